@@ -1,0 +1,1 @@
+"""Hardware abstraction layer: contracts, robot description and what speaks to motors."""

@@ -1,0 +1,228 @@
+"""The contracts of the hardware abstraction layer.
+
+Every body (simulated, virtual or real) is read as an `Observation` and driven by a `Command`; everything above
+works on the `State` that the estimator makes of observations. Arrays follow the robot's joint order and may carry
+leading world dimensions: `(..., n_joints)`. A value that was not read is NaN, never zero and never invented.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+
+
+class Mode(IntEnum):
+    """What a motor does with a command."""
+
+    OFF = 0  # torque off: the joint is free
+    DAMP = 1  # gains at zero with torque on: the motor brakes
+    ACTIVE = 2  # track the position target
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """One read of a body.
+
+    `fault` holds the bits of the servos' hardware-error register (0: none). `age` is the time since a joint's sample
+    was taken, infinite if it never was.
+    """
+
+    time_ns: int  # monotonic
+    position: Array  # (..., n_joints) rad
+    velocity: Array  # (..., n_joints) rad/s
+    effort: Array  # (..., n_joints) N m
+    temperature: Array  # (..., n_joints) degrees C
+    voltage: Array  # (..., n_joints) V
+    age: Array  # (..., n_joints) s
+    fault: Array  # (..., n_joints) int
+    orientation: Array  # (..., 4) quaternion w x y z of the IMU's own fusion
+    angular_velocity: Array  # (..., 3) rad/s, base frame
+    specific_force: Array  # (..., 3) m/s2, base frame: +9.81 on z when level and still
+    imu_age: Array  # (...,) s
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """PD targets. `gain` scales the firmware's position gain (1: as configured); it is not in N m/rad."""
+
+    position: Array  # (..., n_joints) rad
+    gain: Array  # (..., n_joints)
+    mode: Mode
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """What a policy may know, made by the estimator from observations alone.
+
+    The odometry frame has its origin under the base and its x axis along the heading at reset; z is up and zero on
+    the ground. The heading frame is the base frame turned upright.
+    """
+
+    time_ns: int
+    orientation: Array  # (..., 4) quaternion w x y z, base in the odometry frame
+    gravity: Array  # (..., 3) unit vector along gravity, base frame
+    yaw: Array  # (...,) rad, heading in the odometry frame, unwrapped
+    angular_velocity: Array  # (..., 3) rad/s, base frame
+    velocity: Array  # (..., 3) m/s of the base, heading frame
+    displacement: Array  # (..., 3) m, base in the odometry frame; z is the height above the soles
+    position: Array  # (..., n_joints) rad
+    joint_velocity: Array  # (..., n_joints) rad/s
+    contact: Array  # (..., n_feet) 0..1, how much a foot carries
+
+
+@dataclass(frozen=True, slots=True)
+class Percept:
+    """What else a task may know, in the odometry frame, with its age and where it came from."""
+
+    source: str  # "task", "scene", or the name of an external feed
+    age: float  # s
+    goal: Array | None = None  # (2,) m
+    obstacles: Array | None = None  # (n, 3) m: x, y, radius
+    robots: Array | None = None  # (n, 3): x, y m and heading rad
+
+
+class Sensors(Protocol):
+    """The reading half of a backend."""
+
+    def read(self) -> Observation:
+        """Return the newest observation. Raises BackendError when the body cannot be reached."""
+        ...
+
+
+class Motors(Protocol):
+    """The writing half of a backend. Only the guard holds one."""
+
+    def write(self, command: Command) -> None:
+        """Send a command. Raises BackendError when the body cannot be reached."""
+        ...
+
+
+class Clock(Protocol):
+    """Monotonic time: the machine's, a simulation's, or a virtual rig's."""
+
+    def now_ns(self) -> int: ...
+
+    def sleep_until(self, time_ns: int) -> None:
+        """Return at `time_ns`, or at once when it has passed."""
+        ...
+
+
+class Backend(Protocol):
+    """A body: simulated, virtual or real. `connect` never moves it."""
+
+    name: str
+    clock: Clock
+
+    def connect(self) -> tuple[Sensors, Motors]: ...
+
+    def close(self) -> None:
+        """Release the body. Motors are left with torque off."""
+        ...
+
+
+class BackendError(Exception):
+    """A body cannot be reached or refused: exit code 3."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceFrames:
+    """Frames of a motion to track, `k` of them along the axis before the last."""
+
+    position: Array  # (..., k, n_joints) rad
+    velocity: Array  # (..., k, 2) m/s of the base, heading frame
+    yaw_rate: Array  # (..., k) rad/s
+    height: Array  # (..., k) m of the base above the ground
+    contact: Array  # (..., k, n_feet) 0..1, planned
+
+
+class Reference(Protocol):
+    """A motion that a tracker follows: a gait, a clip, or a planner's output."""
+
+    def frames(self, ahead: Array) -> ReferenceFrames:
+        """Frames `ahead` ticks from now, `(k,)` integers, 0 being the frame to be in at the next tick."""
+        ...
+
+    def advance(self) -> None:
+        """Go on by one tick."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Instruction:
+    """What a task asks of a policy at a tick."""
+
+    velocity: Array  # (..., 3) m/s forward, m/s left, rad/s: base, heading frame
+    goal: Array | None = None  # (..., 2) m in the heading frame, from the base
+
+
+class Policy(Protocol):
+    """A controller. `applied` is what the guard really sent last, so that a policy never believes its own wishes."""
+
+    def reset(self, seed: int) -> None: ...
+
+    def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
+        """Joint targets `(..., n_joints)` rad for the next tick."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class PlanRequest:
+    """What a planner is asked at `tick`: the newest `history` of features and the actions that run meanwhile."""
+
+    tick: int
+    states: Array  # (history, state features), oldest first, the last one being now
+    actions: Array  # (history - 1 + delay, n_joints) rad: those applied after each past state, then those yet to run
+    instruction: Instruction
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A plan indexed by tick: `actions[i]` belongs to tick `tick + i`."""
+
+    tick: int
+    actions: Array  # (horizon, n_joints) rad
+    states: Array  # (horizon, state features)
+    path: Array  # (horizon, 2) m: predicted displacement in the heading frame of `tick`, to be drawn and logged
+    seconds: float  # how long planning took
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """What a run went through, by the estimate or by the truth; one row a tick."""
+
+    dt: float
+    displacement: Array  # (ticks, 3) m
+    yaw: Array  # (ticks,) rad
+    velocity: Array  # (ticks, 3) m/s, heading frame
+    yaw_rate: Array  # (ticks,) rad/s
+    command: Array  # (ticks, 3) instructed velocity
+    fallen: bool
+
+
+class Task(Protocol):
+    """What the robot shall do. `success` is pure: `run` applies it to the estimate, evaluation to the truth."""
+
+    name: str
+    seconds: float
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Draw the episode's goal, commands and disturbances."""
+        ...
+
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction: ...
+
+    def cost(self, trajectory: Any, instruction: Instruction) -> Any:
+        """Guidance cost `(batch,)` of a predicted trajectory (torch), in the heading frame of now."""
+        ...
+
+    def done(self, state: State) -> bool: ...
+
+    def success(self, trace: Trace) -> bool: ...
+
+    def metrics(self, trace: Trace) -> dict[str, float]: ...

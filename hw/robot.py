@@ -1,0 +1,172 @@
+"""The robot description: joints, servos, legs and limits, loaded from `configs/robots/*.yaml`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from hw.config import ConfigError, load_yaml, resolve
+from hw.hal import Array
+
+
+@dataclass(frozen=True)
+class Servo:
+    """A servo model. Torques N m, speeds rad/s, times s, at `voltage`; stiffness is that of gain scale 1."""
+
+    name: str
+    model_number: int
+    ticks_per_turn: int
+    center_tick: int
+    velocity_unit: float  # rad/s
+    current_unit: float  # A
+    torque_per_ampere: float  # N m/A
+    voltage_unit: float  # V
+    position_p_gain: int
+    voltage: float
+    stiffness: float
+    stall_torque: float
+    no_load_speed: float
+    braking_torque: float
+    damping: float
+    friction: float
+    armature: float
+    command_delay: float
+    position_latency: float
+    max_temperature: float
+    voltage_range: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint. `zero` is added to the servo's angle, `direction` is 1 or -1; angles rad."""
+
+    name: str
+    servo: str
+    id: int
+    direction: int
+    zero: float
+    range: tuple[float, float]
+    home: float
+    mirror: str
+    mirror_sign: int
+
+
+@dataclass(frozen=True)
+class Link:
+    """A joint of a leg: its offset [m] from the joint before it, in that joint's frame, and its axis."""
+
+    joint: str
+    offset: tuple[float, float, float]
+    axis: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Foot:
+    """A foot: its collision geoms and its sole's centre and half size [m] in the last leg link."""
+
+    geoms: tuple[str, ...]
+    sole: tuple[float, float, float]
+    half_size: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the guard enforces. Speeds rad/s, angles rad, temperature degrees C, `stale` in ticks."""
+
+    joint_speed: float
+    margin: float
+    homing_speed: float
+    tilt: float
+    stale: int
+    temperature: float
+
+
+@dataclass(frozen=True)
+class Imu:
+    """Errors of the IMU: standard deviation of a sample's noise, half-width of the bias at power-on."""
+
+    gyro_noise: float
+    gyro_bias: float
+    accelerometer_noise: float
+    accelerometer_bias: float
+    latency: float
+
+
+@dataclass(frozen=True)
+class Bus:
+    baud: int
+    board_id: int
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot, as its file describes it. Joint arrays below are `(n_joints,)` in the file's order."""
+
+    name: str
+    mjcf: str  # relative to the robot's file; absolute once loaded
+    base: str
+    imu_site: str
+    rate: int
+    standing_height: float
+    bus: Bus
+    limits: Limits
+    imu: Imu
+    feet: dict[str, Foot]
+    legs: dict[str, tuple[Link, ...]]
+    joints: tuple[Joint, ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(joint.name for joint in self.joints)
+
+    @cached_property
+    def home(self) -> Array:
+        return np.array([joint.home for joint in self.joints])
+
+    @cached_property
+    def lower(self) -> Array:
+        return np.array([joint.range[0] for joint in self.joints])
+
+    @cached_property
+    def upper(self) -> Array:
+        return np.array([joint.range[1] for joint in self.joints])
+
+    @cached_property
+    def mirror(self) -> tuple[Array, Array]:
+        """Index and sign such that `q[..., index] * sign` is the pose seen in a mirror (left and right swapped)."""
+        index = np.array([self.names.index(joint.mirror) for joint in self.joints])
+        return index, np.array([float(joint.mirror_sign) for joint in self.joints])
+
+    @cached_property
+    def leg_index(self) -> Array:
+        """Joint numbers of each leg, `(n_legs, joints of a leg)`, hip to ankle."""
+        return np.array([[self.names.index(link.joint) for link in leg] for leg in self.legs.values()])
+
+    @cached_property
+    def servos(self) -> tuple[Servo, ...]:
+        """The servo of each joint."""
+        models = {name: load_servo(name) for name in {joint.servo for joint in self.joints}}
+        return tuple(models[joint.servo] for joint in self.joints)
+
+    @property
+    def dt(self) -> float:
+        """Length of a tick [s]."""
+        return 1.0 / self.rate
+
+
+def load_servo(name: str) -> Servo:
+    """Load a servo model by name. Raises ConfigError."""
+    return load_yaml(resolve("servos", name), Servo)
+
+
+def load_robot(name: str | Path = "op3") -> Robot:
+    """Load a robot by name or file, checked. Raises ConfigError naming file, line and key."""
+    path = resolve("robots", name)
+    robot = load_yaml(path, Robot)
+    return replace(robot, mjcf=str((path.parent / robot.mjcf).resolve()))
+
+
+__all__ = ["ConfigError", "Joint", "Robot", "Servo", "load_robot", "load_servo"]
