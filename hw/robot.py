@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hw.config import ConfigError, load_yaml, resolve
+from hw.config import ConfigError, load_marked, resolve
 from hw.hal import Array
+from hw.robot_checks import check_robot, check_servo
 
 
 @dataclass(frozen=True)
@@ -158,14 +159,17 @@ class Robot:
 
 
 def load_servo(name: str) -> Servo:
-    """Load a servo model by name. Raises ConfigError."""
-    return load_yaml(resolve("servos", name), Servo)
+    """Load a servo model by name, checked. Raises ConfigError naming file, line and key."""
+    servo, marks = load_marked(resolve("servos", name), Servo)
+    check_servo(servo, marks)
+    return servo
 
 
 def load_robot(name: str | Path = "op3") -> Robot:
     """Load a robot by name or file, checked. Raises ConfigError naming file, line and key."""
     path = resolve("robots", name)
-    robot = load_yaml(path, Robot)
+    robot, marks = load_marked(path, Robot)
+    check_robot(robot, marks)
     return replace(robot, mjcf=str((path.parent / robot.mjcf).resolve()))
 
 
