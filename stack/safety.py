@@ -1,0 +1,284 @@
+"""The guard: the only holder of the motors.
+
+Everything else proposes targets; what reaches a servo is decided here. Its invariants, each of which is a test in
+tests/stack/test_safety.py:
+
+1. A position that is sent ACTIVE is finite and inside the joint's range less the margin, or on its way there from a
+   measured pose that was outside.
+2. From one accepted goal to the next a joint moves at most `joint_speed * dt` for each elapsed tick, and for no more
+   ticks than `stale`: a servo holds its goal meanwhile, so a long gap does not earn a leap. While homing the limit is
+   `homing_speed`, for one tick however many were missed.
+3. Nothing is sent before `home`; nothing that a policy proposes is sent before `start`.
+4. A target that is not finite is never sent: the last goal holds, and after PATIENCE in a row the robot is damped.
+5. DAMPED and FAULT are final: DAMP, then OFF, and never ACTIVE again.
+6. Samples older than `stale` ticks, or that never came, end in FAULT; so do tilt beyond `tilt` and a servo's error.
+7. A stop that leaves time for it (Ctrl-C, heat, a full disk, the end of a task) lowers a standing robot first.
+
+Homing is the guard's own: from the pose that the robot is in, slowly, to the home pose.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+
+import numpy as np
+
+from hw.hal import Array, Command, Mode, Motors, Observation
+from hw.robot import Robot
+from stack.coast import missing
+from stack.crouch import crouch
+from stack.event import Event
+from stack.limits import limit
+
+PATIENCE = 3  # targets in a row that may be not finite
+LOWER_SECONDS = 1.5
+DAMP_SECONDS = 0.5  # braked before torque goes off, so that the robot settles instead of dropping
+HOME_TOLERANCE = 0.35  # rad that a joint may be from home after homing: above any sag under the robot's own weight
+MIN_JERK_PEAK = 1.875  # peak over mean speed of a minimum-jerk motion (Flash and Hogan, 1985)
+SERVO_ERRORS = {0: "input voltage", 2: "overheating", 3: "encoder", 4: "electrical shock", 5: "overload"}
+
+
+class Phase(StrEnum):
+    """What the guard lets happen."""
+
+    LIMP = "limp"  # nothing is sent
+    HOMING = "homing"  # going to the home pose
+    READY = "ready"  # holding it
+    RUNNING = "running"  # following targets
+    LOWERING = "lowering"  # going to a crouch, to end
+    DAMPED = "damped"  # braking, then torque off
+    FAULT = "fault"  # the same, for a reason that a person must look at
+
+
+POWERED = {Phase.HOMING, Phase.READY, Phase.RUNNING, Phase.LOWERING}
+ENDED = {Phase.DAMPED, Phase.FAULT}
+
+
+class Motion:
+    """A minimum-jerk motion between two poses, one sample a call."""
+
+    def __init__(self, start: Array, end: Array, ticks: int) -> None:
+        self._start, self._end, self._ticks, self._tick = start, end, max(1, ticks), 0
+
+    @property
+    def done(self) -> bool:
+        return self._tick >= self._ticks
+
+    def next(self) -> Array:
+        self._tick = min(self._tick + 1, self._ticks)
+        s = self._tick / self._ticks
+        return self._start + (self._end - self._start) * (10 * s**3 - 15 * s**4 + 6 * s**5)
+
+
+class Guard:
+    """Decides and sends every command. `gain` scales the servos' position gain, 1 being as configured."""
+
+    def __init__(self, robot: Robot, motors: Motors, gain: float = 1.0) -> None:
+        self.robot = robot
+        self.phase = Phase.LIMP
+        self.applied: Array = robot.home.copy()  # (n_joints,) rad: the last accepted goal
+        self.off = False  # torque off has been sent
+        self.lowest = crouch(robot)
+        self._motors = motors
+        self._gain = np.full(len(robot.names), gain)
+        self._events: list[Event] = []
+        self._command = self._make(Mode.OFF)
+        self._motion: Motion | None = None
+        self._rejected = 0
+        self._damped_ticks = 0
+        self._tick = 0  # of the newest decision
+        self._accepted = 0  # tick of the last accepted goal
+        self._began: int | None = None
+        self._time = 0.0
+
+    # What a run asks for ---------------------------------------------------------------------------------------------
+
+    def home(self, observation: Observation) -> None:
+        """Begin to move to the home pose from where the robot is. Raises RuntimeError unless LIMP."""
+        self._expect(Phase.LIMP)
+        lacking = missing(observation, self.robot.names)
+        if lacking:
+            self.fault("stale", f"no valid sample from {', '.join(lacking)}: check the cable and the power", lacking[0])
+            return
+        self.applied = np.array(observation.position, dtype=float)
+        self._accepted = self._tick
+        distance = float(np.abs(self.robot.home - self.applied).max())
+        seconds = MIN_JERK_PEAK * distance / self.robot.limits.homing_speed
+        self._motion = Motion(self.applied, self.robot.home, math.ceil(seconds * self.robot.rate))
+        self._enter(Phase.HOMING, f"homing, {seconds:.1f} s")
+
+    def start(self) -> None:
+        """Follow targets from now on. Raises RuntimeError unless READY."""
+        self._expect(Phase.READY)
+        self._enter(Phase.RUNNING, "running")
+
+    def stop(self, kind: str, text: str, joint: str | None = None) -> None:
+        """End in order: lowered if it stands, damped, off. Does nothing when the robot is ending already."""
+        if self.phase in ENDED or self.phase is Phase.LOWERING:
+            return
+        self.note(kind, text, joint)
+        if self.phase in {Phase.READY, Phase.RUNNING}:
+            self._motion = Motion(self.applied, self.lowest, round(LOWER_SECONDS * self.robot.rate))
+            self._enter(Phase.LOWERING, "lowering")
+        else:  # limp or on the way home: the robot may hang or lie, and a crouch would be one more motion
+            self._enter(Phase.DAMPED, "damped")
+
+    def fault(self, kind: str, text: str, joint: str | None = None) -> None:
+        """End at once: damped, then off."""
+        if self.phase in ENDED:
+            return
+        self.note(kind, text, joint)
+        self._enter(Phase.FAULT, f"damped: {text}")
+
+    def release(self) -> None:
+        """Damp and turn torque off at once, both tried even if one fails. Raises the first BackendError at the end."""
+        if self.phase not in ENDED:
+            self._enter(Phase.DAMPED, "released")
+        if self.off:
+            return
+        failure: Exception | None = None
+        for mode in (Mode.DAMP, Mode.OFF):
+            self._command = self._make(mode)
+            try:
+                self._motors.write(self._command)
+            except Exception as error:  # the second write is the one that matters
+                failure = failure or error
+        if failure is not None:
+            raise failure
+        self.off = True
+
+    # One tick --------------------------------------------------------------------------------------------------------
+
+    def decide(self, tick: int, observation: Observation, target: Array | None) -> Command:
+        """What to send at `tick`.
+
+        `observation` holds the newest sample of each joint and its age; `target` `(n_joints,)` rad is what a policy
+        proposes and is looked at only in RUNNING, where None means that it proposes nothing and the goal holds.
+        """
+        self._tick = tick
+        self._began = observation.time_ns if self._began is None else self._began
+        self._time = (observation.time_ns - self._began) * 1e-9
+        if self.phase in POWERED:
+            self._check(observation)
+        if self.phase is Phase.RUNNING and target is not None:
+            self._accept(target)
+        elif self.phase in {Phase.READY, Phase.RUNNING}:
+            self._accepted = tick  # a goal that is held is accepted anew, so that time spent holding earns no leap
+        elif self.phase is Phase.HOMING:
+            self._home_on(observation)
+        elif self.phase is Phase.LOWERING:
+            self._lower_on()
+        if self.phase in POWERED:
+            self._command = self._make(Mode.ACTIVE)
+        elif self.phase in ENDED:
+            self._damped_ticks += 1
+            braking = self._damped_ticks <= DAMP_SECONDS * self.robot.rate
+            self._command = self._make(Mode.DAMP if braking else Mode.OFF)
+        return self._command
+
+    def send(self) -> None:
+        """Write what was decided. Takes no argument, so that nobody else's command can pass. Raises BackendError."""
+        if self.phase is Phase.LIMP or self.off:
+            return
+        self._motors.write(self._command)
+        self.off = self._command.mode is Mode.OFF
+
+    def events(self) -> tuple[Event, ...]:
+        """Events since the last call."""
+        taken, self._events = tuple(self._events), []
+        return taken
+
+    def note(self, kind: str, text: str, joint: str | None = None) -> None:
+        """Add an event at the present tick."""
+        self._events.append(Event(self._tick, self._time, kind, joint, text))
+
+    # How -------------------------------------------------------------------------------------------------------------
+
+    def _accept(self, target: Array) -> None:
+        proposal = np.asarray(target, dtype=float)
+        if proposal.shape != self.applied.shape:
+            self.fault("policy", f"a target of shape {proposal.shape}, but the robot has {len(self.applied)} joints")
+            return
+        bad = np.flatnonzero(~np.isfinite(proposal))
+        if bad.size:
+            self._rejected += 1
+            joint = self.robot.names[bad[0]]
+            if self._rejected == 1:
+                self.note("rejected", f"target of {joint} is {proposal[bad[0]]}: the last goal holds", joint)
+            if self._rejected >= PATIENCE:
+                self.fault("policy", f"{PATIENCE} targets in a row are not finite, the last for {joint}", joint)
+            return
+        self._rejected = 0
+        self.applied = limit(proposal, self.applied, self.robot, self._elapsed())
+        self._accepted = self._tick
+
+    def _home_on(self, observation: Observation) -> None:
+        assert self._motion is not None
+        self._accepted = self._tick
+        if self._motion.done:
+            error = np.abs(observation.position - self.robot.home)
+            worst = int(error.argmax())
+            if error[worst] > HOME_TOLERANCE:
+                name = self.robot.names[worst]
+                self.fault("homing", f"{name} is {error[worst]:.2f} rad from home: is it blocked or unpowered?", name)
+            else:
+                self._enter(Phase.READY, "ready")
+            return
+        step = self.robot.limits.homing_speed * self.robot.dt
+        self.applied = np.clip(self._motion.next(), self.applied - step, self.applied + step)
+
+    def _lower_on(self) -> None:
+        assert self._motion is not None
+        if self._motion.done:
+            self._enter(Phase.DAMPED, "damped")
+            return
+        self.applied = limit(self._motion.next(), self.applied, self.robot, self._elapsed())
+        self._accepted = self._tick
+
+    def _check(self, observation: Observation) -> None:
+        limits, names = self.robot.limits, self.robot.names
+        oldest = limits.stale * self.robot.dt + 1e-9
+        joints = np.isfinite(observation.position) & np.isfinite(observation.velocity) & (observation.age <= oldest)
+        if not joints.all():
+            name = names[int(np.flatnonzero(~joints)[0])]
+            self.fault("stale", f"no fresh sample from {name} for {limits.stale} ticks: check its cable", name)
+            return
+        orientation = observation.orientation
+        if not (np.isfinite(orientation).all() and float(observation.imu_age) <= oldest):
+            self.fault("stale", f"no fresh sample from the IMU for {limits.stale} ticks: check its cable")
+            return
+        broken = np.flatnonzero(observation.fault)
+        if broken.size:
+            name, bits = names[broken[0]], int(observation.fault[broken[0]])
+            causes = [text for bit, text in SERVO_ERRORS.items() if bits >> bit & 1] or [f"error {bits:#04x}"]
+            self.fault("servo", f"{name} reports {', '.join(causes)}: let it cool, then reboot it", name)
+            return
+        tilt = _tilt(orientation)
+        if tilt > limits.tilt and self.phase is not Phase.HOMING:  # on the way home it may hang from a hand
+            self.fault("fall", f"tilted by {math.degrees(tilt):.0f} degrees")
+            return
+        hot = np.flatnonzero(np.nan_to_num(observation.temperature, nan=-np.inf) > limits.temperature)
+        if hot.size:
+            name = names[hot[0]]
+            self.stop("temperature", f"{name} is at {observation.temperature[hot[0]]:.0f} C: let it cool", name)
+
+    def _elapsed(self) -> int:
+        return min(max(1, self._tick - self._accepted), self.robot.limits.stale)
+
+    def _make(self, mode: Mode) -> Command:
+        return Command(position=self.applied, gain=self._gain, mode=mode)
+
+    def _enter(self, phase: Phase, text: str) -> None:
+        self.phase = phase
+        self.note("phase", text)
+
+    def _expect(self, phase: Phase) -> None:
+        if self.phase is not phase:
+            raise RuntimeError(f"the guard is {self.phase}, not {phase}")
+
+
+def _tilt(orientation: Array) -> float:
+    """Angle [rad] between the base's z axis and the vertical, of a quaternion w x y z."""
+    w, x, y, z = orientation / np.linalg.norm(orientation)
+    return math.acos(min(1.0, max(-1.0, w * w - x * x - y * y + z * z)))
