@@ -1,0 +1,151 @@
+"""A robot's MuJoCo model: its body from the MJCF, its motors and sensors from the robot's and the servos' files."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from pathlib import Path
+
+import mujoco
+
+from hw.config import ConfigError
+from hw.robot import Robot, Servo
+
+TIMESTEP = 0.004  # s
+_FOUND, _FORCE, _NET = 1, 2, 3  # data bits and reduction of MuJoCo's contact sensor
+
+
+def build(robot: Robot) -> mujoco.MjModel:
+    """Compile the model of `robot` on a floor. Actuator i drives joint i of the robot's file.
+
+    The MJCF's own actuators, sensors and keyframes are replaced. Raises ConfigError naming what the MJCF lacks.
+    """
+    return spec(robot).compile()
+
+
+def spec(robot: Robot) -> mujoco.MjSpec:
+    """The editable model of `robot`, for scenes that add bodies to it. Raises ConfigError."""
+    path = Path(robot.mjcf)
+    if not path.is_file():
+        raise ConfigError(f"{robot.name}: mjcf: no such file: {path}")
+    try:
+        result = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ConfigError(f"{path}: not a valid MJCF: {error}") from error
+    _check(result, robot, path)
+    for element in [*result.actuators, *result.sensors, *result.keys]:
+        result.delete(element)
+    result.option.timestep = TIMESTEP
+    result.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    result.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # 4.0.0's sparse Newton solver has a bug
+    result.option.iterations, result.option.ls_iterations = 10, 10
+    _add_floor(result)
+    for joint, servo in zip(robot.joints, robot.servos, strict=True):
+        _add_servo(result, joint.name, servo)
+    _add_sensors(result, robot)
+    return result
+
+
+def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
+    """Refuse a model that lacks what the robot's file names."""
+
+    def need(kind: str, wanted: str, present: list[str]) -> None:
+        if wanted not in present:
+            near = get_close_matches(wanted, present, 1)
+            hint = f"; nearest: {near[0]}" if near else ""
+            raise ConfigError(f"{path}: no {kind} named {wanted!r}, which robot {robot.name!r} needs{hint}")
+
+    joints = [joint.name for joint in model.joints]
+    for joint in robot.joints:
+        need("joint", joint.name, joints)
+    need("body", robot.base, [body.name for body in model.bodies])
+    need("site (the IMU's)", robot.imu_site, [site.name for site in model.sites])
+    geoms = [geom.name for geom in model.geoms]
+    for foot in robot.feet.values():
+        for geom in foot.geoms:
+            need("geom (of a sole)", geom, geoms)
+    extra = [name for joint in model.joints if (name := joint.name) not in robot.names and joint.type != 0]
+    if extra:
+        raise ConfigError(f"{path}: joints that robot {robot.name!r} does not list: {', '.join(extra)}")
+
+
+def _add_floor(model: mujoco.MjSpec) -> None:
+    if any(geom.name == "floor" for geom in model.geoms):
+        return
+    model.add_texture(
+        name="floor",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.78, 0.80, 0.83],
+        rgb2=[0.70, 0.72, 0.76],
+        width=256,
+        height=256,
+    )
+    textures = [""] * mujoco.mjtTextureRole.mjNTEXROLE
+    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
+    model.add_material(name="floor", textures=textures, texrepeat=[5, 5], texuniform=True)
+    model.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.90, 0.94, 0.98],
+        rgb2=[0.55, 0.65, 0.78],
+        width=128,
+        height=128,
+    )
+    model.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.05],
+        material="floor",
+        contype=1,
+        conaffinity=0,
+        friction=[0.8, 0.005, 0.0001],
+        priority=1,  # the floor's friction counts, so that randomising one number is enough
+        solref=[0.008, 1.0],
+    )
+    model.worldbody.add_light(pos=[0.5, -0.5, 3.0], dir=[-0.15, 0.15, -1.0], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+
+
+def _add_servo(model: mujoco.MjSpec, name: str, servo: Servo) -> None:
+    """A DC motor under the firmware's law: position error times gain is a voltage, clipped at the supply.
+
+    MuJoCo's controller compensates back-EMF; its velocity gain K^2/R takes that out again, since the firmware's does
+    not. `saturation` is the braking limit, which the torque-speed line alone would exceed.
+    """
+    joint = model.joint(name)
+    joint.damping = [servo.damping, 0, 0]
+    joint.frictionloss = servo.friction
+    joint.armature = servo.armature
+    k = servo.voltage / servo.no_load_speed
+    r = k * servo.voltage / servo.stall_torque
+    actuator = model.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator.set_to_dcmotor(
+        motorconst=[k, k],
+        resistance=r,
+        saturation=[servo.braking_torque, 0, 0],
+        controller=[servo.stiffness, 0, k * k / r, 0, 0, servo.voltage],
+        ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_POS),
+    )
+
+
+def _add_sensors(model: mujoco.MjSpec, robot: Robot) -> None:
+    """IMU for the estimator; soles and contacts for the truth."""
+    kind, obj = mujoco.mjtSensor, mujoco.mjtObj
+
+    def add(name: str, sensor: int, objtype: int, objname: str, **more: object) -> None:
+        model.add_sensor(name=name, type=sensor, objtype=objtype, objname=objname, **more)
+
+    add("gyro", kind.mjSENS_GYRO, obj.mjOBJ_SITE, robot.imu_site)
+    add("accelerometer", kind.mjSENS_ACCELEROMETER, obj.mjOBJ_SITE, robot.imu_site)
+    floor = {"objtype": obj.mjOBJ_GEOM, "objname": "floor"}
+    model.add_sensor(name="floor", type=kind.mjSENS_CONTACT, intprm=[_FOUND, 0, 1], **floor)
+    for name, foot in robot.feet.items():
+        body = model.geom(foot.geoms[0]).parent
+        body.add_site(name=f"{name}_foot", pos=foot.sole, group=4)
+        reftype = {"reftype": obj.mjOBJ_BODY, "refname": body.name}
+        model.add_sensor(
+            name=f"{name}_contact", type=kind.mjSENS_CONTACT, intprm=[_FOUND | _FORCE, _NET, 1], **floor, **reftype
+        )
+        add(f"{name}_position", kind.mjSENS_FRAMEPOS, obj.mjOBJ_SITE, f"{name}_foot")
+        add(f"{name}_velocity", kind.mjSENS_FRAMELINVEL, obj.mjOBJ_SITE, f"{name}_foot")
+        add(f"{name}_up", kind.mjSENS_FRAMEZAXIS, obj.mjOBJ_SITE, f"{name}_foot")

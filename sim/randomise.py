@@ -1,0 +1,77 @@
+"""What differs from one simulated robot to the next: drawn once an episode, nominal or randomised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hw.hal import Array
+from hw.robot import Robot
+
+# Ranges of the randomised robot.
+STIFFNESS = (5.0, 19.0)  # N m/rad at the servo's nominal voltage
+VOLTAGE = (11.0, 12.6)  # V
+FRICTION = (0.4, 1.2)  # of the floor
+MASS = (0.9, 1.1)  # factor on each body
+COMMAND_DELAY = (0.008, 0.040)  # s
+LATENCY = (0.0, 0.012)  # s, of joints and of the IMU, each its own
+ZERO = 0.03  # rad, half-width
+BACKLASH = np.deg2rad(0.25)  # rad, whole play of a gear
+IMU_TILT = 0.02  # rad, half-width of the mounting error about x and y
+
+NOMINAL_FRICTION = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """One robot. `mass` is `(n_bodies,)`, `zero` `(n_joints,)`, biases and tilt `(3,)` and `(2,)`."""
+
+    stiffness: float
+    voltage: float
+    friction: float
+    mass: Array
+    command_delay: float
+    joint_latency: float
+    imu_latency: float
+    zero: Array
+    backlash: float
+    gyro_bias: Array
+    accelerometer_bias: Array
+    imu_tilt: Array
+
+
+def draw(rng: np.random.Generator, robot: Robot, n_bodies: int, randomise: bool) -> Body:
+    """Draw a robot. The sensors' biases differ on the nominal robot too: no IMU is without."""
+    imu, servo, n = robot.imu, robot.servos[0], len(robot.joints)
+    gyro = rng.uniform(-imu.gyro_bias, imu.gyro_bias, 3)
+    accelerometer = rng.uniform(-imu.accelerometer_bias, imu.accelerometer_bias, 3)
+    if not randomise:
+        return Body(
+            stiffness=servo.stiffness,
+            voltage=servo.voltage,
+            friction=NOMINAL_FRICTION,
+            mass=np.ones(n_bodies),
+            command_delay=servo.command_delay,
+            joint_latency=servo.position_latency,
+            imu_latency=imu.latency,
+            zero=np.zeros(n),
+            backlash=0.0,
+            gyro_bias=gyro,
+            accelerometer_bias=accelerometer,
+            imu_tilt=np.zeros(2),
+        )
+    return Body(
+        stiffness=rng.uniform(*STIFFNESS),
+        voltage=rng.uniform(*VOLTAGE),
+        friction=rng.uniform(*FRICTION),
+        mass=rng.uniform(*MASS, n_bodies),
+        command_delay=rng.uniform(*COMMAND_DELAY),
+        joint_latency=rng.uniform(*LATENCY),
+        imu_latency=rng.uniform(*LATENCY),
+        zero=rng.uniform(-ZERO, ZERO, n),
+        backlash=BACKLASH,
+        gyro_bias=gyro,
+        accelerometer_bias=accelerometer,
+        imu_tilt=rng.uniform(-IMU_TILT, IMU_TILT, 2),
+    )

@@ -1,0 +1,106 @@
+"""The simulation's own state. Rewards and evaluation read it; no policy, estimator or task ever sees it."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from hw.hal import Array
+from hw.robot import Robot
+
+FALL_HEIGHT = 0.6  # of the standing height
+FALL_TILT = np.deg2rad(60.0)
+
+
+class Truth:
+    """Live views of the worlds' truth. All arrays are `(n, ...)`, world frame unless said otherwise."""
+
+    def __init__(
+        self, model: mujoco.MjModel, robot: Robot, qpos: Array, qvel: Array, sensors: Array
+    ) -> None:
+        self._robot, self._qpos, self._qvel, self._sensors = robot, qpos, qvel, sensors
+        self._at = {model.sensor(i).name: slice(int(a := model.sensor(i).adr[0]), int(a + model.sensor(i).dim[0]))
+                    for i in range(model.nsensor)}  # fmt: skip
+        joints = [model.joint(name) for name in robot.names]
+        self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
+        self._joint_dof = np.array([int(joint.dofadr[0]) for joint in joints])
+
+    def _feet(self, what: str) -> Array:
+        return np.stack([self._sensors[:, self._at[f"{foot}_{what}"]] for foot in self._robot.feet], 1)
+
+    @property
+    def position(self) -> Array:
+        """Base position `(n, 3)` m."""
+        return self._qpos[:, 0:3]
+
+    @property
+    def orientation(self) -> Array:
+        """Base quaternion `(n, 4)` w x y z."""
+        return self._qpos[:, 3:7]
+
+    @property
+    def yaw(self) -> Array:
+        """Heading `(n,)` rad in -pi..pi."""
+        w, x, y, z = self.orientation.T
+        return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+    @property
+    def gravity(self) -> Array:
+        """Unit vector along gravity in the base frame `(n, 3)`."""
+        w, x, y, z = self.orientation.T
+        return -np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1)
+
+    @property
+    def tilt(self) -> Array:
+        """Angle of the base from upright `(n,)` rad."""
+        return np.arccos(np.clip(-self.gravity[:, 2], -1.0, 1.0))
+
+    @property
+    def velocity(self) -> Array:
+        """Base velocity `(n, 3)` m/s in the heading frame."""
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        vx, vy, vz = self._qvel[:, 0:3].T
+        return np.stack([c * vx + s * vy, -s * vx + c * vy, vz], -1)
+
+    @property
+    def angular_velocity(self) -> Array:
+        """Base angular velocity `(n, 3)` rad/s in the base frame."""
+        return self._qvel[:, 3:6]
+
+    @property
+    def joints(self) -> Array:
+        """Joint positions `(n, n_joints)` rad."""
+        return self._qpos[:, self._joint_qpos]
+
+    @property
+    def joint_velocity(self) -> Array:
+        """Joint velocities `(n, n_joints)` rad/s."""
+        return self._qvel[:, self._joint_dof]
+
+    @property
+    def foot_force(self) -> Array:
+        """Normal force of the ground on each foot `(n, n_feet)` N."""
+        return np.abs(self._feet("contact")[..., 3])
+
+    @property
+    def foot_position(self) -> Array:
+        """Centres of the soles `(n, n_feet, 3)` m."""
+        return self._feet("position")
+
+    @property
+    def foot_velocity(self) -> Array:
+        """Velocities of the soles' centres `(n, n_feet, 3)` m/s."""
+        return self._feet("velocity")
+
+    @property
+    def foot_up(self) -> Array:
+        """Upward axes of the soles `(n, n_feet, 3)`."""
+        return self._feet("up")
+
+    @property
+    def fallen(self) -> Array:
+        """Whether each body has fallen `(n,)`: too low, too tilted, or on the ground with anything but its feet."""
+        low = self.position[:, 2] < FALL_HEIGHT * self._robot.standing_height
+        all_contacts = self._sensors[:, self._at["floor"]][:, 0]
+        foot_contacts = self._feet("contact")[..., 0].sum(-1)
+        return low | (self.tilt > FALL_TILT) | (all_contacts > foot_contacts)

@@ -1,0 +1,184 @@
+"""Many simulated bodies of one robot, stepped by all cores: what training, collection and the simulated backend share.
+
+A world's draws come from its own episode's random stream, so that an episode does not depend on its neighbours, on the
+number of worlds or on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from hw.hal import Array, Command, Mode, Observation
+from hw.legs import Legs
+from hw.robot import Robot
+from sim.model import TIMESTEP, build
+from sim.randomise import Body, draw
+from sim.truth import Truth
+
+_DELAYED = 3  # commands that may still be on their way: a delay of up to two ticks
+_NOISE_ROWS = 64  # ticks of sensor noise drawn at a time
+_VELOCITY_NOISE = 0.02  # rad/s, standard deviation, before quantisation
+_KP, _VMAX = 4, 7  # indices in a dcmotor's gainprm
+
+
+class Worlds:
+    """`n` bodies. Commands and observations are `(n, ...)`; `threads` 0 takes all cores."""
+
+    def __init__(
+        self, robot: Robot, n: int, *, threads: int = 0, randomise: bool = False, model: mujoco.MjModel | None = None
+    ) -> None:
+        self.robot, self.n, self.randomise = robot, n, randomise
+        self.model = build(robot) if model is None else model
+        self.substeps = round(robot.dt / TIMESTEP)
+        self.batch = Batch(self.model, n, threads)
+        self._legs = Legs(robot)
+        joints = [self.model.joint(name) for name in robot.names]
+        self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
+        self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
+        servos = robot.servos
+        self._unit = np.array([servo.current_unit * servo.torque_per_ampere for servo in servos])
+        self._velocity_unit = np.array([servo.velocity_unit for servo in servos])
+        self._tick_angle = 2 * np.pi / np.array([servo.ticks_per_turn for servo in servos])
+        self._nominal_voltage = np.array([servo.voltage for servo in servos])
+        self._nominal_stiffness = np.array([servo.stiffness for servo in servos])
+        self._braking = np.array([servo.braking_torque for servo in servos])
+        self._voltage_unit = servos[0].voltage_unit
+
+        b, nj = self.batch, len(robot.joints)
+        self._state_qpos, self._state_qvel = b.bind("qpos"), b.bind("qvel")
+        self._sensors = b.bind("sensordata")
+        self._gain, self._force = b.expand("actuator_gainprm"), b.expand("actuator_forcerange")
+        self._floor = b.expand("geom_friction")[:, self.model.geom("floor").id]
+        if randomise:
+            self._mass, self._inertia = b.expand("body_mass"), b.expand("body_inertia")
+        self.bodies: list[Body | None] = [None] * n
+        self._rngs: list[np.random.Generator] = [np.random.default_rng(0)] * n
+        self._stiffness = np.zeros(n)
+        self._supply = np.zeros(n)
+        self._delay, self._joint_age, self._imu_age = np.zeros(n), np.zeros(n, int), np.zeros(n, int)
+        self._zero, self._backlash = np.zeros((n, nj)), np.zeros((n, 1))
+        self._gyro_bias, self._acc_bias, self._tilt = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2))
+        self._noise = np.zeros((n, _NOISE_ROWS, 6 + nj))
+        self._commands = np.zeros((n, _DELAYED, nj))  # oldest first
+        self._play = np.zeros((n, nj))
+        span = 2 * self.substeps  # samples kept: those of this tick and of the one before
+        self._record = {
+            "qpos": np.zeros((n, span, self.model.nq)),
+            "qvel": np.zeros((n, span, self.model.nv)),
+            "sensordata": np.zeros((n, span, self.model.nsensordata)),
+            "actuator_force": np.zeros((n, span, self.model.nu)),
+        }
+        self._fresh = {key: value[:, self.substeps :].copy() for key, value in self._record.items()}
+        self.ticks = np.zeros(n, int)  # since each world's reset
+        self.tick = 0
+        self.truth = Truth(self.model, robot, self._state_qpos, self._state_qvel, self._sensors)
+
+    def reset(self, ids: Array, rngs: Sequence[np.random.Generator], joints: Array | None = None) -> None:
+        """Put worlds `ids` on the ground at pose `joints` `(len(ids), n_joints)` (default: home), drawing new robots."""
+        pose = np.broadcast_to(self.robot.home if joints is None else joints, (len(ids), len(self.robot.joints)))
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        for i, rng in zip(ids, rngs, strict=True):
+            self._rngs[i] = rng
+            self._place(i, draw(rng, self.robot, self.model.nbody, self.randomise))
+        self._state_qpos[ids] = 0.0
+        self._state_qpos[ids, 2], self._state_qpos[ids, 3:7] = self._legs.stand(pose)
+        self._state_qpos[ids[:, None], self._qpos] = pose - self._zero[ids]
+        self._state_qvel[ids] = 0.0
+        if self.randomise:
+            self.batch.set_const(ids)
+        self._gain[ids, :, _KP], self._force[ids, :, 0], self._force[ids, :, 1] = 0.0, 0.0, 0.0
+        self.batch.forward(ids)
+        self._commands[ids] = pose[:, None]
+        self._play[ids] = pose - self._zero[ids]
+        for key, value in self._record.items():
+            value[ids] = getattr(self.batch, key)[ids][:, None]
+        self.ticks[ids] = 0
+
+    def _place(self, i: int, body: Body) -> None:
+        self.bodies[i] = body
+        self._stiffness[i], self._supply[i], self._delay[i] = body.stiffness, body.voltage, body.command_delay
+        self._joint_age[i] = round(body.joint_latency / TIMESTEP)
+        self._imu_age[i] = max(round(body.imu_latency / TIMESTEP) - 1, 0)  # the recorded IMU is a substep old
+        self._zero[i], self._backlash[i] = body.zero, body.backlash
+        self._gyro_bias[i], self._acc_bias[i], self._tilt[i] = body.gyro_bias, body.accelerometer_bias, body.imu_tilt
+        self._floor[i, 0] = body.friction
+        if self.randomise:
+            self._mass[i] = self.model.body_mass * body.mass
+            self._inertia[i] = self.model.body_inertia * body.mass[:, None]
+
+    def step(self, command: Command) -> None:
+        """Advance by one tick under `command`, whose arrays are `(n, n_joints)` or broadcast to it."""
+        self._commands[:, :-1] = self._commands[:, 1:]
+        self._commands[:, -1] = command.position
+        gain = command.gain if command.mode is Mode.ACTIVE else 0.0
+        scale = (self._supply[:, None] / self._nominal_voltage) * (
+            self._stiffness[:, None] * self._nominal_stiffness / self._nominal_stiffness[0]
+        )
+        self._gain[:, :, _KP] = scale * gain
+        self._gain[:, :, _VMAX] = self._supply[:, None]
+        limit = 0.0 if command.mode is Mode.OFF else self._braking
+        self._force[:, :, 0], self._force[:, :, 1] = -limit, limit
+
+        # The command in force at a substep is the newest that was written at least `delay` before it.
+        start = np.arange(self.substeps) * TIMESTEP - self._delay[:, None]
+        which = np.clip(np.floor(start / self.robot.dt + 1e-6).astype(int) + _DELAYED - 1, 0, _DELAYED - 1)
+        control = np.take_along_axis(self._commands, which[:, :, None], 1) - self._zero[:, None]
+        self.batch.rollout(self.substeps, control, record=tuple(self._record), out=self._fresh)
+        for key, value in self._record.items():
+            value[:, : self.substeps] = value[:, self.substeps :]
+            value[:, self.substeps :] = self._fresh[key]
+        self.ticks += 1
+        self.tick += 1
+
+    def push(self, velocity: Array) -> None:
+        """Change the bases' velocity by `(n, 2)` m/s, world frame."""
+        self._state_qvel[:, :2] += velocity
+
+    def observe(self) -> Observation:
+        """What the rig's sensors say now: delayed, quantised, biased and noisy."""
+        rows, last = np.arange(self.n), 2 * self.substeps - 1
+        noise = self._draw_noise()
+        at = last - self._joint_age
+        q = self._record["qpos"][rows, at][:, self._qpos]
+        self._play = np.clip(self._play, q - self._backlash / 2, q + self._backlash / 2)
+        position = np.round((self._play + self._zero) / self._tick_angle) * self._tick_angle
+        speed = self._record["qvel"][rows, at][:, self._dof] + _VELOCITY_NOISE * noise[:, 6:]
+        velocity = np.round(speed / self._velocity_unit) * self._velocity_unit
+        effort = np.round(self._record["actuator_force"][rows, at] / self._unit) * self._unit
+        imu = self._record["sensordata"][rows, last - self._imu_age]
+        errors = self.robot.imu
+        gyro = _tilt(imu[:, 0:3], self._tilt) + self._gyro_bias + errors.gyro_noise * noise[:, 0:3]
+        force = _tilt(imu[:, 3:6], self._tilt) + self._acc_bias + errors.accelerometer_noise * noise[:, 3:6]
+        shape = position.shape
+        voltage = np.round(self._supply / self._voltage_unit) * self._voltage_unit
+        return Observation(
+            time_ns=round(self.tick * self.robot.dt * 1e9),
+            position=position,
+            velocity=velocity,
+            effort=effort,
+            temperature=np.full(shape, np.nan),  # windings are not simulated here
+            voltage=np.broadcast_to(voltage[:, None], shape),
+            age=np.broadcast_to((self._joint_age * TIMESTEP)[:, None], shape),
+            fault=np.zeros(shape, int),
+            orientation=np.full((self.n, 4), np.nan),  # no fusion on the board is simulated
+            angular_velocity=gyro,
+            specific_force=force,
+            imu_age=(self._imu_age + 1) * TIMESTEP,
+        )
+
+    def _draw_noise(self) -> Array:
+        """This tick's standard normal noise `(n, 6 + n_joints)`, refilled from each world's own stream."""
+        row = self.ticks % _NOISE_ROWS
+        for i in np.flatnonzero(row == 0):
+            self._rngs[i].standard_normal(out=self._noise[i])
+        return self._noise[np.arange(self.n), row]
+
+
+def _tilt(vector: Array, angles: Array) -> Array:
+    """Turn `(n, 3)` by small angles `(n, 2)` about x and y."""
+    x, y = angles[:, 0], angles[:, 1]
+    return vector + np.stack([y * vector[:, 2], -x * vector[:, 2], x * vector[:, 1] - y * vector[:, 0]], -1)
