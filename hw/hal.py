@@ -215,6 +215,14 @@ class Task(Protocol):
         """Draw the episode's goal, commands and disturbances."""
         ...
 
+    def percept(self, state: State) -> Percept:
+        """What the task itself tells the robot about its surroundings."""
+        ...
+
+    def disturbance(self, tick: int) -> Array | None:
+        """Change of the base's planar velocity `(2,)` m/s, world frame, to be applied by a simulated body; or None."""
+        ...
+
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction: ...
 
     def cost(self, trajectory: Any, instruction: Instruction) -> Any:

@@ -1,0 +1,85 @@
+"""What all tasks share: settings, and a body that no disturbance touches and that perceives nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+
+from hw.hal import Array, Instruction, Percept, State, Trace
+from stack.tasks.guidance import Trajectory, Weights, twist_cost
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of every task. The text beside a field is what `servoid tasks` shows."""
+
+    seconds: Annotated[float, "s, length of the episode"]
+    cost: Annotated[Weights, "weights of the guidance cost"] = field(default_factory=Weights)
+
+    def __post_init__(self) -> None:
+        require_positive(self, "seconds")
+
+
+class BaseTask:
+    """One robot's task over one episode at a time. Implements the Task protocol but for what is asked and `success`."""
+
+    name: str
+    description: str
+    settings_type: ClassVar[type[Settings]] = Settings
+
+    def __init__(self, settings: Any, dt: float) -> None:
+        self.settings = settings
+        self.dt = dt
+        self.seconds: float = settings.seconds
+
+    @staticmethod
+    def complete(settings: dict[str, str]) -> dict[str, str]:
+        """Settings as typed, with those that follow from them."""
+        return settings
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Draw the episode. All randomness of a task comes from `rng`."""
+
+    def percept(self, state: State) -> Percept:
+        """What the task itself tells the robot about its surroundings at `state`."""
+        return Percept(source="task", age=0.0)
+
+    def disturbance(self, tick: int) -> Array | None:
+        """Change of the base's planar velocity `(2,)` m/s in the world frame at `tick`, or None."""
+        return None
+
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
+        raise NotImplementedError(f"task {self.name} asks for nothing")
+
+    def cost(self, trajectory: Trajectory, instruction: Instruction) -> Any:
+        """Guidance cost `(batch,)`: squared distance from the instructed twist."""
+        return twist_cost(trajectory, instruction.velocity, self.settings.cost)
+
+    def done(self, state: State) -> bool:
+        """Whether the episode may end before its time."""
+        return False
+
+    def success(self, trace: Trace) -> bool:
+        raise NotImplementedError(f"task {self.name} has no measure of success")
+
+    def metrics(self, trace: Trace) -> dict[str, float]:
+        return {}
+
+
+def require_positive(settings: Any, *keys: str) -> None:
+    """Raise ValueError for the first setting that is not positive."""
+    for key in keys:
+        if getattr(settings, key) <= 0.0:
+            raise ValueError(f"{key}: must be positive, not {getattr(settings, key):g}")
+
+
+def require_ranges(settings: Any, *keys: str) -> None:
+    """Raise ValueError for the first range whose low end is above its high end."""
+    for key in keys:
+        low, high = getattr(settings, key)
+        if low > high:
+            raise ValueError(f"{key}: upside down: {low:g} is above {high:g}; write low before high")

@@ -1,0 +1,43 @@
+"""Stand still."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from hw.hal import Instruction, Percept, State, Trace
+from stack.tasks.base import BaseTask, Settings, require_positive
+
+
+@dataclass(frozen=True)
+class StandSettings(Settings):
+    radius: Annotated[float, "m that the base may wander"] = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive(self, "radius")
+
+
+class Stand(BaseTask):
+    name = "stand"
+    description = "stand still"
+    settings_type = StandSettings
+
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
+        return Instruction(velocity=np.zeros(3))
+
+    def success(self, trace: Trace) -> bool:
+        return not trace.fallen and len(trace.displacement) > 0 and _wandered(trace) <= self.settings.radius
+
+    def metrics(self, trace: Trace) -> dict[str, float]:
+        return {"wandered_m": _wandered(trace)}
+
+
+def _wandered(trace: Trace) -> float:
+    """Farthest that the base was from where it started [m]."""
+    if len(trace.displacement) == 0:
+        return 0.0
+    offset = trace.displacement[:, :2] - trace.displacement[0, :2]
+    return float(np.linalg.norm(offset, axis=1).max())
