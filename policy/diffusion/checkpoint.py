@@ -1,0 +1,90 @@
+"""Checkpoints of the diffusion core: a denoiser with the normalisation of its features."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hw.hal import Array
+from hw.robot import Robot
+from policy import checkpoint
+from policy.checkpoint import CheckpointError
+from policy.diffusion.denoiser import Denoiser, DenoiserConfig
+from policy.diffusion.features import Normaliser, raw_layout, token_layout
+
+KIND = "diffusion"
+
+
+@dataclass(frozen=True)
+class Model:
+    """A denoiser with what turns features into its inputs. Normalisers hold torch tensors."""
+
+    denoiser: Denoiser
+    states: Normaliser
+    actions: Normaliser
+    header: Mapping[str, Any]
+
+    @property
+    def config(self) -> DenoiserConfig:
+        return self.denoiser.config
+
+
+def save(
+    path: Path,
+    weights: Mapping[str, Tensor],
+    config: DenoiserConfig,
+    states: Normaliser,
+    actions: Normaliser,
+    robot: Robot,
+    *,
+    data: str,
+    licence: str,
+    results: Mapping[str, Any],
+    training: Mapping[str, Any],
+) -> None:
+    """Write `weights` (a denoiser's state_dict) and all that is needed to run them. Raises CheckpointError."""
+    n = len(robot.joints)
+    head = checkpoint.header(
+        KIND,
+        robot,
+        config=asdict(config),
+        data=data,
+        licence=licence,
+        results=results,
+        training=dict(training),
+        raw_layout=raw_layout(n).to_header(),
+        token_layout=token_layout(n).to_header(),
+    )
+    tensors: dict[str, Array] = {f"denoiser.{k}": v.detach().float().cpu().numpy() for k, v in weights.items()}
+    for name, normaliser in (("states", states), ("actions", actions)):
+        tensors[f"{name}.mean"] = torch.as_tensor(normaliser.mean).numpy()
+        tensors[f"{name}.std"] = torch.as_tensor(normaliser.std).numpy()
+    checkpoint.write(path, tensors, head)
+
+
+def load(path: Path, robot: Robot) -> Model:
+    """Load a denoiser for `robot`, in evaluation mode. Raises CheckpointError saying what does not fit."""
+    head, tensors = checkpoint.read(path)
+    checkpoint.check(path, head, KIND, robot)
+    n = len(robot.joints)
+    for name, ours in (("raw", raw_layout(n)), ("token", token_layout(n))):
+        checkpoint.check_layout(path, name, head.get(f"{name}_layout", []), ours.to_header())
+    try:
+        denoiser = Denoiser(DenoiserConfig(**head["config"]))
+        weights = {
+            k.removeprefix("denoiser."): torch.from_numpy(v) for k, v in tensors.items() if k.startswith("denoiser.")
+        }
+        denoiser.load_state_dict(weights)
+        states, actions = (
+            Normaliser(torch.from_numpy(tensors[f"{k}.mean"]), torch.from_numpy(tensors[f"{k}.std"]))
+            for k in ("states", "actions")
+        )
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise CheckpointError(f"{path}: its tensors do not fit its own header: {error}") from error
+    denoiser.eval().requires_grad_(False)
+    return Model(denoiser, states, actions, head)

@@ -1,0 +1,170 @@
+"""Training windows from a recorded dataset (LeRobot v3.0 layout), all in memory.
+
+Row i holds the state of tick i, the action decided on it (clean label) and the action that really ran (noisy). A window
+is an index: its rows are gathered, mirrored and brought into the canonical frame when a batch is drawn.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hw.config import ConfigError
+from hw.hal import Array
+from hw.robot import Robot
+from policy.diffusion.denoiser import DenoiserConfig
+from policy.diffusion.features import Mirror, Normaliser, raw_layout, to_tokens
+
+COLUMNS = ("observation.state", "action", "action_applied", "episode_index", "frame_index")
+
+
+class DatasetError(ConfigError):
+    """A dataset that cannot be trained on: exit code 2."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Rows of all episodes, one after the other."""
+
+    raw: Array  # (rows, raw size) float32
+    action: Array  # (rows, n_joints) rad, what the expert decided
+    applied: Array  # (rows, n_joints) rad, what really ran
+    episode: Array  # (rows,) int
+    info: dict[str, Any]  # meta/info.json
+
+    @cached_property
+    def spans(self) -> Array:
+        """First and one past the last row of each episode, `(episodes, 2)`."""
+        starts = np.flatnonzero(np.r_[True, np.diff(self.episode) != 0])
+        return np.stack([starts, np.r_[starts[1:], len(self.episode)]], 1)
+
+
+def read_recording(folder: Path, robot: Robot) -> Recording:
+    """Read a dataset folder. Raises DatasetError naming the file and what is wrong with it."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    files = sorted(folder.glob("data/chunk-*/file-*.parquet"))
+    if not files:
+        raise DatasetError(f"{folder}: no data/chunk-*/file-*.parquet here; record a dataset with `servoid collect`")
+    try:
+        info = json.loads((folder / "meta" / "info.json").read_text())
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{folder / 'meta' / 'info.json'}: cannot be read ({error})") from error
+    n = len(robot.joints)
+    if info.get("fps", robot.rate) != robot.rate:
+        raise DatasetError(f"{folder}: recorded at {info['fps']} ticks a second, and {robot.name} runs at {robot.rate}")
+    sizes = {"observation.state": raw_layout(n).size, "action": n, "action_applied": n}
+    parts: dict[str, list[Array]] = {name: [] for name in COLUMNS}
+    for file in files:
+        try:
+            table = pq.read_table(file)
+        except (pa.ArrowInvalid, OSError) as error:
+            raise DatasetError(f"{file}: not a parquet file, or a truncated one ({error})") from error
+        for name in COLUMNS:
+            if name not in table.column_names:
+                raise DatasetError(f"{file}: no column '{name}'; it has {', '.join(table.column_names)}")
+            column = table.column(name).combine_chunks()
+            if name not in sizes:
+                parts[name].append(column.to_numpy(zero_copy_only=False))
+                continue
+            flat = column.flatten().to_numpy(zero_copy_only=False)
+            if flat.size != sizes[name] * table.num_rows:
+                raise DatasetError(f"{file}: '{name}' does not have {sizes[name]} numbers a row")
+            parts[name].append(flat.reshape(-1, sizes[name]).astype(np.float32))
+    columns = {name: np.concatenate(part) for name, part in parts.items()}
+    order = np.lexsort((columns["frame_index"], columns["episode_index"]))
+    columns = {name: np.ascontiguousarray(value[order]) for name, value in columns.items()}
+    for name in sizes:
+        bad = np.flatnonzero(~np.isfinite(columns[name]).all(1))
+        if bad.size:
+            where = f"episode {columns['episode_index'][bad[0]]}, frame {columns['frame_index'][bad[0]]}"
+            raise DatasetError(f"{folder}: '{name}' is not finite in {bad.size} rows, first in {where}")
+    gaps = (np.diff(columns["episode_index"]) == 0) & (np.diff(columns["frame_index"]) != 1)
+    if gaps.any():
+        where = np.flatnonzero(gaps)[0]
+        episode, frame = columns["episode_index"][where], columns["frame_index"][where]
+        raise DatasetError(f"{folder}: episode {episode} does not go on by one after frame {frame}")
+    return Recording(
+        columns["observation.state"], columns["action"], columns["action_applied"], columns["episode_index"], info
+    )
+
+
+class Windows:
+    """Windows over a recording, drawn as normalised batches."""
+
+    def __init__(self, recording: Recording, robot: Robot, config: DenoiserConfig, held_out: float = 0.02) -> None:
+        """A share `held_out` of the episodes, evenly spread and at least one, is kept for validation."""
+        self.config = config
+        self.n_joints = len(robot.joints)
+        self._mirror = Mirror.of(robot.mirror)
+        spans = recording.spans
+        first, last = config.history - 1, config.horizon  # ticks needed before and after the present
+        long = spans[spans[:, 1] - spans[:, 0] > first + last]
+        if len(long) < 2:
+            raise DatasetError(
+                f"{len(long)} of {len(spans)} episodes are longer than the {first + last + 1} ticks of a window, "
+                "and two are needed; record longer ones"
+            )
+        every = max(2, round(1 / held_out))
+        kept = np.arange(len(long)) % every == 0
+        self.validation = self._presents(long[kept], first, last)
+        self.training = self._presents(long[~kept], first, last)
+        self._raw = torch.from_numpy(recording.raw)
+        self._action = torch.from_numpy(recording.action)
+        self._applied = torch.from_numpy(recording.applied)
+        self.states, self.actions = self._fit()
+
+    @staticmethod
+    def _presents(spans: Array, before: int, after: int) -> Tensor:
+        """Rows that can be the present of a window."""
+        return torch.from_numpy(np.concatenate([np.arange(a + before, b - after) for a, b in spans]))
+
+    def _fit(self, samples: int = 20_000) -> tuple[Normaliser, Normaliser]:
+        """Normalisation over a fixed draw of windows and their mirror images, as torch tensors."""
+        generator = torch.Generator().manual_seed(0)
+        count = min(samples, len(self.training))
+        pick = self.training[torch.randint(len(self.training), (count,), generator=generator)]
+        drawn = [self._gather(pick, torch.full((len(pick),), mirrored)) for mirrored in (False, True)]
+        fitted = [Normaliser.fit(torch.cat([part[i] for part in drawn]).flatten(0, 1).numpy()) for i in (0, 1)]
+        a, b = (Normaliser(torch.from_numpy(f.mean), torch.from_numpy(f.std)) for f in fitted)
+        return a, b
+
+    def _gather(self, present: Tensor, mirrored: Tensor) -> tuple[Tensor, Tensor]:
+        """Tokens and actions of windows in physical units; `mirrored` `(batch,)` bool."""
+        state_rows = present[:, None] + torch.from_numpy(self.config.state_ticks)
+        action_rows = present[:, None] + torch.from_numpy(self.config.action_ticks)
+        raw = self._raw[state_rows]
+        # The past is what really ran; the future is what the expert would do.
+        past = self.config.history - 1
+        actions = torch.cat([self._applied[action_rows[:, :past]], self._action[action_rows[:, past:]]], 1)
+        flip = mirrored[:, None, None]
+        raw = torch.where(flip, self._mirror.raw(raw), raw)
+        actions = torch.where(flip, self._mirror.actions(actions), actions)
+        return to_tokens(raw, raw[:, past], self.n_joints), actions
+
+    def draw(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """A normalised training batch, each window mirrored with probability one half.
+
+        Shapes `(batch, state tokens, token size)` and `(batch, action tokens, n_joints)`.
+        """
+        present = self.training[torch.randint(len(self.training), (batch,), generator=generator)]
+        mirrored = torch.rand(batch, generator=generator) < 0.5
+        return self._encode(self._gather(present, mirrored))
+
+    def held_out(self, count: int) -> tuple[Tensor, Tensor]:
+        """Up to `count` normalised validation windows, the same every time."""
+        pick = torch.linspace(0, len(self.validation) - 1, min(count, len(self.validation))).long()
+        present = self.validation[pick]
+        return self._encode(self._gather(present, torch.arange(len(present)) % 2 == 1))
+
+    def _encode(self, window: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        states, actions = window
+        return self.states.encode(states), self.actions.encode(actions)

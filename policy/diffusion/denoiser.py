@@ -1,0 +1,125 @@
+"""The denoiser: one transformer over state and action tokens, each with its own noise level.
+
+Tokens of a window around the present tick 0, with `history` ticks known and `horizon` to come:
+
+    states   -history+1 .. 0 (past and present), 1 .. horizon
+    actions  -history+1 .. -1 (past), 0 .. horizon-1
+
+An action of tick t is decided on the state of tick t and leads to the state of tick t + 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from hw.config import ConfigError
+from hw.hal import Array
+from policy.diffusion.masks import attention_mask
+
+
+@dataclass(frozen=True)
+class DenoiserConfig:
+    """Shape of a denoiser. Stored in the checkpoint."""
+
+    state_size: int
+    action_size: int
+    layers: int = 2
+    width: int = 192
+    heads: int = 4
+    history: int = 4
+    horizon: int = 16
+    levels: int = 20
+    mask: str = "state_full_action_causal"
+
+    def __post_init__(self) -> None:
+        for name in ("state_size", "action_size", "layers", "width", "heads", "history", "horizon", "levels"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"denoiser: {name} must be at least 1, not {getattr(self, name)}")
+        if self.width % self.heads:
+            raise ConfigError(f"denoiser: width {self.width} is not a multiple of heads {self.heads}")
+
+    @property
+    def state_ticks(self) -> Array:
+        """Ticks of the state tokens, `(history + horizon,)`."""
+        return np.arange(1 - self.history, self.horizon + 1)
+
+    @property
+    def action_ticks(self) -> Array:
+        """Ticks of the action tokens, `(history - 1 + horizon,)`."""
+        return np.arange(1 - self.history, self.horizon)
+
+    @property
+    def tokens(self) -> int:
+        return len(self.state_ticks) + len(self.action_ticks)
+
+
+class Block(nn.Module):
+    """Pre-norm attention and feed-forward."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm_attention = nn.LayerNorm(width)
+        self.qkv = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+        self.norm_feed = nn.LayerNorm(width)
+        self.feed = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(approximate="tanh"), nn.Linear(4 * width, width))
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """Tokens `(batch, tokens, width)` to the same; `mask` is `(tokens, tokens)` bool."""
+        batch, tokens, width = x.shape
+        qkv = self.qkv(self.norm_attention(x)).view(batch, tokens, 3, self.heads, width // self.heads)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)
+        attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+        x = x + self.out(attended.transpose(1, 2).reshape(batch, tokens, width))
+        return x + self.feed(self.norm_feed(x))
+
+
+class Denoiser(nn.Module):
+    """Predicts the clean window (x0) from a noisy one. Inputs and outputs are normalised."""
+
+    mask: Tensor
+
+    def __init__(self, config: DenoiserConfig) -> None:
+        super().__init__()
+        self.config = config
+        width = config.width
+        # States pass through an MLP and actions through a linear layer, as in Diffuse-CLoC.
+        self.embed_state = nn.Sequential(nn.Linear(config.state_size, width), nn.GELU("tanh"), nn.Linear(width, width))
+        self.embed_action = nn.Linear(config.action_size, width)
+        self.level = nn.Embedding(config.levels + 1, width)
+        self.position = nn.Parameter(0.02 * torch.randn(config.history + config.horizon, width))
+        self.kind = nn.Parameter(0.02 * torch.randn(2, width))
+        self.blocks = nn.ModuleList(Block(width, config.heads) for _ in range(config.layers))
+        self.norm = nn.LayerNorm(width)
+        self.head_state = nn.Linear(width, config.state_size)
+        self.head_action = nn.Linear(width, config.action_size)
+        nn.init.normal_(self.level.weight, std=0.02)
+        mask = attention_mask(config.mask, config.state_ticks, config.action_ticks)
+        self.register_buffer("mask", torch.from_numpy(mask), persistent=False)
+
+    def forward(
+        self, states: Tensor, actions: Tensor, state_levels: Tensor, action_levels: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Clean states and actions predicted from noisy ones.
+
+        Shapes `(batch, state tokens, state_size)`, `(batch, action tokens, action_size)`; levels are integers
+        `(batch, tokens)`, or `(tokens,)` when the batch shares them.
+        """
+        n = states.shape[1]
+        at_state = self.embed_state(states) + self.level(state_levels) + self.position + self.kind[0]
+        at_action = self.embed_action(actions) + self.level(action_levels) + self.position[:-1] + self.kind[1]
+        x = torch.cat([at_state, at_action], 1)
+        for block in self.blocks:
+            x = block(x, self.mask)
+        x = self.norm(x)
+        return self.head_state(x[:, :n]), self.head_action(x[:, n:])
+
+    @property
+    def parameter_count(self) -> int:
+        return sum(p.numel() for p in self.parameters())

@@ -1,0 +1,246 @@
+"""State and actions <-> tokens.
+
+A raw row is what a recording holds of one tick, in the odometry frame. A token row describes the same tick seen from
+the canonical frame: the heading frame of the present tick, with its origin under the present base. So a window looks
+the same wherever the robot stands. Both keep the same information, and `to_raw` undoes `to_tokens`.
+
+Every function takes numpy arrays or torch tensors and returns what it was given; torch is not imported here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hw.hal import Array, State
+
+AnyArray = Any  # a numpy array or a torch tensor
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Named fields of a row, in order."""
+
+    fields: tuple[tuple[str, int], ...]
+
+    @property
+    def size(self) -> int:
+        return sum(size for _, size in self.fields)
+
+    def slice(self, name: str) -> slice:
+        """Where a field lies in a row. Raises KeyError."""
+        start = 0
+        for field, size in self.fields:
+            if field == name:
+                return slice(start, start + size)
+            start += size
+        raise KeyError(f"no field '{name}' in this layout: {', '.join(field for field, _ in self.fields)}")
+
+    def split(self, rows: AnyArray) -> dict[str, AnyArray]:
+        """Fields of `(..., size)` rows by name."""
+        return {name: rows[..., self.slice(name)] for name, _ in self.fields}
+
+    def to_header(self) -> list[list[Any]]:
+        """The layout as a checkpoint stores it."""
+        return [[name, size] for name, size in self.fields]
+
+
+def raw_layout(n_joints: int) -> Layout:
+    """A tick as it is recorded: odometry frame, SI units (see `hw.hal.State`)."""
+    return Layout(
+        (
+            ("displacement", 3),  # m, z above the ground
+            ("yaw", 1),  # rad
+            ("velocity", 3),  # m/s, heading frame of its own tick
+            ("angular_velocity", 3),  # rad/s, base frame
+            ("gravity", 3),  # unit vector, base frame
+            ("position", n_joints),  # rad
+            ("joint_velocity", n_joints),  # rad/s
+        )
+    )
+
+
+def token_layout(n_joints: int) -> Layout:
+    """A tick as the network sees it: canonical frame, SI units, before normalisation."""
+    return Layout(
+        (
+            ("displacement", 2),  # m from the present base
+            ("heading", 2),  # cosine and sine of the yaw from the present one
+            ("height", 1),  # m
+            ("velocity", 3),  # m/s, heading frame of its own tick
+            ("angular_velocity", 3),  # rad/s, base frame
+            ("gravity", 3),  # unit vector, base frame
+            ("position", n_joints),  # rad
+            ("joint_velocity", n_joints),  # rad/s
+        )
+    )
+
+
+def joints_of(layout: Layout) -> int:
+    """How many joints a layout describes."""
+    return dict(layout.fields)["position"]
+
+
+def raw_row(state: State) -> Array:
+    """Raw rows `(..., size)` float32 of a State."""
+    parts = (
+        state.displacement,
+        np.asarray(state.yaw)[..., None],
+        state.velocity,
+        state.angular_velocity,
+        state.gravity,
+        state.position,
+        state.joint_velocity,
+    )
+    return np.concatenate(parts, -1).astype(np.float32)
+
+
+def _namespace(x: AnyArray) -> Any:
+    if isinstance(x, np.ndarray):
+        return np
+    import torch
+
+    return torch
+
+
+def _rotate(xy: AnyArray, yaw: AnyArray, xp: Any) -> AnyArray:
+    """Turn planar vectors `(..., 2)` by `yaw` `(...)`."""
+    c, s = xp.cos(yaw), xp.sin(yaw)
+    x, y = xy[..., 0], xy[..., 1]
+    return xp.stack([c * x - s * y, s * x + c * y], -1)
+
+
+def to_tokens(raw: AnyArray, present: AnyArray, n_joints: int) -> AnyArray:
+    """Rows `(..., time, raw size)` seen from the raw row `present` `(..., raw size)`: `(..., time, token size)`."""
+    xp = _namespace(raw)
+    row = raw_layout(n_joints).split(raw)
+    origin = raw_layout(n_joints).split(present[..., None, :])
+    yaw = row["yaw"] - origin["yaw"]
+    moved = row["displacement"][..., :2] - origin["displacement"][..., :2]
+    parts = [
+        _rotate(moved, -origin["yaw"][..., 0], xp),
+        xp.cos(yaw),
+        xp.sin(yaw),
+        row["displacement"][..., 2:],
+        *(row[name] for name in ("velocity", "angular_velocity", "gravity", "position", "joint_velocity")),
+    ]
+    return xp.concat(parts, -1)
+
+
+def to_raw(tokens: AnyArray, present: AnyArray, n_joints: int) -> AnyArray:
+    """Inverse of `to_tokens`; the yaw comes back within pi of the present one, since a heading has no turns."""
+    xp = _namespace(tokens)
+    token = token_layout(n_joints).split(tokens)
+    origin = raw_layout(n_joints).split(present[..., None, :])
+    heading = token["heading"]
+    parts = [
+        _rotate(token["displacement"], origin["yaw"][..., 0], xp) + origin["displacement"][..., :2],
+        token["height"],
+        xp.arctan2(heading[..., 1:], heading[..., :1]) + origin["yaw"],
+        *(token[name] for name in ("velocity", "angular_velocity", "gravity", "position", "joint_velocity")),
+    ]
+    return xp.concat(parts, -1)
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """Left and right swapped, for raw rows and for actions: `x[..., index] * sign`."""
+
+    raw_index: Array
+    raw_sign: Array
+    action_index: Array
+    action_sign: Array
+
+    @classmethod
+    def of(cls, joints: tuple[Array, Array]) -> Mirror:
+        """From the robot's `mirror` (index, sign) over its joints."""
+        index, sign = joints
+        layout = raw_layout(len(index))
+        raw_index, raw_sign = np.arange(layout.size), np.ones(layout.size, dtype=np.float32)
+        # A mirror through the x-z plane turns y of a vector, x and z of a rotation.
+        for name, flipped in (
+            ("displacement", (1,)),
+            ("yaw", (0,)),
+            ("velocity", (1,)),
+            ("angular_velocity", (0, 2)),
+            ("gravity", (1,)),
+        ):
+            start = layout.slice(name).start
+            raw_sign[[start + i for i in flipped]] = -1
+        for name in ("position", "joint_velocity"):
+            part = layout.slice(name)
+            raw_index[part] = part.start + index
+            raw_sign[part] = sign
+        return cls(raw_index, raw_sign, np.asarray(index), np.asarray(sign, dtype=np.float32))
+
+    def raw(self, rows: AnyArray) -> AnyArray:
+        """Mirrored raw rows `(..., raw size)`."""
+        return _take(rows, self.raw_index, self.raw_sign)
+
+    def actions(self, actions: AnyArray) -> AnyArray:
+        """Mirrored joint targets `(..., n_joints)`."""
+        return _take(actions, self.action_index, self.action_sign)
+
+
+def _take(x: AnyArray, index: Array, sign: Array) -> AnyArray:
+    if isinstance(x, np.ndarray):
+        return x[..., index] * sign.astype(x.dtype)
+    xp = _namespace(x)
+    return x[..., xp.as_tensor(index)] * xp.as_tensor(sign, dtype=x.dtype)
+
+
+@dataclass(frozen=True)
+class Normaliser:
+    """Zero mean and unit deviation per feature; `mean` and `std` are both numpy or both torch, `(features,)`."""
+
+    mean: AnyArray
+    std: AnyArray
+
+    # A feature that hardly moves would be blown up to noise: deviations below this (rad, m, m/s) count as this.
+    FLOOR = 0.01
+
+    @classmethod
+    def fit(cls, values: Array) -> Normaliser:
+        """From `(samples, features)`."""
+        std = np.maximum(values.std(0, dtype=np.float64), cls.FLOOR)
+        return cls(values.mean(0, dtype=np.float64).astype(np.float32), std.astype(np.float32))
+
+    def encode(self, x: AnyArray) -> AnyArray:
+        return (x - self.mean) / self.std
+
+    def decode(self, x: AnyArray) -> AnyArray:
+        return x * self.std + self.mean
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The predicted future in physical units, in the heading frame of now: what a guidance cost is given (torch)."""
+
+    displacement: AnyArray  # (batch, horizon, 2) m
+    yaw: AnyArray  # (batch, horizon) rad
+    velocity: AnyArray  # (batch, horizon, 2) m/s, heading frame of its own tick
+    yaw_rate: AnyArray  # (batch, horizon) rad/s
+    height: AnyArray  # (batch, horizon) m
+    dt: float  # s between ticks; the first is one tick from now
+
+    @classmethod
+    def of(cls, tokens: AnyArray, n_joints: int, dt: float) -> Trajectory:
+        """From tokens `(batch, horizon, token size)` in physical units."""
+        xp = _namespace(tokens)
+        token = token_layout(n_joints).split(tokens)
+        return cls(
+            displacement=token["displacement"],
+            yaw=xp.arctan2(token["heading"][..., 1], token["heading"][..., 0]),
+            velocity=token["velocity"][..., :2],
+            yaw_rate=token["angular_velocity"][..., 2],
+            height=token["height"][..., 0],
+            dt=dt,
+        )
+
+
+def layout_from_header(fields: Sequence[Sequence[Any]]) -> Layout:
+    """The layout that `Layout.to_header` stored."""
+    return Layout(tuple((str(name), int(size)) for name, size in fields))

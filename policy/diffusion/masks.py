@@ -1,0 +1,47 @@
+"""Attention masks by name, over state tokens followed by action tokens.
+
+A mask is `(tokens, tokens)` bool, True where the row's token may attend to the column's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from difflib import get_close_matches
+
+import numpy as np
+
+from hw.config import ConfigError
+from hw.hal import Array
+
+
+def full(state_ticks: Array, action_ticks: Array) -> Array:
+    """Every token attends to every token."""
+    tokens = len(state_ticks) + len(action_ticks)
+    return np.ones((tokens, tokens), dtype=bool)
+
+
+def state_full_action_causal(state_ticks: Array, action_ticks: Array) -> Array:
+    """The mask of Diffuse-CLoC (arXiv:2503.11801, section 3.1 and figure 3).
+
+    States attend to all states, past and future, and to no action. The action of a tick attends to the states and the
+    actions up to that tick: what lies ahead reaches it only through the present state's token, which has seen it.
+    """
+    states = np.ones((len(state_ticks), len(state_ticks)), dtype=bool)
+    no_actions = np.zeros((len(state_ticks), len(action_ticks)), dtype=bool)
+    to_states = state_ticks[None, :] <= action_ticks[:, None]
+    to_actions = action_ticks[None, :] <= action_ticks[:, None]
+    return np.block([[states, no_actions], [to_states, to_actions]])
+
+
+MASKS: dict[str, Callable[[Array, Array], Array]] = {
+    "full": full,
+    "state_full_action_causal": state_full_action_causal,
+}
+
+
+def attention_mask(name: str, state_ticks: Array, action_ticks: Array) -> Array:
+    """Mask `name` for tokens of the given ticks. Raises ConfigError with the nearest name when there is no such mask."""
+    if name not in MASKS:
+        near = get_close_matches(name, MASKS, n=1, cutoff=0.0)[0]
+        raise ConfigError(f"no attention mask is called '{name}': did you mean '{near}'? There are {', '.join(MASKS)}.")
+    return MASKS[name](state_ticks, action_ticks)
