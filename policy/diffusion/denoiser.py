@@ -58,6 +58,15 @@ class DenoiserConfig:
         return len(self.state_ticks) + len(self.action_ticks)
 
 
+def _attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
+    """Masked attention over `(batch, heads, tokens, head width)`."""
+    if not torch.is_grad_enabled():
+        return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+    # With a mask, the backward pass of the fused kernel takes 40 % of a training step on a CPU; this takes 5 %.
+    scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
+    return scores.masked_fill(~mask, float("-inf")).softmax(-1).to(v.dtype) @ v
+
+
 class Block(nn.Module):
     """Pre-norm attention and feed-forward."""
 
@@ -68,14 +77,14 @@ class Block(nn.Module):
         self.qkv = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
         self.norm_feed = nn.LayerNorm(width)
-        self.feed = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(approximate="tanh"), nn.Linear(4 * width, width))
+        self.feed = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Tokens `(batch, tokens, width)` to the same; `mask` is `(tokens, tokens)` bool."""
         batch, tokens, width = x.shape
         qkv = self.qkv(self.norm_attention(x)).view(batch, tokens, 3, self.heads, width // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)
-        attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+        attended = _attend(q, k, v, mask)
         x = x + self.out(attended.transpose(1, 2).reshape(batch, tokens, width))
         return x + self.feed(self.norm_feed(x))
 
@@ -90,7 +99,7 @@ class Denoiser(nn.Module):
         self.config = config
         width = config.width
         # States pass through an MLP and actions through a linear layer, as in Diffuse-CLoC.
-        self.embed_state = nn.Sequential(nn.Linear(config.state_size, width), nn.GELU("tanh"), nn.Linear(width, width))
+        self.embed_state = nn.Sequential(nn.Linear(config.state_size, width), nn.GELU(), nn.Linear(width, width))
         self.embed_action = nn.Linear(config.action_size, width)
         self.level = nn.Embedding(config.levels + 1, width)
         self.position = nn.Parameter(0.02 * torch.randn(config.history + config.horizon, width))
