@@ -1,0 +1,140 @@
+"""The `servoid` command. A verb's module is imported only when the verb is called, so that `--help` is quick."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import select
+import signal
+import sys
+import traceback
+from dataclasses import dataclass, field
+from importlib import metadata
+from types import ModuleType
+
+from tools import exit_codes
+from tools.parser import Parser, suggestion
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A verb: the module that has `add_arguments(parser)` and `main(args) -> int`, or verbs of its own."""
+
+    help: str
+    module: str = ""
+    verbs: dict[str, Verb] = field(default_factory=dict)
+
+
+VERBS: dict[str, Verb] = {
+    "tasks": Verb("list what can be run, with settings", "tools.tasks"),
+    "doctor": Verb("check whether this machine is ready", "tools.doctor"),
+    "run": Verb("run a task on a simulated, virtual or real robot", "tools.run"),
+    "rollout": Verb("run a task many times in simulation and measure it", "tools.rollout"),
+    "collect": Verb("record demonstrations of the expert as a dataset", "tools.collect"),
+    "train": Verb(
+        "train a network",
+        verbs={
+            "expert": Verb("PPO: the tracker of references", "tools.train.expert"),
+            "odometry": Verb("the correction of leg odometry", "tools.train.odometry"),
+            "diffusion": Verb("the diffusion planner-controller", "tools.train.diffusion"),
+        },
+    ),
+    "bench": Verb(
+        "measure speed on this machine",
+        verbs={
+            "sim": Verb("batched simulation against the raw engine", "tools.bench.sim"),
+            "policy": Verb("planning time", "tools.bench.policy"),
+            "loop": Verb("lateness of the control loop", "tools.bench.loop"),
+        },
+    ),
+    "replay": Verb("repeat a recorded run and compare", "tools.replay"),
+    "plot": Verb("draw a recorded run", "tools.plot"),
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line `argv` and return its exit code."""
+    debug = os.environ.get("SERVOID_DEBUG") == "1"
+    try:
+        code = _dispatch("servoid", VERBS, sys.argv[1:] if argv is None else argv)
+        sys.stdout.flush()
+        return code
+    except SystemExit as stop:  # argparse: help or a usage error
+        return stop.code if isinstance(stop.code, int) else exit_codes.DONE
+    except BaseException as error:
+        if isinstance(error, BrokenPipeError) and _reader_left():
+            return 128 + signal.SIGPIPE
+        if debug:
+            traceback.print_exc()
+        print(f"servoid: {exit_codes.explain(error)}", file=sys.stderr)
+        return exit_codes.exit_code(error)
+
+
+def _reader_left() -> bool:
+    """Whether standard output's reader is gone (`servoid ... | head`), rather than some other pipe's."""
+    try:
+        descriptor = sys.stdout.fileno()
+    except (AttributeError, OSError):  # captured in memory
+        return False
+    poll = select.poll()
+    poll.register(descriptor, 0)  # errors are reported unasked: a pipe without a reader is one
+    if not any(events & (select.POLLERR | select.POLLHUP) for _, events in poll.poll(0)):
+        return False
+    # Python flushes once more at exit and would complain: let that go nowhere.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
+    return True
+
+
+def _dispatch(prog: str, verbs: dict[str, Verb], argv: list[str]) -> int:
+    if not argv or argv[0].startswith("-"):
+        _overview(prog, verbs).parse_args(argv)
+        _overview(prog, verbs).error(f"say what to do: {', '.join(verbs)}")
+    name, rest = argv[0], argv[1:]
+    if name not in verbs:
+        near = suggestion(name, verbs) or f"; known: {', '.join(verbs)}"
+        _overview(prog, verbs).error(f"unknown verb '{name}'{near}")
+    verb = verbs[name]
+    if verb.verbs:
+        return _dispatch(f"{prog} {name}", verb.verbs, rest)
+    module = importlib.import_module(verb.module)
+    parser = Parser(prog=f"{prog} {name}", description=_summary(module), formatter_class=_Formatter)
+    module.add_arguments(parser)
+    return int(module.main(parser.parse_args(rest)))
+
+
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=32)
+
+
+def _summary(module: ModuleType) -> str:
+    return (module.__doc__ or "").strip()
+
+
+def _overview(prog: str, verbs: dict[str, Verb]) -> Parser:
+    """The parser of a command that only has verbs: it answers `--help` and, at the top, `--version`."""
+    width = max(map(len, verbs))
+    lines = "\n".join(f"  {name:<{width}}  {verb.help}" for name, verb in verbs.items())
+    parser = Parser(
+        prog=prog,
+        usage=f"{prog} VERB ...",
+        description=f"verbs:\n{lines}",
+        epilog=f"{prog} VERB --help tells what a verb takes.",
+        formatter_class=_Formatter,
+    )
+    if prog == "servoid":
+        parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
+    return parser
+
+
+class _Version(argparse.Action):
+    """Looks the version up only when asked."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        print(f"servoid {metadata.version('servoid')}")
+        parser.exit()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
