@@ -1,0 +1,37 @@
+# make demo: install, then walk to a goal.   make test: install what tests need, then run all of them.
+# make clean: remove the environment and what runs left.   PYTHON=... chooses the interpreter (3.11 or newer).
+
+PYTHON ?= $(shell for p in python3.11 python3; do $$p -c '' 2>/dev/null && echo $$p && break; done)
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+.PHONY: demo test clean
+
+demo: $(VENV)/.installed-demo
+	mkdir -p runs
+	$(BIN)/servoid run goal --backend sim --seed 1 --record runs/demo.mcap --video runs/demo.mp4
+
+test: $(VENV)/.installed-test
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/pytest
+
+# A stamp is newer than pyproject.toml once its packages are installed, so that nothing is installed twice.
+$(VENV)/.installed-demo: pyproject.toml | $(BIN)/python
+	$(PIP) install --editable '.[video]'
+	touch $@
+
+$(VENV)/.installed-test: pyproject.toml | $(BIN)/python
+	$(PIP) install --editable '.[test]'
+	touch $@ $(VENV)/.installed-demo
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "no python3 found: install Python 3.11, or say make PYTHON=/path/to/python" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "$(PYTHON) is older than 3.11: say make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+clean:
+	rm -rf $(VENV) build *.egg-info runs .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
