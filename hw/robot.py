@@ -45,7 +45,7 @@ class Joint:
     """A joint. `zero` is added to the servo's angle, `direction` is 1 or -1; angles rad."""
 
     name: str
-    servo: str
+    servo: str  # a name in configs/servos, or a .yaml file: relative to the robot's file, absolute once loaded
     id: int
     direction: int
     zero: float
@@ -170,7 +170,14 @@ def load_robot(name: str | Path = "op3") -> Robot:
     path = resolve("robots", name)
     robot, marks = load_marked(path, Robot)
     check_robot(robot, marks)
-    return replace(robot, mjcf=str((path.parent / robot.mjcf).resolve()))
+    folder = path.parent.resolve()
+    joints = tuple(
+        replace(joint, servo=str(folder / joint.servo)) if joint.servo.endswith((".yaml", ".yml")) else joint
+        for joint in robot.joints
+    )
+    robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints)
+    _ = robot.servos  # a servo's file that cannot be used is found now, not when the robot stands
+    return robot
 
 
 __all__ = ["ConfigError", "Joint", "Robot", "Servo", "load_robot", "load_servo"]

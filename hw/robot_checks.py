@@ -72,7 +72,10 @@ def _check_identity(robot: Robot, marks: Marks) -> None:
             )
         ids[joint.id] = joint.name
         known = available("servos")
-        if not joint.servo.endswith((".yaml", ".yml")) and joint.servo not in known:
+        if joint.servo.endswith((".yaml", ".yml")):
+            if not (marks.path.parent / joint.servo).is_file():
+                raise marks.error(f"joints[{i}].servo", f"no file {joint.servo} in {marks.path.parent}")
+        elif joint.servo not in known:
             raise marks.error(f"joints[{i}].servo", f"unknown servo '{joint.servo}'; {nearest(joint.servo, known)}")
 
 

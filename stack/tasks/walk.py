@@ -56,12 +56,12 @@ class Walk(BaseTask):
         self._pushes: Array = size[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
-        segment = tick // round(self.settings.every / self.dt)
+        segment = tick // max(round(self.settings.every / self.dt), 1)
         return Instruction(velocity=self._commands[min(segment, len(self._commands) - 1)].copy())
 
     def disturbance(self, tick: int) -> Array | None:
         """A push at each whole interval, the first one interval after the start."""
-        number, rest = divmod(tick, round(self.settings.push_every / self.dt))
+        number, rest = divmod(tick, max(round(self.settings.push_every / self.dt), 1))
         if rest or not 1 <= number <= len(self._pushes) or self.settings.push[1] == 0.0:
             return None
         return self._pushes[number - 1].copy()

@@ -152,3 +152,20 @@ def test_a_servo_that_cannot_be_is_refused(tmp_path: Path, old: str, new: str, w
     with pytest.raises(ConfigError, match=re.escape(words)) as caught:
         load_servo(str(path))
     assert str(caught.value).startswith(f"{path}:{line}: "), caught.value
+
+
+def test_a_robot_may_bring_its_own_servo_and_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files beside the robot's own are found wherever the program was started."""
+    edited(tmp_path, "robots", "op3.yaml", ROLL, ROLL.replace("servo: xm430-w350", "servo: strong.yaml"))
+    strong = (CONFIGS / "servos" / "xm430-w350.yaml").read_text().replace("stall_torque: 2.95", "stall_torque: 5.0")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"op3\.yaml:\d+: joints\[3\]\.servo: no file strong\.yaml in "):
+        load_robot("op3.yaml")
+    (tmp_path / "strong.yaml").write_text(strong.replace("stall_torque", "stahl_torque"))
+    with pytest.raises(ConfigError, match=r"strong\.yaml:14: stahl_torque: unknown key; did you mean 'stall_torque'"):
+        load_robot("op3.yaml")
+    (tmp_path / "strong.yaml").write_text(strong)
+    robot = load_robot("op3.yaml")
+    monkeypatch.chdir("/")
+    assert [servo.stall_torque for servo in robot.servos[2:5]] == [2.95, 5.0, 2.95]
+    assert robot.mjcf == str(tmp_path / "op3.xml")
