@@ -14,10 +14,9 @@ from hw.hal import Array
 from hw.robot import Robot
 from policy import checkpoint
 from policy.checkpoint import CheckpointError
-from policy.diffusion.denoiser import Denoiser, DenoiserConfig
+from policy.diffusion.config import KIND, DenoiserConfig, check_fit
+from policy.diffusion.denoiser import Denoiser
 from policy.diffusion.features import Normaliser, raw_layout, token_layout
-
-KIND = "diffusion"
 
 
 @dataclass(frozen=True)
@@ -70,21 +69,15 @@ def save(
 def load(path: Path, robot: Robot) -> Model:
     """Load a denoiser for `robot`, in evaluation mode. Raises CheckpointError saying what does not fit."""
     head, tensors = checkpoint.read(path)
-    checkpoint.check(path, head, KIND, robot)
-    n = len(robot.joints)
-    for name, ours in (("raw", raw_layout(n)), ("token", token_layout(n))):
-        checkpoint.check_layout(path, name, head.get(f"{name}_layout", []), ours.to_header())
+    denoiser = Denoiser(check_fit(path, head, robot))
     try:
-        denoiser = Denoiser(DenoiserConfig(**head["config"]))
-        weights = {
-            k.removeprefix("denoiser."): torch.from_numpy(v) for k, v in tensors.items() if k.startswith("denoiser.")
-        }
+        weights = {k.removeprefix("denoiser."): torch.from_numpy(v) for k, v in tensors.items() if "denoiser." in k}
         denoiser.load_state_dict(weights)
         states, actions = (
             Normaliser(torch.from_numpy(tensors[f"{k}.mean"]), torch.from_numpy(tensors[f"{k}.std"]))
             for k in ("states", "actions")
         )
-    except (KeyError, TypeError, RuntimeError) as error:
+    except (KeyError, RuntimeError) as error:
         raise CheckpointError(f"{path}: its tensors do not fit its own header: {error}") from error
     denoiser.eval().requires_grad_(False)
     return Model(denoiser, states, actions, head)

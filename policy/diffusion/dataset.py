@@ -19,7 +19,7 @@ from torch import Tensor
 from hw.config import ConfigError
 from hw.hal import Array
 from hw.robot import Robot
-from policy.diffusion.denoiser import DenoiserConfig
+from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.features import Mirror, Normaliser, raw_layout, to_tokens
 
 COLUMNS = ("observation.state", "action", "action_applied", "episode_index", "frame_index")

@@ -10,52 +10,12 @@ An action of tick t is decided on the state of tick t and leads to the state of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hw.config import ConfigError
-from hw.hal import Array
+from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.masks import attention_mask
-
-
-@dataclass(frozen=True)
-class DenoiserConfig:
-    """Shape of a denoiser. Stored in the checkpoint."""
-
-    state_size: int
-    action_size: int
-    layers: int = 2
-    width: int = 192
-    heads: int = 4
-    history: int = 4
-    horizon: int = 16
-    levels: int = 20
-    mask: str = "state_full_action_causal"
-
-    def __post_init__(self) -> None:
-        for name in ("state_size", "action_size", "layers", "width", "heads", "history", "horizon", "levels"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"denoiser: {name} must be at least 1, not {getattr(self, name)}")
-        if self.width % self.heads:
-            raise ConfigError(f"denoiser: width {self.width} is not a multiple of heads {self.heads}")
-
-    @property
-    def state_ticks(self) -> Array:
-        """Ticks of the state tokens, `(history + horizon,)`."""
-        return np.arange(1 - self.history, self.horizon + 1)
-
-    @property
-    def action_ticks(self) -> Array:
-        """Ticks of the action tokens, `(history - 1 + horizon,)`."""
-        return np.arange(1 - self.history, self.horizon)
-
-    @property
-    def tokens(self) -> int:
-        return len(self.state_ticks) + len(self.action_ticks)
 
 
 def _attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:

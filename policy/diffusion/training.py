@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from policy.diffusion.denoiser import Denoiser, DenoiserConfig
+from policy.diffusion.config import DenoiserConfig
+from policy.diffusion.denoiser import Denoiser
 
 
 def draw_levels(

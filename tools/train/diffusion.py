@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     import torch
 
     from hw.robot import Robot
+    from policy.diffusion.config import DenoiserConfig
     from policy.diffusion.dataset import Windows
-    from policy.diffusion.denoiser import DenoiserConfig
 
 # From a checkpoint's path to what was measured; "survival" in it is the share of worlds that stayed up, 0 to 1.
 Survival = Callable[[Path], Mapping[str, float]]
@@ -78,8 +78,8 @@ def main(args: argparse.Namespace) -> int:
     import torch
 
     from hw.robot import load_robot
+    from policy.diffusion.config import DenoiserConfig
     from policy.diffusion.dataset import Windows, read_recording
-    from policy.diffusion.denoiser import DenoiserConfig
     from policy.diffusion.features import token_layout
 
     survival = _survival(args.survival_seconds, args.survival_worlds, args.seed) if args.survival_worlds else None

@@ -1,0 +1,67 @@
+"""The shape of a denoiser, and whether the one that a checkpoint describes fits a robot. Free of torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hw.config import ConfigError
+from hw.hal import Array
+from hw.robot import Robot
+from policy import checkpoint
+from policy.checkpoint import CheckpointError
+from policy.diffusion.features import raw_layout, token_layout
+
+KIND = "diffusion"  # of a checkpoint
+
+
+@dataclass(frozen=True)
+class DenoiserConfig:
+    """Shape of a denoiser. Stored in the checkpoint."""
+
+    state_size: int
+    action_size: int
+    layers: int = 2
+    width: int = 192
+    heads: int = 4
+    history: int = 4
+    horizon: int = 16
+    levels: int = 20
+    mask: str = "state_full_action_causal"
+
+    def __post_init__(self) -> None:
+        for name in ("state_size", "action_size", "layers", "width", "heads", "history", "horizon", "levels"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"denoiser: {name} must be at least 1, not {getattr(self, name)}")
+        if self.width % self.heads:
+            raise ConfigError(f"denoiser: width {self.width} is not a multiple of heads {self.heads}")
+
+    @property
+    def state_ticks(self) -> Array:
+        """Ticks of the state tokens, `(history + horizon,)`."""
+        return np.arange(1 - self.history, self.horizon + 1)
+
+    @property
+    def action_ticks(self) -> Array:
+        """Ticks of the action tokens, `(history - 1 + horizon,)`."""
+        return np.arange(1 - self.history, self.horizon)
+
+    @property
+    def tokens(self) -> int:
+        return len(self.state_ticks) + len(self.action_ticks)
+
+
+def check_fit(path: Path, head: Mapping[str, Any], robot: Robot) -> DenoiserConfig:
+    """The network that a header describes. Raises CheckpointError saying why it does not fit `robot`."""
+    checkpoint.check(path, head, KIND, robot)
+    n = len(robot.joints)
+    for name, ours in (("raw", raw_layout(n)), ("token", token_layout(n))):
+        checkpoint.check_layout(path, name, head.get(f"{name}_layout", []), ours.to_header())
+    try:
+        return DenoiserConfig(**head["config"])
+    except (TypeError, ConfigError) as error:
+        raise CheckpointError(f"{path}: the network's config in its header cannot be used: {error}") from error
