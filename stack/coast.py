@@ -10,16 +10,16 @@ import numpy as np
 from hw.hal import Observation
 
 JOINT_FIELDS = ("position", "velocity", "effort")
-IMU_FIELDS = ("orientation", "angular_velocity", "specific_force")
+IMU_FIELDS = ("angular_velocity", "specific_force")
 SLOW_FIELDS = ("temperature", "voltage")  # read in rotation: their last value stands
 
 
 class Coast:
     """Fills what an observation lacks (NaN) from the newest valid sample.
 
-    A joint's sample is its position and velocity; the IMU's is orientation, angular velocity and specific force. A
-    filled sample keeps its own time, so its age says how old it is; the guard damps when it is too old. What was never
-    read stays NaN with an infinite age.
+    A joint's sample is its position and velocity; the IMU's is angular velocity and specific force (not every IMU
+    fuses them into an orientation). A filled sample keeps its own time, so its age says how old it is; the guard damps
+    when it is too old. What was never read stays NaN with an infinite age.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Coast:
                 now = getattr(observation, name)
                 changes[name] = np.where(np.isfinite(now), now, getattr(last, name))
             if not imu:
-                changes |= {name: getattr(last, name) for name in IMU_FIELDS}
+                changes |= {name: getattr(last, name) for name in (*IMU_FIELDS, "orientation")}
             changes["age"] = np.where(joints, observation.age, last.age + passed)
             changes["imu_age"] = np.asarray(observation.imu_age if imu else last.imu_age + passed)
             filled = replace(observation, **changes)

@@ -1,11 +1,18 @@
-"""Ctrl-C as a request, not as an exception: a write to the motors is never cut in half."""
+"""Ctrl-C and other reasons to stop as requests, not as exceptions: a write to the motors is never cut in half."""
 
 from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from types import FrameType
 from typing import Any
+
+from stack.event import Event
+
+ONCE = "interrupted: lowering; once more for torque off at once"
+TWICE = "interrupted twice: torque off at once"
 
 
 class Interrupt:
@@ -40,3 +47,34 @@ class Interrupt:
         self.count += 1
         if self.count > 1 and self.breakable:
             raise KeyboardInterrupt
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """A reason to end that came from outside the robot."""
+
+    kind: str
+    text: str
+    at_once: bool = False  # without lowering
+
+
+class Stops:
+    """All such reasons in one place: the operator's Ctrl-C, a log that cannot be written, and, when a recorded run is
+    repeated, the ones that its log tells of."""
+
+    def __init__(
+        self, interrupt: Interrupt, failure: Callable[[], str | None] = lambda: None, script: Sequence[Event] = ()
+    ) -> None:
+        self._interrupt, self._failure, self._script = interrupt, failure, script
+
+    def at(self, tick: int) -> Stop | None:
+        """The reason to stop at a tick, the strongest first."""
+        due = [event for event in self._script if event.tick <= tick]
+        if self._interrupt.count > 1 or any(event.text == TWICE for event in due):
+            return Stop("interrupt", TWICE, at_once=True)
+        if self._interrupt.count == 1:
+            return Stop("interrupt", ONCE)
+        if due:
+            return Stop(due[0].kind, due[0].text)
+        failure = self._failure()
+        return Stop("record", failure) if failure is not None else None

@@ -24,9 +24,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from hw.hal import Array, Command, Mode, Motors, Observation
+from hw.hal import Array, Command, Mode, Motors, Observation, State
 from hw.robot import Robot
-from stack.coast import missing
+from stack.coast import complete, missing
 from stack.crouch import crouch
 from stack.event import Event
 from stack.limits import limit
@@ -79,6 +79,7 @@ class Guard:
         self.phase = Phase.LIMP
         self.applied: Array = robot.home.copy()  # (n_joints,) rad: the last accepted goal
         self.off = False  # torque off has been sent
+        self.cause: str | None = None  # kind of the event that ended the run, the first if there were several
         self.lowest = crouch(robot)
         self._motors = motors
         self._gain = np.full(len(robot.names), gain)
@@ -117,6 +118,7 @@ class Guard:
         """End in order: lowered if it stands, damped, off. Does nothing when the robot is ending already."""
         if self.phase in ENDED or self.phase is Phase.LOWERING:
             return
+        self.cause = self.cause or kind
         self.note(kind, text, joint)
         if self.phase in {Phase.READY, Phase.RUNNING}:
             self._motion = Motion(self.applied, self.lowest, round(LOWER_SECONDS * self.robot.rate))
@@ -128,12 +130,14 @@ class Guard:
         """End at once: damped, then off."""
         if self.phase in ENDED:
             return
+        self.cause = self.cause or kind
         self.note(kind, text, joint)
         self._enter(Phase.FAULT, f"damped: {text}")
 
     def release(self) -> None:
         """Damp and turn torque off at once, both tried even if one fails. Raises the first BackendError at the end."""
         if self.phase not in ENDED:
+            self.cause = self.cause or "interrupt"
             self._enter(Phase.DAMPED, "released")
         if self.off:
             return
@@ -150,21 +154,27 @@ class Guard:
 
     # One tick --------------------------------------------------------------------------------------------------------
 
-    def decide(self, tick: int, observation: Observation, target: Array | None) -> Command:
-        """What to send at `tick`.
-
-        `observation` holds the newest sample of each joint and its age; `target` `(n_joints,)` rad is what a policy
-        proposes and is looked at only in RUNNING, where None means that it proposes nothing and the goal holds.
-        """
+    def begin(self, tick: int, time_ns: int) -> None:
+        """A new tick, at a time of the loop's clock."""
         self._tick = tick
-        self._began = observation.time_ns if self._began is None else self._began
-        self._time = (observation.time_ns - self._began) * 1e-9
+        self._began = time_ns if self._began is None else self._began
+        self._time = (time_ns - self._began) * 1e-9
+
+    def decide(self, observation: Observation, state: State | None, target: Array | None) -> Command:
+        """What to send at this tick.
+
+        `observation` holds the newest sample of each joint and its age; `state` is read for the tilt alone, and is None
+        while there is not a sample of everything yet; `target` `(n_joints,)` rad is what a policy proposes and is
+        looked at only in RUNNING, where None means that it proposes nothing and the goal holds.
+        """
         if self.phase in POWERED:
-            self._check(observation)
+            self._check(observation, state)
         if self.phase is Phase.RUNNING and target is not None:
             self._accept(target)
         elif self.phase in {Phase.READY, Phase.RUNNING}:
-            self._accepted = tick  # a goal that is held is accepted anew, so that time spent holding earns no leap
+            self._accepted = (
+                self._tick
+            )  # a goal that is held is accepted anew, so that time spent holding earns no leap
         elif self.phase is Phase.HOMING:
             self._home_on(observation)
         elif self.phase is Phase.LOWERING:
@@ -173,7 +183,7 @@ class Guard:
             self._command = self._make(Mode.ACTIVE)
         elif self.phase in ENDED:
             self._damped_ticks += 1
-            braking = self._damped_ticks <= DAMP_SECONDS * self.robot.rate
+            braking = not self.off and self._damped_ticks <= DAMP_SECONDS * self.robot.rate
             self._command = self._make(Mode.DAMP if braking else Mode.OFF)
         return self._command
 
@@ -236,7 +246,7 @@ class Guard:
         self.applied = limit(self._motion.next(), self.applied, self.robot, self._elapsed())
         self._accepted = self._tick
 
-    def _check(self, observation: Observation) -> None:
+    def _check(self, observation: Observation, state: State | None) -> None:
         limits, names = self.robot.limits, self.robot.names
         oldest = limits.stale * self.robot.dt + 1e-9
         joints = np.isfinite(observation.position) & np.isfinite(observation.velocity) & (observation.age <= oldest)
@@ -244,8 +254,8 @@ class Guard:
             name = names[int(np.flatnonzero(~joints)[0])]
             self.fault("stale", f"no fresh sample from {name} for {limits.stale} ticks: check its cable", name)
             return
-        orientation = observation.orientation
-        if not (np.isfinite(orientation).all() and float(observation.imu_age) <= oldest):
+        tilt = _tilt(observation, state)
+        if not (complete(observation) and float(observation.imu_age) <= oldest and math.isfinite(tilt)):
             self.fault("stale", f"no fresh sample from the IMU for {limits.stale} ticks: check its cable")
             return
         broken = np.flatnonzero(observation.fault)
@@ -254,7 +264,6 @@ class Guard:
             causes = [text for bit, text in SERVO_ERRORS.items() if bits >> bit & 1] or [f"error {bits:#04x}"]
             self.fault("servo", f"{name} reports {', '.join(causes)}: let it cool, then reboot it", name)
             return
-        tilt = _tilt(orientation)
         if tilt > limits.tilt and self.phase is not Phase.HOMING:  # on the way home it may hang from a hand
             self.fault("fall", f"tilted by {math.degrees(tilt):.0f} degrees")
             return
@@ -270,6 +279,8 @@ class Guard:
         return Command(position=self.applied, gain=self._gain, mode=mode)
 
     def _enter(self, phase: Phase, text: str) -> None:
+        if self.phase is Phase.LIMP and phase in ENDED:
+            self.off = True  # torque was never on: there is nothing to brake
         self.phase = phase
         self.note("phase", text)
 
@@ -278,7 +289,12 @@ class Guard:
             raise RuntimeError(f"the guard is {self.phase}, not {phase}")
 
 
-def _tilt(orientation: Array) -> float:
-    """Angle [rad] between the base's z axis and the vertical, of a quaternion w x y z."""
-    w, x, y, z = orientation / np.linalg.norm(orientation)
-    return math.acos(min(1.0, max(-1.0, w * w - x * x - y * y + z * z)))
+def _tilt(observation: Observation, state: State | None) -> float:
+    """Angle [rad] of the base from upright: the estimate's, or that of the IMU's own fusion where that is larger."""
+    if state is None:
+        return math.nan
+    tilt = math.acos(min(1.0, max(-1.0, -float(state.gravity[2]))))
+    if np.isfinite(observation.orientation).all():
+        _, x, y, _ = observation.orientation / np.linalg.norm(observation.orientation)
+        tilt = max(tilt, math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * float(x * x + y * y)))))
+    return tilt

@@ -87,8 +87,12 @@ def spoiled(observation: Observation, joints: Array | list[int]) -> Observation:
     return replace(observation, position=position)
 
 
+def tilt_of(gravity_z: float) -> Array:
+    return np.array([0.0, np.sqrt(max(0.0, 1.0 - gravity_z**2)), gravity_z])
+
+
 class StillEstimator:
-    """States of a robot that stands where it began."""
+    """States of a robot that stands where it began, tilted as its IMU's own fusion says."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
@@ -103,7 +107,7 @@ class StillEstimator:
         return State(
             time_ns=observation.time_ns,
             orientation=observation.orientation,
-            gravity=np.array([0.0, 0.0, -1.0]),
+            gravity=tilt_of(2.0 * float(observation.orientation[1:3] @ observation.orientation[1:3]) - 1.0),
             yaw=np.asarray(0.0),
             angular_velocity=observation.angular_velocity,
             velocity=np.zeros(3),

@@ -1,0 +1,41 @@
+"""Backends by name, imported when they are asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+
+from hw.config import ConfigError, nearest
+from hw.hal import Backend
+from hw.robot import Robot
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of body. A simulated one takes a seed and has a clock that a run drives as fast as it can."""
+
+    module: str
+    attribute: str
+    simulated: bool
+
+
+BACKENDS = {"sim": Kind("sim.backend", "SimBackend", simulated=True)}
+
+
+def backend_kind(name: str) -> Kind:
+    """Raises ConfigError with the nearest name."""
+    if name not in BACKENDS:
+        raise ConfigError(f"unknown backend '{name}': {nearest(name, BACKENDS)}")
+    return BACKENDS[name]
+
+
+def make_backend(name: str, robot: Robot, *, seed: int, randomise: bool, port: str | None) -> Backend:
+    """A body, not yet connected. Raises ConfigError for an unknown name or a setting that it does not take."""
+    kind = backend_kind(name)
+    if kind.simulated and port is not None:
+        raise ConfigError(f"backend '{name}' has no port: drop --port, or name a backend that is reached by one")
+    if not kind.simulated and randomise:
+        raise ConfigError(f"backend '{name}' is a robot that is what it is: drop --randomise")
+    make = getattr(import_module(kind.module), kind.attribute)
+    backend: Backend = make(robot, seed=seed, randomise=randomise) if kind.simulated else make(robot, port=port)
+    return backend

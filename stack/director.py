@@ -1,0 +1,103 @@
+"""The phases of a run: home, stand still, do the task, end."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+
+import numpy as np
+
+from hw.hal import Array, Instruction, Observation, Policy, State, Task, Trace
+from hw.robot import Robot
+from stack.coast import missing
+from stack.loop import Estimator, Proposal
+from stack.safety import Guard, Phase
+
+WAIT_SECONDS = 1.0  # for a first sample from every sensor
+SETTLE_SECONDS = 1.5  # standing still at home, in which the estimator learns the gyro's bias
+
+
+class Director:
+    """Pilot of a run. `push` changes the body's velocity, m/s `(2,)`; None where a body cannot be pushed."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        guard: Guard,
+        estimator: Estimator,
+        task: Task,
+        policy: Policy,
+        push: Callable[[Array], None] | None = None,
+    ) -> None:
+        self._robot, self._guard, self._estimator, self._task, self._policy = robot, guard, estimator, task, policy
+        self._push = push
+        self._settled = 0
+        self._rows: list[tuple[State, Instruction]] = []
+        self.ended: str | None = None  # "done" or "time", if the task ended by itself
+
+    @property
+    def task_ticks(self) -> int:
+        return len(self._rows)
+
+    def act(self, tick: int, observation: Observation, state: State | None) -> Proposal:
+        phase = self._guard.phase
+        if phase is Phase.LIMP:
+            self._wake(tick, observation, state)
+        elif phase is Phase.READY:
+            self._settled += 1
+            if self._settled >= SETTLE_SECONDS * self._robot.rate:
+                self._estimator.reset_odometry()
+                self._guard.start()
+        elif phase is Phase.RUNNING and state is not None:
+            return self._do_task(state)
+        return Proposal()
+
+    def trace(self) -> Trace:
+        """What the robot believes to have gone through in the task."""
+        states = [state for state, _ in self._rows]
+        gravity = np.array([state.gravity for state in states]).reshape(-1, 3)
+        rates = np.array([state.angular_velocity for state in states]).reshape(-1, 3)
+        return Trace(
+            dt=self._robot.dt,
+            displacement=np.array([state.displacement for state in states]).reshape(-1, 3),
+            yaw=np.array([state.yaw for state in states], dtype=float),
+            velocity=np.array([state.velocity for state in states]).reshape(-1, 3),
+            yaw_rate=-(gravity * rates).sum(-1),  # about the vertical
+            command=np.array([instruction.velocity for _, instruction in self._rows]).reshape(-1, 3),
+            fallen=self._guard.phase is Phase.FAULT and self._guard.cause == "fall" and self.ended is None,
+        )
+
+    def _wake(self, tick: int, observation: Observation, state: State | None) -> None:
+        if state is not None:
+            self._guard.home(observation)
+        elif tick >= WAIT_SECONDS * self._robot.rate:
+            lacking = ", ".join(missing(observation, self._robot.names))
+            self._guard.fault("stale", f"no sample from {lacking}: check cables and power")
+
+    def _do_task(self, state: State) -> Proposal:
+        tick = self.task_ticks
+        percept = self._task.percept(state)
+        instruction = self._task.instruct(tick, state, percept)
+        self._rows.append((state, instruction))
+        shown = Proposal(instruction=instruction, percept=percept)
+        if self._task.done(state):
+            self._end("done", "the task is done")
+            return shown
+        if tick * self._robot.dt >= self._task.seconds:
+            self._end("time", f"{self._task.seconds:g} s are over")
+            return shown
+        velocity = self._task.disturbance(tick)
+        if velocity is not None and self._push is not None:
+            self._push(velocity)
+        try:
+            target = self._policy.act(state, self._guard.applied, instruction)
+        except Exception as error:  # whatever a controller raises, the robot must end safe
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            what = f"{type(error).__name__}: {error} ({where.filename}:{where.lineno})"
+            self._guard.fault("policy", f"the policy failed: {what}")
+            return shown
+        return Proposal(target, instruction, percept, getattr(self._policy, "adopted", None))
+
+    def _end(self, how: str, text: str) -> None:
+        self.ended = how
+        self._guard.stop("task", text)

@@ -1,0 +1,160 @@
+"""The control loop: read, estimate, act, guard, write, record."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from hw.hal import Array, Command, Instruction, Observation, Percept, Plan, Sensors, State
+from stack.clock import Schedule
+from stack.coast import Coast, complete
+from stack.event import Event
+from stack.interrupt import TWICE, Interrupt, Stops
+from stack.safety import Guard, Phase
+
+
+@dataclass(frozen=True, slots=True)
+class Adopted:
+    """A plan at the tick of its adoption; ticks count from the start of the task."""
+
+    requested: int
+    adopted: int
+    plan: Plan
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """What a pilot wants at a tick. Without a target the goal holds."""
+
+    target: Array | None = None  # (n_joints,) rad
+    instruction: Instruction | None = None
+    percept: Percept | None = None
+    plan: Adopted | None = None  # where one was adopted at this tick
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """How long a tick took, ns of the machine's own clock. `record` is that of the tick before."""
+
+    late: int  # by the loop's clock
+    missed: int  # ticks skipped before this one
+    read: int
+    estimate: int
+    act: int
+    guard: int
+    write: int
+    record: int
+
+
+@dataclass(frozen=True, slots=True)
+class TickRecord:
+    """Everything about one tick. Arrays are never changed afterwards."""
+
+    tick: int
+    phase: Phase  # of the guard, after it decided
+    observation: Observation  # as read
+    state: State | None  # None until every sensor was read once
+    command: Command
+    proposal: Proposal
+    events: tuple[Event, ...]
+    timing: Timing
+
+
+class Estimator(Protocol):
+    """Makes states of observations; `applied` is the last accepted goal, `(n_joints,)` rad."""
+
+    def reset(self) -> None: ...
+
+    def reset_odometry(self) -> None: ...
+
+    def update(self, observation: Observation, applied: Array) -> State: ...
+
+
+class Pilot(Protocol):
+    """Decides what a run does at each tick, through the guard."""
+
+    def act(self, tick: int, observation: Observation, state: State | None) -> Proposal: ...
+
+
+Listener = Callable[[TickRecord], None]
+
+
+class Loop:
+    """Runs ticks on schedule until the guard has turned torque off, whatever happens."""
+
+    def __init__(
+        self,
+        sensors: Sensors,
+        estimator: Estimator,
+        pilot: Pilot,
+        guard: Guard,
+        schedule: Schedule,
+        interrupt: Interrupt,
+        stops: Stops,
+        listeners: tuple[Listener, ...] = (),
+    ) -> None:
+        self._sensors, self._estimator, self._pilot, self._guard = sensors, estimator, pilot, guard
+        self._schedule, self._interrupt, self._stops, self._listeners = schedule, interrupt, stops, listeners
+        self._coast = Coast()
+        self._record_ns = 0
+
+    def run(self) -> None:
+        """Raises BackendError when the body cannot be reached, and whatever a listener raises; torque is off by then,
+        as far as the body can be reached."""
+        try:
+            while not self._guard.off:
+                self.tick()
+        except KeyboardInterrupt:  # a policy hung, and was broken off by the second Ctrl-C
+            self._guard.note("interrupt", TWICE)
+        finally:
+            self._guard.release()
+
+    def tick(self) -> None:
+        wake = self._schedule.wait()
+        began = time.perf_counter_ns()
+        raw = self._sensors.read()
+        read = time.perf_counter_ns()
+        self._guard.begin(wake.tick, raw.time_ns)
+        observation = self._coast.update(raw)
+        state = self._estimator.update(observation, self._guard.applied) if complete(observation) else None
+        estimated = time.perf_counter_ns()
+        proposal = self._act(wake.tick, observation, state)
+        acted = time.perf_counter_ns()
+        self._heed(wake.tick)
+        command = self._guard.decide(observation, state, proposal.target)
+        guarded = time.perf_counter_ns()
+        self._guard.send()
+        written = time.perf_counter_ns()
+        timing = Timing(
+            late=wake.late_ns,
+            missed=wake.missed,
+            read=read - began,
+            estimate=estimated - read,
+            act=acted - estimated,
+            guard=guarded - acted,
+            write=written - guarded,
+            record=self._record_ns,
+        )
+        record = TickRecord(wake.tick, self._guard.phase, raw, state, command, proposal, self._guard.events(), timing)
+        for listener in self._listeners:
+            listener(record)
+        self._record_ns = time.perf_counter_ns() - written
+
+    def _act(self, tick: int, observation: Observation, state: State | None) -> Proposal:
+        self._interrupt.breakable = True  # nothing is written here, so a hung policy may be cut off
+        try:
+            return self._pilot.act(tick, observation, state)
+        finally:
+            self._interrupt.breakable = False
+
+    def _heed(self, tick: int) -> None:
+        stop = self._stops.at(tick)
+        if stop is None or self._guard.off:
+            return
+        if stop.at_once:
+            self._guard.note(stop.kind, stop.text)
+            self._guard.release()
+        else:
+            self._guard.stop(stop.kind, stop.text)

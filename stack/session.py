@@ -1,0 +1,209 @@
+"""One run, composed from its settings: what the command line, the Python API, rollouts and replays all use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hw.config import ConfigError
+from hw.hal import Backend, Policy, Task, Trace
+from hw.robot import Robot, load_robot
+from stack.backends import backend_kind, make_backend
+from stack.clock import RealTime, Schedule, WallClock
+from stack.director import Director
+from stack.estimator import Estimator
+from stack.event import Event
+from stack.interrupt import Interrupt, Stops
+from stack.loop import Listener, Loop, TickRecord
+from stack.policies import make_policy
+from stack.safety import Guard, Phase
+from stack.steady import steady
+from stack.tasks import load_task
+
+MAX_GAIN = 2.0  # times the firmware's configured gain; above, a servo of this class rings
+TASK_STREAM = 1  # distinguishes the task's random stream from others of the same seed
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to run. `set` overrides the task's settings by name; `gain` in it scales the servos' position gain."""
+
+    task: str
+    backend: str = "sim"
+    robot: str = "op3"
+    policy: str = "diffusion"
+    randomise: bool = False  # draw the simulated robot's mass, friction, delays and so on
+    seconds: float | None = None  # instead of the task's own
+    seed: int = 0
+    set: Mapping[str, str] = field(default_factory=dict)
+    start: bool = False  # move a real robot without asking
+    record: Path | None = None  # flight log to write
+    realtime: bool | None = None  # in step with the wall; None: only where there is hardware
+    port: str | None = None
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a run went, by what the robot knew. Times s, lateness ms."""
+
+    outcome: str  # succeeded, failed, fell, timed_out, stopped or interrupted
+    success: bool
+    seconds: float  # spent on the task
+    ticks: int  # spent on the task
+    missed: int
+    late_p50_ms: float
+    late_p99_ms: float
+    metrics: dict[str, float]
+    events: tuple[Event, ...]
+    trace: Trace
+    log: Path | None
+
+    def summary(self) -> dict[str, Any]:
+        """The result as JSON values, without the trace."""
+        from stack.logformat import event_message, plain
+
+        names = ("outcome", "success", "seconds", "ticks", "missed", "late_p50_ms", "late_p99_ms", "metrics")
+        values: dict[str, Any] = plain({name: getattr(self, name) for name in names})
+        return values | {"events": [event_message(event) for event in self.events]}
+
+
+def run(
+    settings: Settings,
+    *,
+    backend: Backend | None = None,
+    on_tick: Listener | None = None,
+    policy: Policy | None = None,
+    confirm: Callable[[str], None] | None = None,
+    stops: Sequence[Event] = (),
+) -> Result:
+    """Do one run and return how it went, the robot with torque off.
+
+    `backend` and `policy` replace those that the settings name. `on_tick` is called after each tick and must be quick.
+    `confirm` asks the person at a real robot, and returns when it may move. `stops` are the events of a recorded run
+    that ended it from outside, to be repeated. Raises ConfigError before anything is connected, BackendError when the
+    body cannot be reached.
+    """
+    robot = load_robot(settings.robot)
+    task, gain = _task(settings, robot)
+    simulated = backend_kind(settings.backend).simulated if backend is None else hasattr(backend, "truth")
+    realtime = not simulated if settings.realtime is None else settings.realtime
+    if not (simulated or settings.start or confirm):
+        raise ConfigError(
+            "nothing moves by itself on a real robot: give start=True (--start), or confirm at the prompt"
+        )
+    with ExitStack() as stack:
+        pilot = make_policy(settings.policy, robot, task, realtime) if policy is None else policy
+        if hasattr(pilot, "close"):
+            stack.callback(pilot.close)
+        body = backend or make_backend(
+            settings.backend, robot, seed=settings.seed, randomise=settings.randomise, port=settings.port
+        )
+        stack.callback(body.close)
+        push = getattr(body, "push", None)
+        if push is None and _pushes(task):
+            raise ConfigError(f"backend '{body.name}' cannot push the robot: drop the task's push setting")
+        task.reset(np.random.default_rng([settings.seed, TASK_STREAM]))
+        pilot.reset(settings.seed)
+        sensors, motors = body.connect()
+        if not (simulated or settings.start) and confirm is not None:
+            confirm(f"{robot.name} will go to its home pose and then: {task.name}")
+
+        # From here on a Ctrl-C is a request, until the motors are off.
+        interrupt = stack.enter_context(Interrupt())
+        guard = Guard(robot, motors, gain)
+        estimator = Estimator(robot)
+        director = Director(robot, guard, estimator, task, pilot, push)
+        tally = _Tally()
+        listeners: list[Listener] = [tally]
+        recorder = None
+        if settings.record is not None:
+            from stack.provenance import header
+            from stack.recorder import Recorder
+
+            recorder = Recorder.create(
+                settings.record, header(settings, robot, task, pilot), wait=simulated and not realtime
+            )
+            listeners.append(recorder)
+        if on_tick is not None:
+            listeners.append(on_tick)
+        if realtime:
+            stack.enter_context(steady(not simulated, lambda text: guard.note("system", text)))
+        clock = RealTime(body.clock) if realtime and not isinstance(body.clock, WallClock) else body.clock
+        requests = Stops(interrupt, lambda: recorder.error if recorder is not None else None, stops)
+        loop = Loop(
+            sensors, estimator, director, guard, Schedule(clock, robot.rate), interrupt, requests, tuple(listeners)
+        )
+        try:
+            loop.run()
+        finally:
+            late_events = guard.events()
+            tally.events += late_events
+            result = tally.result(director, guard, task, settings)
+            if recorder is not None:
+                recorder.events(late_events)
+                recorder.close(result.summary())
+        return result
+
+
+def _task(settings: Settings, robot: Robot) -> tuple[Task, float]:
+    values = dict(settings.set)
+    text = values.pop("gain", "1")
+    try:
+        gain = float(text)
+    except ValueError:
+        raise ConfigError(f"gain: '{text}' is not a number") from None
+    if not 0.0 < gain <= MAX_GAIN:
+        raise ConfigError(f"gain: {gain:g} is outside 0 to {MAX_GAIN:g}: it scales the servos' position gain")
+    if settings.seconds is not None:
+        values["seconds"] = repr(settings.seconds)
+    return load_task(settings.task, values, robot.dt), gain
+
+
+def _pushes(task: Task) -> bool:
+    return bool(np.any(getattr(getattr(task, "settings", None), "push", 0.0)))
+
+
+class _Tally:
+    """Counts while a run goes on."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+        self._late: list[int] = []
+        self._missed = 0
+
+    def __call__(self, record: TickRecord) -> None:
+        self.events += record.events
+        if record.phase is Phase.RUNNING:
+            self._late.append(record.timing.late)
+            self._missed += record.timing.missed
+
+    def result(self, director: Director, guard: Guard, task: Task, settings: Settings) -> Result:
+        trace = director.trace()
+        success = bool(director.ended is not None and task.success(trace))
+        late = np.array(self._late or [0]) * 1e-6
+        return Result(
+            outcome=_outcome(director, guard, success, trace),
+            success=success,
+            seconds=director.task_ticks * trace.dt,
+            ticks=director.task_ticks,
+            missed=self._missed,
+            late_p50_ms=float(np.percentile(late, 50)),
+            late_p99_ms=float(np.percentile(late, 99)),
+            metrics=task.metrics(trace) if director.task_ticks else {},
+            events=tuple(self.events),
+            trace=trace,
+            log=settings.record,
+        )
+
+
+def _outcome(director: Director, guard: Guard, success: bool, trace: Trace) -> str:
+    if director.ended is not None:
+        return "succeeded" if success else "timed_out" if director.ended == "time" else "failed"
+    if trace.fallen:
+        return "fell"
+    return "interrupted" if guard.cause == "interrupt" else "stopped"
