@@ -92,8 +92,8 @@ class Legs:
 class LegInverse:
     """Analytic inverse kinematics of legs of the order yaw, roll, pitch, knee, ankle pitch, ankle roll.
 
-    The hip's three axes and the ankle's two must each meet in a point (to 1 mm). Method: S. Kajita et al., Introduction to
-    Humanoid Robotics, section 2.5. Raises ConfigError for legs of another build.
+    The hip's three axes and the ankle's two must each meet in a point (to 1 mm). Method: S. Kajita et al.,
+    Introduction to Humanoid Robotics, section 2.5. Raises ConfigError for legs of another build.
     """
 
     ORDER = np.array([2, 0, 1, 1, 1, 0])  # coordinate axis of each joint: z x y y y x

@@ -77,7 +77,7 @@ class Gait:
         """Go on by one tick."""
         moving = (np.abs(self.target) > 1e-3).any(-1) | (np.abs(self.velocity) > 1e-3).any(-1)
         self.velocity = self.velocity + np.clip(self.target - self.velocity, -self._slew, self._slew)
-        # Steps fade in over half a cycle and out over a whole one; a cycle starts with the sway, not with a lifted foot.
+        # Steps fade in over half a cycle and out over a whole one.
         rate = np.where(moving, 2.0, -1.0) * self._phase_step
         self.phase = np.where(self.activity > 0, (self.phase + self._phase_step) % 1.0, self.phase)
         self.activity = np.clip(self.activity + rate, 0.0, 1.0)

@@ -103,7 +103,8 @@ def _add_floor(model: mujoco.MjSpec) -> None:
         priority=1,  # the floor's friction counts, so that randomising one number is enough
         solref=[0.008, 1.0],
     )
-    model.worldbody.add_light(pos=[0.5, -0.5, 3.0], dir=[-0.15, 0.15, -1.0], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    sun = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    model.worldbody.add_light(pos=[0.5, -0.5, 3.0], dir=[-0.15, 0.15, -1.0], type=sun)
 
 
 def _add_servo(model: mujoco.MjSpec, name: str, servo: Servo) -> None:

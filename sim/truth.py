@@ -29,6 +29,11 @@ class Truth:
         return np.stack([self._sensors[:, self._at[f"{foot}_{what}"]] for foot in self._robot.feet], 1)
 
     @property
+    def qpos(self) -> Array:
+        """MuJoCo's generalised positions `(n, nq)`."""
+        return self._qpos
+
+    @property
     def position(self) -> Array:
         """Base position `(n, 3)` m."""
         return self._qpos[:, 0:3]

@@ -26,10 +26,13 @@ _KP, _VMAX = 4, 7  # indices in a dcmotor's gainprm
 
 
 class Worlds:
-    """`n` bodies. Commands and observations are `(n, ...)`; `threads` 0 takes all cores."""
+    """`n` bodies. Commands and observations are `(n, ...)`.
+
+    `threads` 0 takes all cores; `randomise` is the share of episodes on a randomised robot.
+    """
 
     def __init__(
-        self, robot: Robot, n: int, *, threads: int = 0, randomise: bool = False, model: mujoco.MjModel | None = None
+        self, robot: Robot, n: int, *, threads: int = 0, randomise: float = 0.0, model: mujoco.MjModel | None = None
     ) -> None:
         self.robot, self.n, self.randomise = robot, n, randomise
         self.model = build(robot) if model is None else model
@@ -53,7 +56,7 @@ class Worlds:
         self._sensors = b.bind("sensordata")
         self._gain, self._force = b.expand("actuator_gainprm"), b.expand("actuator_forcerange")
         self._floor = b.expand("geom_friction")[:, self.model.geom("floor").id]
-        if randomise:
+        if randomise > 0:
             self._mass, self._inertia = b.expand("body_mass"), b.expand("body_inertia")
         self.bodies: list[Body | None] = [None] * n
         self._rngs: list[np.random.Generator] = [np.random.default_rng(0)] * n
@@ -78,17 +81,17 @@ class Worlds:
         self.truth = Truth(self.model, robot, self._state_qpos, self._state_qvel, self._sensors)
 
     def reset(self, ids: Array, rngs: Sequence[np.random.Generator], joints: Array | None = None) -> None:
-        """Put worlds `ids` on the ground at pose `joints` `(len(ids), n_joints)` (default: home), drawing new robots."""
+        """Put worlds `ids` on the ground at pose `joints` `(len(ids), n_joints)` (default: home) and draw new robots."""
         pose = np.broadcast_to(self.robot.home if joints is None else joints, (len(ids), len(self.robot.joints)))
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for i, rng in zip(ids, rngs, strict=True):
             self._rngs[i] = rng
-            self._place(i, draw(rng, self.robot, self.model.nbody, self.randomise))
+            self._place(i, draw(rng, self.robot, self.model.nbody, rng.random() < self.randomise))
         self._state_qpos[ids] = 0.0
         self._state_qpos[ids, 2], self._state_qpos[ids, 3:7] = self._legs.stand(pose)
         self._state_qpos[ids[:, None], self._qpos] = pose - self._zero[ids]
         self._state_qvel[ids] = 0.0
-        if self.randomise:
+        if self.randomise > 0:
             self.batch.set_const(ids)
         self._gain[ids, :, _KP], self._force[ids, :, 0], self._force[ids, :, 1] = 0.0, 0.0, 0.0
         self.batch.forward(ids)
@@ -106,7 +109,7 @@ class Worlds:
         self._zero[i], self._backlash[i] = body.zero, body.backlash
         self._gyro_bias[i], self._acc_bias[i], self._tilt[i] = body.gyro_bias, body.accelerometer_bias, body.imu_tilt
         self._floor[i, 0] = body.friction
-        if self.randomise:
+        if self.randomise > 0:
             self._mass[i] = self.model.body_mass * body.mass
             self._inertia[i] = self.model.body_inertia * body.mass[:, None]
 
@@ -133,6 +136,11 @@ class Worlds:
             value[:, self.substeps :] = self._fresh[key]
         self.ticks += 1
         self.tick += 1
+
+    @property
+    def effort(self) -> Array:
+        """True torque of the servos `(n, n_joints)` N m."""
+        return self._record["actuator_force"][:, -1]
 
     def push(self, velocity: Array) -> None:
         """Change the bases' velocity by `(n, 2)` m/s, world frame."""

@@ -1,0 +1,49 @@
+"""A multilayer perceptron in numpy: fast for one robot, the same for a thousand worlds, and free of torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hw.hal import Array
+from hw.robot import Robot
+from policy import checkpoint
+
+
+class Mlp:
+    """Normalised inputs, dense layers with ELU between them. Weights are `(inputs, outputs)`, float32."""
+
+    def __init__(self, layers: list[tuple[Array, Array]], mean: Array, std: Array) -> None:
+        self.layers, self.mean, self.std = layers, mean, std
+
+    def __call__(self, x: Array) -> Array:
+        """Map `(..., inputs)` to `(..., outputs)`, float64."""
+        y = ((x - self.mean) / self.std).astype(np.float32)
+        for i, (weight, bias) in enumerate(self.layers):
+            y = y @ weight + bias
+            if i < len(self.layers) - 1:
+                y = np.where(y > 0, y, np.expm1(np.minimum(y, 0)))
+        return y.astype(float)
+
+    def save(self, path: Path, head: Mapping[str, Any]) -> None:
+        """Write a checkpoint with header `head`. Raises CheckpointError."""
+        tensors = {"mean": self.mean, "std": self.std}
+        for i, (weight, bias) in enumerate(self.layers):
+            tensors[f"{i}.weight"], tensors[f"{i}.bias"] = weight, bias
+        checkpoint.write(path, {name: value.astype(np.float32) for name, value in tensors.items()}, head)
+
+    @classmethod
+    def load(cls, path: Path, kind: str, robot: Robot, inputs: int) -> tuple[Mlp, dict[str, Any]]:
+        """Read a network of `kind` for `robot` with so many inputs, and its header. Raises CheckpointError."""
+        head, tensors = checkpoint.read(path)
+        checkpoint.check(path, head, kind, robot)
+        if len(tensors["mean"]) != inputs:
+            raise checkpoint.CheckpointError(
+                f"{path}: takes {len(tensors['mean'])} inputs, and this program's features are {inputs}; train it again"
+            )
+        count = sum(name.endswith(".weight") for name in tensors)
+        layers = [(tensors[f"{i}.weight"], tensors[f"{i}.bias"]) for i in range(count)]
+        return cls(layers, tensors["mean"], tensors["std"]), head

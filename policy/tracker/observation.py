@@ -1,0 +1,61 @@
+"""What the tracker sees: the estimate, a short history and the reference's next frames. Never the command."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hw.hal import Array, ReferenceFrames, State
+from hw.robot import Robot
+
+AHEAD = np.array([0, 3, 8])  # ticks ahead that the tracker sees of its reference
+RESIDUAL = 0.3  # rad of joint target for an action of one
+_HISTORY = 2  # past ticks of joints and gyro
+
+
+class TrackerObservation:
+    """Builds observations `(..., size)` float32; keeps the short history. `shape` are the leading dimensions."""
+
+    def __init__(self, robot: Robot, shape: tuple[int, ...] = ()) -> None:
+        self._home = robot.home
+        n, feet = len(robot.joints), len(robot.feet)
+        self._past = np.zeros((*shape, _HISTORY, n + 3))
+        self._before = np.zeros((*shape, n))
+        self._fresh = np.ones(shape, bool)
+        self.size = 3 + 3 + 2 + 1 + feet + 4 * n + _HISTORY * (n + 3) + len(AHEAD) * (n + 4 + feet)
+
+    def reset(self, where: Array | None = None) -> None:
+        """Forget the history in the worlds `where` (default: all)."""
+        self._fresh = np.ones_like(self._fresh) if where is None else self._fresh | where
+
+    def __call__(self, state: State, applied: Array, frames: ReferenceFrames) -> Array:
+        """Observe, once a tick. `applied` `(..., n_joints)` rad is what was commanded last; `frames` are at AHEAD."""
+        joints = state.position - self._home
+        row = np.concatenate([joints, 0.25 * state.angular_velocity], -1)
+        if self._fresh.any():
+            self._past = np.where(self._fresh[..., None, None], row[..., None, :], self._past)
+            self._before = np.where(self._fresh[..., None], applied, self._before)
+            self._fresh = np.zeros_like(self._fresh)
+        lead = state.yaw.shape
+        observation = np.concatenate(
+            [
+                state.gravity,
+                0.25 * state.angular_velocity,
+                2.0 * state.velocity[..., :2],
+                10.0 * (state.displacement[..., 2:] - 0.25),
+                state.contact,
+                joints,
+                0.1 * state.joint_velocity,
+                applied - state.position,
+                self._before - self._home,
+                self._past.reshape(*lead, -1),
+                (frames.position - self._home).reshape(*lead, -1),
+                2.0 * frames.velocity.reshape(*lead, -1),
+                frames.yaw_rate,
+                10.0 * (frames.height - 0.25),
+                frames.contact.reshape(*lead, -1),
+            ],
+            -1,
+        ).astype(np.float32)
+        self._past = np.concatenate([row[..., None, :], self._past[..., :-1, :]], -2)
+        self._before = applied
+        return observation

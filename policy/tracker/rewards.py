@@ -1,0 +1,133 @@
+"""Reward terms of the tracker: pure functions of one step, `(n,)` each, summed by a table of weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hw.hal import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One tick of `n` worlds, by the truth. Reference values are those of the frame that was to be reached."""
+
+    velocity: Array  # (n, 2) m/s of the base, heading frame, averaged over about half a gait cycle
+    yaw_rate: Array  # (n,) rad/s, averaged likewise
+    height: Array  # (n,) m
+    gravity: Array  # (n, 3)
+    angular_velocity: Array  # (n, 3)
+    joints: Array  # (n, n_joints) rad
+    effort: Array  # (n, n_joints) N m
+    target: Array  # (n, n_joints) rad: the last three targets, newest first
+    target1: Array
+    target2: Array
+    foot_force: Array  # (n, n_feet) N
+    foot_height: Array  # (n, n_feet) m of the sole's centre
+    foot_velocity: Array  # (n, n_feet, 3) m/s
+    foot_up: Array  # (n, n_feet, 3)
+    reference_velocity: Array  # (n, 2)
+    reference_yaw_rate: Array  # (n,)
+    reference_height: Array  # (n,)
+    reference_joints: Array  # (n, n_joints)
+    reference_contact: Array  # (n, n_feet)
+    fallen: Array  # (n,)
+
+
+def _kernel(squared: Array, width: float) -> Array:
+    return np.exp(-squared / width**2)
+
+
+def velocity(s: Step) -> Array:
+    """Planar velocity near the reference's: a wide kernel to find it and a narrow one to hold it."""
+    error = ((s.velocity - s.reference_velocity) ** 2).sum(-1)
+    return 0.5 * _kernel(error, 0.2) + 0.5 * _kernel(error, 0.06)
+
+
+def yaw_rate(s: Step) -> Array:
+    """Yaw rate near the reference's."""
+    error = (s.yaw_rate - s.reference_yaw_rate) ** 2
+    return 0.5 * _kernel(error, 0.6) + 0.5 * _kernel(error, 0.2)
+
+
+def pose(s: Step) -> Array:
+    """Joints near the reference's."""
+    return _kernel(((s.joints - s.reference_joints) ** 2).mean(-1), 0.25)
+
+
+def contact(s: Step) -> Array:
+    """Share of feet that carry, or do not, as the reference plans."""
+    return ((s.foot_force > 1.0) == (s.reference_contact > 0.5)).mean(-1)
+
+
+def clearance(s: Step) -> Array:
+    """How far swinging feet are lifted, up to 2 cm."""
+    swing = s.reference_contact < 0.5
+    return (np.clip(s.foot_height / 0.02, 0.0, 1.0) * swing).sum(-1)
+
+
+def upright(s: Step) -> Array:
+    """Squared sine of the tilt."""
+    return (s.gravity[:, :2] ** 2).sum(-1)
+
+
+def height(s: Step) -> Array:
+    """Squared error of the base's height [m2]."""
+    return (s.height - s.reference_height) ** 2
+
+
+def sway_rate(s: Step) -> Array:
+    """Squared roll and pitch rate [rad2/s2]."""
+    return (s.angular_velocity[:, :2] ** 2).sum(-1)
+
+
+def slip(s: Step) -> Array:
+    """Squared speed of feet that carry [m2/s2]."""
+    return ((s.foot_velocity[..., :2] ** 2).sum(-1) * (s.foot_force > 1.0)).sum(-1)
+
+
+def level_feet(s: Step) -> Array:
+    """Squared sine of the soles' tilt."""
+    return (s.foot_up[..., :2] ** 2).sum((-1, -2))
+
+
+def impact(s: Step) -> Array:
+    """Force of a foot beyond twice the robot's weight, in units of that [1]."""
+    return np.clip(s.foot_force / 60.0 - 1.0, 0.0, 2.0).sum(-1)
+
+
+def target_rate(s: Step) -> Array:
+    """Squared change of the targets [rad2]."""
+    return ((s.target - s.target1) ** 2).sum(-1)
+
+
+def target_acceleration(s: Step) -> Array:
+    """Squared second difference of the targets [rad2]."""
+    return ((s.target - 2 * s.target1 + s.target2) ** 2).sum(-1)
+
+
+def effort(s: Step) -> Array:
+    """Squared torque [N2 m2]."""
+    return (s.effort**2).sum(-1)
+
+
+def fall(s: Step) -> Array:
+    """One on falling."""
+    return s.fallen.astype(float)
+
+
+TERMS: Mapping[str, Callable[[Step], Array]] = {
+    term.__name__: term
+    for term in (
+        velocity, yaw_rate, pose, contact, clearance, upright, height, sway_rate, slip, level_feet, impact, target_rate,
+        target_acceleration, effort, fall,
+    )
+}  # fmt: skip
+
+
+def total(step: Step, weights: Mapping[str, float]) -> tuple[Array, dict[str, float]]:
+    """Weighted sum `(n,)` and the mean of each weighted term. Raises KeyError for an unknown term."""
+    parts = {name: weight * TERMS[name](step) for name, weight in weights.items()}
+    return np.sum(list(parts.values()), axis=0), {name: float(part.mean()) for name, part in parts.items()}

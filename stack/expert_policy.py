@@ -1,0 +1,30 @@
+"""The learned tracker on the gait: the expert that makes the diffusion model's data."""
+
+from __future__ import annotations
+
+from hw.hal import Array, Instruction, State, Task
+from hw.robot import Robot
+from policy.checkpoint import resolve
+from policy.gait import Gait, load_gait
+from policy.mlp import Mlp
+from policy.tracker.observation import AHEAD, RESIDUAL, TrackerObservation
+
+
+class ExpertPolicy:
+    """Raises CheckpointError when the shipped tracker does not fit the robot."""
+
+    def __init__(self, robot: Robot, task: Task, realtime: bool) -> None:
+        del task, realtime  # the tracker sees its reference alone, and answers within the tick
+        self._gait, self._observation = Gait(robot, load_gait()), TrackerObservation(robot)
+        self._tracker, _ = Mlp.load(resolve("expert"), "tracker", robot, self._observation.size)
+
+    def reset(self, seed: int) -> None:
+        self._gait.reset()
+        self._observation.reset()
+
+    def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
+        self._gait.command(instruction.velocity)
+        frames = self._gait.frames(AHEAD)
+        residual = self._tracker(self._observation(state, applied, frames))
+        self._gait.advance()
+        return frames.position[0] + RESIDUAL * residual

@@ -1,0 +1,237 @@
+"""`servoid train expert`: PPO on the tracking environment, resumable at any moment."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("runs/expert"), help="folder of the run; an old one goes on")
+    parser.add_argument("--minutes", type=float, default=90.0, help="of training, this call (default: %(default)s)")
+    parser.add_argument("--samples", type=float, default=20e6, help="the learning-rate and push schedules end here")
+    parser.add_argument("--worlds", type=int, default=512)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--fresh", action="store_true", help="start anew even if --out holds a run")
+    parser.add_argument("--plain-odometry", action="store_true", help="no learned correction in the estimator")
+
+
+def main(args: argparse.Namespace) -> int:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # the worlds use the cores
+    import torch
+
+    torch.set_num_threads(1)
+    from hw.robot import load_robot
+    from stack.odometry import load_odometry
+    from tools.train.settings import load_settings
+    from tools.train.tracking import Tracking
+
+    robot, settings = load_robot(args.robot), load_settings()
+    odometry = None if args.plain_odometry else load_odometry(robot)
+    args.out.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(args.seed)
+    env = Tracking(robot, args.worlds, odometry, settings, args.seed)
+    Trainer(env, args.out, args.samples, args.fresh).learn(args.minutes)
+    return 0
+
+
+class Trainer:
+    """PPO's outer loop: collect, update, log, save. The algorithm itself is rsl-rl's."""
+
+    def __init__(self, env: Any, out: Path, samples: float, fresh: bool) -> None:
+        import torch
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.env, self.out, self.budget = env, out, samples
+        self.ppo = _ppo(env)
+        self.samples, self.state_file = 0, out / "state.pt"
+        if self.state_file.exists() and not fresh:
+            saved = torch.load(self.state_file, weights_only=True)
+            self.samples = int(saved.pop("samples"))
+            self.ppo.load(saved, None, True)
+        else:
+            self._warm_up()
+        self.writer = SummaryWriter(str(out), purge_step=self.samples)
+        self.lengths: deque[int] = deque(maxlen=500)
+
+    def _warm_up(self) -> None:
+        """Let the observation statistics settle first: while they move, the policy does too."""
+        import torch
+
+        self.ppo.train_mode()
+        with torch.inference_mode():
+            for _ in range(60):
+                self.env.step(self.ppo.actor(_observations(self.env), stochastic_output=True).numpy())
+                self.ppo.actor.update_normalization(_observations(self.env))
+                self.ppo.critic.update_normalization(_observations(self.env))
+
+    def learn(self, minutes: float) -> None:
+        """Train for `minutes`, or until Ctrl-C; everything is saved at the end."""
+        from tqdm import tqdm
+
+        self.ppo.train_mode()
+        end = time.monotonic() + 60 * minutes
+        saved = time.monotonic()
+        bar = tqdm(initial=self.samples, total=int(self.budget), unit="sample", unit_scale=True, mininterval=5.0)
+        try:
+            while time.monotonic() < end and self.samples < self.budget:
+                row = self._iteration()
+                bar.update(self.samples - bar.n)
+                bar.set_postfix(length=f"{row['episode_ticks']:.0f}", reward=f"{row['reward']:.2f}")
+                if time.monotonic() - saved > 120:
+                    self._save()
+                    saved = time.monotonic()
+        except KeyboardInterrupt:
+            pass  # stopping is a normal end: what was learned is saved below
+        finally:
+            bar.close()
+            self._save()
+
+    def _iteration(self) -> dict[str, float]:
+        import torch
+
+        env, s = self.env, self.env.settings
+        progress = min(self.samples / self.budget, 1.0)
+        env.push_scale = min(1.0, 0.25 + 0.75 * progress / 0.2)
+        self.ppo.learning_rate = s.learning_rate * (1.0 - 0.85 * progress)
+        for group in self.ppo.optimizer.param_groups:
+            group["lr"] = self.ppo.learning_rate
+        begun, rewards, terms = time.monotonic(), [], []
+        with torch.inference_mode():
+            for _ in range(s.horizon):
+                action = self.ppo.act(_observations(env)).numpy()
+                ticks = env.ticks + 1
+                reward, done, late = env.step(action)
+                self.lengths.extend(ticks[done].tolist())
+                rewards.append(float(reward.mean()))
+                terms.append(env.terms)
+                extras = {"time_outs": torch.as_tensor(late, dtype=torch.float32)}
+                reward_t = torch.as_tensor(reward, dtype=torch.float32)
+                self.ppo.process_env_step(_observations(env), reward_t, torch.as_tensor(done), extras)
+            self.ppo.compute_returns(_observations(env))
+        collected = time.monotonic()
+        losses = self.ppo.update()
+        self.samples += s.horizon * env.n
+        row = {
+            "samples": float(self.samples),
+            "episode_ticks": float(np.mean(self.lengths)) if self.lengths else 0.0,
+            "reward": float(np.mean(rewards)),
+            "std": float(self.ppo.actor.output_std.detach().mean()),
+            "learning_rate": self.ppo.learning_rate,
+            "samples_per_s": s.horizon * env.n / (time.monotonic() - begun),
+            "collect_share": (collected - begun) / (time.monotonic() - begun),
+            **{f"loss_{k}": float(v) for k, v in losses.items()},
+            **{f"term_{k}": float(np.mean([t[k] for t in terms])) for k in terms[0]},
+        }
+        for key, value in row.items():
+            self.writer.add_scalar(key.replace("_", "/", 1), value, self.samples)
+        self._log(row)
+        return row
+
+    def _log(self, row: dict[str, float]) -> None:
+        path = self.out / "progress.csv"
+        new = not path.exists()
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, list(row))
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+
+    def _save(self) -> None:
+        import torch
+
+        part = self.state_file.with_suffix(".part")
+        torch.save({**self.ppo.save(), "samples": self.samples}, part)
+        part.replace(self.state_file)
+        export(self.ppo.actor, self.env.robot, self.env.settings, self.out / "expert.safetensors", self.samples)
+        plot(self.out / "progress.csv", self.out / "progress.png")
+
+
+def _observations(env: Any) -> Any:
+    import torch
+    from tensordict import TensorDict
+
+    return TensorDict(
+        {"actor": torch.from_numpy(env.actor), "critic": torch.from_numpy(env.critic)}, batch_size=[env.n]
+    )
+
+
+def _ppo(env: Any) -> Any:
+    from rsl_rl.algorithms import PPO
+
+    class Shape:
+        num_envs, num_actions = env.n, len(env.robot.joints)
+
+    s = env.settings
+    network = {"class_name": "MLPModel", "activation": "elu", "obs_normalization": True}
+    noise = {"class_name": "GaussianDistribution", "init_std": s.initial_std, "std_type": "log"}
+    config = {
+        "num_steps_per_env": s.horizon,
+        "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
+        "multi_gpu": None,
+        "actor": {**network, "hidden_dims": list(s.hidden), "distribution_cfg": noise},
+        "critic": {**network, "hidden_dims": list(s.hidden)},
+        "algorithm": {
+            "class_name": "PPO",
+            "num_learning_epochs": s.epochs,
+            "num_mini_batches": s.mini_batches,
+            "gamma": s.discount,
+            "entropy_coef": s.entropy,
+            "learning_rate": s.learning_rate,
+            "schedule": "fixed",
+            "use_clipped_value_loss": False,  # its clip is absolute: with returns of tens the critic never gets there
+        },
+    }
+    return PPO.construct_algorithm(_observations(env), Shape, config, "cpu")
+
+
+def export(actor: Any, robot: Any, settings: Any, path: Path, samples: int) -> None:
+    """Write the actor as the tracker checkpoint that runs without torch."""
+    from policy import checkpoint
+    from policy.mlp import Mlp
+
+    dense = [m for m in actor.mlp if hasattr(m, "weight")]
+    layers = [(m.weight.detach().numpy().T, m.bias.detach().numpy()) for m in dense]
+    norm = actor.obs_normalizer
+    network = Mlp(layers, norm._mean.numpy()[0], norm._std.numpy()[0] + norm.eps)
+    head = checkpoint.header(
+        "tracker",
+        robot,
+        config={"hidden": list(settings.hidden), "rewards": settings.rewards},
+        data="closed-loop experience on the analytic gait in randomised worlds, generated by this project",
+        licence="Apache-2.0",
+        results={"samples": samples},
+    )
+    network.save(path, head)
+
+
+def plot(source: Path, target: Path) -> None:
+    """Draw the learning curve of a run's CSV."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    rows = np.genfromtxt(source, delimiter=",", names=True)
+    if rows.ndim == 0:
+        return
+    terms = [name for name in rows.dtype.names or () if name.startswith("term_")]
+    figure, axes = plt.subplots(1, 3, figsize=(15, 4), layout="constrained")
+    axes[0].plot(rows["samples"], rows["episode_ticks"])
+    axes[0].set(xlabel="samples", ylabel="episode [ticks]")
+    axes[1].plot(rows["samples"], rows["reward"])
+    axes[1].set(xlabel="samples", ylabel="reward a tick")
+    for name in terms:
+        axes[2].plot(rows["samples"], rows[name], label=name.removeprefix("term_"))
+    axes[2].set(xlabel="samples", ylabel="weighted terms a tick")
+    axes[2].legend(fontsize=6, ncols=2)
+    figure.savefig(target, dpi=90)
+    plt.close(figure)

@@ -1,0 +1,198 @@
+"""`servoid train odometry`: learn the correction of leg odometry in randomised worlds, and measure the drift left."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hw.hal import Array
+
+_CHUNK = 50  # ticks whose mean error is penalised beside each tick's: the mean is what drifts
+_MEAN_WEIGHT = 20.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
+    parser.add_argument("--policy", default="expert", help="what walks: gait, or a tracker (default: expert)")
+    parser.add_argument("--out", type=Path, default=Path("runs/odometry.safetensors"), help="checkpoint to write")
+    parser.add_argument("--worlds", type=int, default=256)
+    parser.add_argument("--seconds", type=float, default=80.0, help="of walking a world (default: %(default)s)")
+    parser.add_argument("--steps", type=int, default=4000, help="of the optimiser (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0)
+
+
+def main(args: argparse.Namespace) -> int:
+    os.environ.setdefault("OMP_NUM_THREADS", "2")
+    from hw.robot import load_robot
+    from policy import checkpoint
+    from tools.train.walker import load_tracker
+
+    robot = load_robot(args.robot)
+    tracker = None if args.policy == "gait" else load_tracker(robot, args.policy)
+    data = record(robot, tracker, args.worlds, args.seconds, args.seed)
+    network = fit(data, args.steps, args.seed)
+    before = drift(robot, tracker, None, walks=64, seconds=30.0, seed=args.seed + 1)
+    after = drift(robot, tracker, network, walks=64, seconds=30.0, seed=args.seed + 1)
+    for name, result in (("legs alone", before), ("corrected", after)):
+        print(
+            f"{name}: displacement error {100 * result.median:.1f} % of the path (median), "
+            f"{100 * result.p90:.1f} % (90th percentile), yaw drift {result.yaw_p90:.3f} rad a minute "
+            f"(90th percentile), {result.walks} walks"
+        )
+    head = checkpoint.header(
+        "odometry",
+        robot,
+        config={"hidden": [len(bias) for _, bias in network.layers[:-1]]},
+        data=f"{args.worlds} randomised worlds of {args.seconds:g} s walked by {args.policy}, seed {args.seed}",
+        licence="Apache-2.0",
+        results={"drift_p90": round(after.p90, 4), "drift_p90_legs_alone": round(before.p90, 4)},
+    )
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    network.save(args.out, head)
+    print(f"wrote {args.out}")
+    return 0
+
+
+def record(robot: Any, tracker: Any, worlds: int, seconds: float, seed: int) -> dict[str, Array]:
+    """Walk randomised worlds; returns rows `(n, ticks, features)`, starts `(n, ticks)` and errors `(n, ticks, 3)`."""
+    from tqdm import trange
+
+    from tools.train.fleet import Fleet
+    from tools.train.walker import Walker
+
+    fleet = Fleet(robot, worlds, None, randomise=0.7, seed=seed + 1000)
+    walker = Walker(fleet, tracker)
+    ticks = round(seconds * robot.rate)
+    rows = np.zeros((worlds, ticks, fleet.estimator.features.size), np.float32)
+    errors = np.zeros((worlds, ticks, 3), np.float32)
+    starts = np.zeros((worlds, ticks), np.int32)
+    everything = np.ones(worlds, bool)
+    fleet.reset(everything)
+    walker.reset(everything)
+    rng = np.random.default_rng(seed)
+    command, start = np.zeros((worlds, 3)), np.zeros(worlds, np.int32)
+    noise = rng.uniform(0.0, 0.1, (worlds, 1))
+    for k in trange(ticks, desc="walking", unit="tick", mininterval=5.0):
+        state = fleet.observe()
+        rows[:, k] = fleet.estimator.features.newest
+        errors[:, k] = fleet.truth.velocity - fleet.estimator.leg_velocity
+        starts[:, k] = start
+        due = rng.random(worlds) < 1 / 150
+        command[due] = rng.uniform([-0.15, -0.13, -1.0], [0.5, 0.13, 1.0], (int(due.sum()), 3))
+        command[due] *= rng.random((int(due.sum()), 3)) < 0.7
+        kicked = rng.random(worlds) < 1 / 100
+        angle, size = rng.uniform(-np.pi, np.pi, worlds), rng.uniform(0, 0.3, worlds) * kicked
+        fleet.worlds.push(np.stack([size * np.cos(angle), size * np.sin(angle)], -1))
+        target = walker.act(command)
+        fleet.step(target, noise * rng.standard_normal(target.shape))
+        fallen = fleet.truth.fallen
+        if fallen.any():
+            fleet.reset(fallen)
+            walker.reset(fallen)
+            start[fallen] = k + 1
+        del state
+    return {"rows": rows, "starts": starts, "errors": errors}
+
+
+def fit(data: dict[str, Array], steps: int, seed: int) -> Any:
+    """Fit the network on chunks of `_CHUNK` ticks; prints the error on worlds that it did not see."""
+    import torch
+    from torch import nn
+    from tqdm import trange
+
+    from policy.mlp import Mlp
+    from stack.odometry import OFFSETS
+
+    torch.manual_seed(seed)
+    rows, errors, starts = (torch.from_numpy(data[k]) for k in ("rows", "errors", "starts"))
+    worlds, ticks, _ = rows.shape
+    held = max(worlds // 8, 1)
+    offsets = torch.from_numpy(OFFSETS)
+
+    def batch(first: int, last: int, size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        world = torch.randint(first, last, (size, 1))
+        at = torch.randint(0, ticks - _CHUNK, (size, 1)) + torch.arange(_CHUNK)
+        begin = starts[world, at]
+        index = torch.maximum(at[..., None] - offsets, begin[..., None])
+        whole = (begin[:, :1] == begin[:, -1:]).float()  # chunks that no fall interrupts
+        return rows[world[..., None], index].flatten(2), errors[world, at], whole
+
+    sample = batch(0, worlds - held, 400)[0].flatten(0, 1)
+    mean, std = sample.mean(0), sample.std(0).clamp_min(0.02)
+    net = nn.Sequential(nn.Linear(sample.shape[1], 128), nn.ELU(), nn.Linear(128, 64), nn.ELU(), nn.Linear(64, 3))
+    optimiser = torch.optim.AdamW(net.parameters(), 2e-3, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+
+    def loss_of(x: torch.Tensor, y: torch.Tensor, whole: torch.Tensor) -> torch.Tensor:
+        left = y - net((x - mean) / std)
+        return (left**2).mean() + _MEAN_WEIGHT * ((left.mean(1) ** 2) * whole).mean()
+
+    bar = trange(steps, desc="fitting", mininterval=5.0)
+    for _ in bar:
+        loss = loss_of(*batch(0, worlds - held, 48))
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        schedule.step()
+        bar.set_postfix(loss=f"{loss.item():.5f}")
+    with torch.no_grad():
+        x, y, whole = batch(worlds - held, worlds, 1000)
+        left = y - net((x - mean) / std)
+        for name, error in (("legs alone", y), ("corrected", left)):
+            rms, slow = (error**2).mean((0, 1)).sqrt(), ((error.mean(1) ** 2) * whole).mean(0).sqrt()
+            print(f"{name}: rms {rms.numpy().round(4)} m/s, of one-second means {slow.numpy().round(4)} m/s")
+    dense = [m for m in net if isinstance(m, nn.Linear)]
+    layers = [(m.weight.detach().numpy().T.copy(), m.bias.detach().numpy().copy()) for m in dense]
+    return Mlp(layers, mean.numpy(), std.numpy())
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Displacement error as a share of the path, yaw drift in rad a minute."""
+
+    median: float
+    p90: float
+    yaw_p90: float
+    walks: int
+
+
+def drift(
+    robot: Any, tracker: Any, odometry: Any, *, walks: int, seconds: float, seed: int, randomise: float = 0.0
+) -> Drift:
+    """Walk with commands changed every 5 s and compare the estimate's end with the truth's.
+
+    Counts walks that stayed up and covered more than a metre.
+    """
+    from tools.train.fleet import Fleet
+    from tools.train.walker import Walker
+
+    fleet = Fleet(robot, walks, odometry, randomise=randomise, seed=seed)
+    walker = Walker(fleet, tracker)
+    everything = np.ones(walks, bool)
+    fleet.reset(everything)
+    walker.reset(everything)
+    alive, path, command = everything.copy(), np.zeros(walks), np.zeros((walks, 3))
+    turned, start = np.zeros(walks), fleet.truth.position[:, :2].copy()
+    last, heading, state = start, fleet.truth.yaw.copy(), fleet.observe()
+    for k in range(round(seconds * robot.rate)):
+        if k % (5 * robot.rate) == 0:
+            low, high = [-0.1, -0.1, -0.8], [0.3, 0.1, 0.8]
+            command = np.array([rng.uniform(low, high) for rng in fleet.rngs])
+        fleet.step(walker.act(command))
+        state = fleet.observe()
+        truth = fleet.truth
+        path += np.linalg.norm(truth.position[:, :2] - last, axis=-1)
+        turned += (truth.yaw - heading + np.pi) % (2 * np.pi) - np.pi
+        last, heading = truth.position[:, :2].copy(), truth.yaw.copy()
+        alive &= ~truth.fallen
+    error = np.linalg.norm(state.displacement[:, :2] - (last - start), axis=-1)
+    use = alive & (path > 1.0)
+    if not use.any():
+        return Drift(np.nan, np.nan, np.nan, 0)
+    share, yaw = (error / path)[use], np.abs(state.yaw - turned)[use] * 60.0 / seconds
+    return Drift(float(np.median(share)), float(np.quantile(share, 0.9)), float(np.quantile(yaw, 0.9)), int(use.sum()))

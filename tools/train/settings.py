@@ -1,0 +1,37 @@
+"""Settings of the expert's training: configs/policies/expert.yaml."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hw.config import CONFIGS, load_yaml
+
+
+@dataclass(frozen=True)
+class ExpertSettings:
+    """Ranges are (low, high); shares are of 1. The file says the rest."""
+
+    hidden: tuple[int, ...]
+    initial_std: float
+    entropy: float
+    learning_rate: float
+    discount: float
+    horizon: int
+    epochs: int
+    mini_batches: int
+    episode_seconds: float
+    randomised: float
+    push: float
+    push_every: tuple[float, float]
+    command_every: tuple[float, float]
+    vx: tuple[float, float]
+    vy: tuple[float, float]
+    yaw_rate: tuple[float, float]
+    stand: float
+    forward: float
+    rewards: dict[str, float]
+
+
+def load_settings() -> ExpertSettings:
+    """Load the settings. Raises ConfigError."""
+    return load_yaml(CONFIGS / "policies" / "expert.yaml", ExpertSettings)
