@@ -10,7 +10,7 @@ import numpy as np
 from hw.hal import Array, Instruction, Observation, Policy, State, Task, Trace
 from hw.robot import Robot
 from stack.coast import missing
-from stack.loop import Estimator, Proposal
+from stack.loop import Adopted, Estimator, Proposal
 from stack.safety import Guard, Phase
 
 WAIT_SECONDS = 1.0  # for a first sample from every sensor
@@ -32,6 +32,7 @@ class Director:
         self._robot, self._guard, self._estimator, self._task, self._policy = robot, guard, estimator, task, policy
         self._push = push
         self._settled = 0
+        self._plans = 0  # adopted so far
         self._rows: list[tuple[State, Instruction]] = []
         self.ended: str | None = None  # "done" or "time", if the task ended by itself
 
@@ -96,7 +97,17 @@ class Director:
             what = f"{type(error).__name__}: {error} ({where.filename}:{where.lineno})"
             self._guard.fault("policy", f"the policy failed: {what}")
             return shown
-        return Proposal(target, instruction, percept, getattr(self._policy, "adopted", None))
+        for text in self._policy.take_events() if hasattr(self._policy, "take_events") else ():
+            self._guard.note("plan", text)
+        return Proposal(target, instruction, percept, self._adopted())
+
+    def _adopted(self) -> Adopted | None:
+        """The plan that a planning policy took over at this tick."""
+        adopted: list[tuple[int, int]] = getattr(self._policy, "adopted", [])
+        if len(adopted) <= self._plans:
+            return None
+        self._plans = len(adopted)
+        return Adopted(*adopted[-1], self._policy.latest_plan)  # type: ignore[attr-defined]
 
     def _end(self, how: str, text: str) -> None:
         self.ended = how

@@ -10,7 +10,7 @@ class Event:
     """One event. `kind` is a short word that programs may test; `text` says what happened and what to do.
 
     Kinds: `phase` (the guard changed its state), `rejected` (a non-finite target), `fall`, `stale`, `temperature`,
-    `servo` (a hardware error), `homing`, `policy`, `record`, `interrupt`, `task`, `system`.
+    `servo` (a hardware error), `homing`, `policy`, `plan`, `record`, `interrupt`, `task`, `system`.
     """
 
     tick: int

@@ -2,26 +2,50 @@
 
 from __future__ import annotations
 
-from importlib import import_module
+from collections.abc import Callable
 
 from hw.config import ConfigError, nearest
 from hw.hal import Policy, Task
 from hw.robot import Robot
 
-POLICIES = {
-    "diffusion": ("stack.diffusion_policy", "DiffusionPolicy"),
-    "expert": ("stack.expert_policy", "ExpertPolicy"),
-    "gait": ("stack.gait_policy", "GaitPolicy"),
+
+def _diffusion(robot: Robot, task: Task, realtime: bool) -> Policy:
+    from stack.diffusion_policy import diffusion_policy
+
+    return diffusion_policy(robot, cost=task.cost, process=realtime)
+
+
+def _expert(robot: Robot, task: Task, realtime: bool) -> Policy:
+    from stack.expert_policy import ExpertPolicy
+
+    policy: Policy = ExpertPolicy(robot, task=task, realtime=realtime)
+    return policy
+
+
+def _gait(robot: Robot, task: Task, realtime: bool) -> Policy:
+    from stack.gait_policy import GaitPolicy
+
+    policy: Policy = GaitPolicy(robot, task=task, realtime=realtime)
+    return policy
+
+
+POLICIES: dict[str, Callable[[Robot, Task, bool], Policy]] = {
+    "diffusion": _diffusion,
+    "expert": _expert,
+    "gait": _gait,
 }
+
+
+def check_policy(name: str) -> None:
+    """Raises ConfigError with the nearest name."""
+    if name not in POLICIES:
+        raise ConfigError(f"unknown policy '{name}': {nearest(name, POLICIES)}")
 
 
 def make_policy(name: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     """A policy for a robot and a task. Raises ConfigError for an unknown name, or for a checkpoint that does not fit.
 
-    With `realtime` a planner may run beside the loop; without, it answers at once, at the same tick.
+    With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is for.
     """
-    if name not in POLICIES:
-        raise ConfigError(f"unknown policy '{name}': {nearest(name, POLICIES)}")
-    module, attribute = POLICIES[name]
-    policy: Policy = getattr(import_module(module), attribute)(robot, task=task, realtime=realtime)
-    return policy
+    check_policy(name)
+    return POLICIES[name](robot, task, realtime)

@@ -1,0 +1,99 @@
+"""Frames of a robot's motion, drawn off screen.
+
+MuJoCo chooses how to draw when it is first imported: on a machine without a display set MUJOCO_GL=egl before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from hw.hal import Array
+from hw.robot import Robot
+from sim.model import build
+
+AZIMUTH, ELEVATION, DISTANCE = 140.0, -18.0, 1.1  # degrees and m, of the camera that follows the robot
+FOLLOW = 0.08  # share of the way to the robot that the camera goes each frame: calm, yet never far behind
+GOAL_COLOUR = (0.15, 0.65, 0.30, 0.8)
+TRAIL_COLOUR = (0.20, 0.35, 0.75, 0.9)
+PLAN_COLOUR = (0.95, 0.55, 0.10, 0.9)
+_ROOM = 2000  # geoms in a scene, of which the trail takes what is left
+
+
+class RenderError(Exception):
+    """No frames can be drawn on this machine."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What one picture shows, all in one frame of reference whose z is up and zero on the ground."""
+
+    place: Array  # (3,) m of the base
+    orientation: Array  # (4,) quaternion w x y z
+    joints: Array  # (n_joints,) rad
+    goal: Array | None = None  # (2,) m
+    plan: Array | None = None  # (n, 2) m: where the robot means to go
+
+
+def render(robot: Robot, frames: list[Frame], width: int = 640, height: int = 480) -> Iterator[Array]:
+    """Pictures `(height, width, 3)` uint8 of `frames`. Raises RenderError when there is no way to draw."""
+    model = build(robot)
+    model.vis.quality.offsamples = 0  # in software, smoothing costs 28 against 400 ms a picture
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    data = mujoco.MjData(model)
+    joints = [int(model.joint(name).qposadr[0]) for name in robot.names]
+    try:
+        renderer = mujoco.Renderer(model, height, width, max_geom=_ROOM)
+    except Exception as error:  # each way of drawing raises its own kind
+        raise RenderError(f"cannot draw on this machine ({error}): try MUJOCO_GL=egl or MUJOCO_GL=osmesa") from error
+    with renderer:
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            renderer.scene.flags[flag] = False
+        camera = mujoco.MjvCamera()
+        camera.azimuth, camera.elevation, camera.distance = AZIMUTH, ELEVATION, DISTANCE
+        camera.lookat[:] = frames[0].place if frames else 0.0
+        trail: list[Array] = []
+        for frame in frames:
+            data.qpos[0:3], data.qpos[3:7], data.qpos[joints] = frame.place, frame.orientation, frame.joints
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_camlight(model, data)
+            camera.lookat[:2] += FOLLOW * (frame.place[:2] - camera.lookat[:2])
+            renderer.update_scene(data, camera)
+            if not trail or np.linalg.norm(frame.place[:2] - trail[-1]) > 0.02:
+                trail.append(frame.place[:2].copy())
+            _draw(renderer.scene, frame, trail)
+            yield renderer.render()
+
+
+def _draw(scene: mujoco.MjvScene, frame: Frame, trail: list[Array]) -> None:
+    if frame.goal is not None:
+        _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (0.05, 0.05, 0.002), frame.goal, 0.003, GOAL_COLOUR)
+        _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (0.004, 0.004, 0.12), frame.goal, 0.12, GOAL_COLOUR)
+    for point in frame.plan if frame.plan is not None else ():
+        _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (0.006, 0, 0), point, 0.012, PLAN_COLOUR)
+    for point in trail[-(_ROOM // 2) :]:
+        _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (0.004, 0, 0), point, 0.004, TRAIL_COLOUR)
+
+
+def _add(
+    scene: mujoco.MjvScene,
+    kind: mujoco.mjtGeom,
+    size: tuple[float, float, float],
+    place: Array,
+    height: float,
+    colour: tuple[float, float, float, float],
+) -> None:
+    if scene.ngeom >= scene.maxgeom:
+        return
+    mujoco.mjv_initGeom(
+        scene.geoms[scene.ngeom],
+        type=kind,
+        size=np.array(size),
+        pos=np.array([place[0], place[1], height]),
+        mat=np.eye(3).ravel(),
+        rgba=np.array(colour, dtype=np.float32),
+    )
+    scene.ngeom += 1

@@ -1,0 +1,44 @@
+"""What video and plot both draw: the robot's path, goal and plans of a flight log, in the odometry frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hw.hal import Array
+from stack.flightlog import FlightLog
+from stack.logformat import unpack
+
+
+@dataclass(frozen=True)
+class DrawnPlan:
+    adopted: int  # tick of the run
+    path: Array  # (horizon, 2) m, odometry frame
+
+
+def task_ticks(log: FlightLog) -> Array:
+    """Ticks of the run in which the task ran; the first is the task's tick 0."""
+    return log.ticks("/instruction")
+
+
+def goal(log: FlightLog) -> Array | None:
+    """The newest goal `(2,)` m, odometry frame."""
+    places = [message["place"] for message in log.messages["/instruction"] if "place" in message]
+    return unpack(places[-1]) if places else None
+
+
+def plans(log: FlightLog) -> list[DrawnPlan]:
+    """Predicted paths. Their ticks count calls of the policy, one for each tick of the task."""
+    ticks = task_ticks(log)
+    if not log.messages["/plan"]:
+        return []
+    at = {int(tick): row for row, tick in enumerate(log.ticks("/state"))}
+    displacement, yaw = log.column("/state", "displacement"), log.column("/state", "yaw")
+    found = []
+    for message in log.messages["/plan"]:
+        row = at[int(ticks[message["requested"]])]
+        c, s = np.cos(yaw[row]), np.sin(yaw[row])
+        turn = np.array([[c, -s], [s, c]])
+        found.append(DrawnPlan(int(message["tick"]), displacement[row, :2] + unpack(message["path"]) @ turn.T))
+    return found
