@@ -1,0 +1,16 @@
+"""Fixtures that tests of several packages share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from synthetic_recording import write_dataset
+
+from hw.robot import load_robot
+
+
+@pytest.fixture(scope="session")
+def synthetic_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a small made-up dataset, as `servoid collect` would write it."""
+    return write_dataset(tmp_path_factory.mktemp("dataset") / "made-up", load_robot())

@@ -1,0 +1,169 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from hw.config import ConfigError
+from policy.diffusion.config import DenoiserConfig
+from policy.diffusion.denoiser import Denoiser
+from policy.diffusion.sampler import Guidance, Known, Sampler
+from policy.diffusion.schedule import cosine_signal, full_sequence
+from policy.diffusion.training import losses
+
+LEVELS = 100
+SIGNAL = torch.as_tensor(cosine_signal(LEVELS), dtype=torch.float32)
+
+
+def unknown(batch: int, tokens: int = 1) -> Known:
+    return Known(
+        torch.zeros(batch, tokens, 1),
+        torch.zeros(batch, tokens, 1),
+        torch.zeros(tokens, dtype=torch.bool),
+        torch.zeros(tokens, dtype=torch.bool),
+    )
+
+
+def generators(batch: int, seed: int = 0) -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(1000 * seed + i) for i in range(batch)]
+
+
+def mixture(weights: Tensor, means: Tensor, deviation: float) -> object:
+    """The exact predictor of x0, E[x0 | xk], for a mixture of normal distributions."""
+
+    def clean(x: Tensor, levels: Tensor) -> Tensor:
+        a = SIGNAL[levels][:, None]
+        variance = a * deviation**2 + 1 - a
+        log = weights.log() - 0.5 * (x - a.sqrt() * means).square() / variance
+        share = log.softmax(-1)
+        each = means + a.sqrt() * deviation**2 / variance * (x - a.sqrt() * means)
+        return (share * each).sum(-1, keepdim=True)
+
+    return lambda s, a, ks, ka: (clean(s, ks), clean(a, ka))
+
+
+def test_samples_have_the_mean_and_spread_of_the_distribution() -> None:
+    predict = mixture(torch.tensor([1.0]), torch.tensor([0.7]), 0.5)
+    states, actions = Sampler(predict, cosine_signal(LEVELS)).sample(
+        full_sequence(LEVELS, 50, 1, 1), unknown(4000), generators(4000)
+    )
+    for x in (states, actions):
+        assert x.mean().item() == pytest.approx(0.7, abs=0.03)
+        assert x.std().item() == pytest.approx(0.5, rel=0.05)
+
+
+def test_both_modes_are_sampled_in_proportion() -> None:
+    predict = mixture(torch.tensor([0.3, 0.7]), torch.tensor([-2.0, 1.0]), 0.2)
+    states, _ = Sampler(predict, cosine_signal(LEVELS)).sample(
+        full_sequence(LEVELS, 50, 1, 1), unknown(4000), generators(4000)
+    )
+    right = states[states > -0.5]
+    assert len(right) / 4000 == pytest.approx(0.7, abs=0.03)
+    assert right.mean().item() == pytest.approx(1.0, abs=0.03)
+    assert right.std().item() == pytest.approx(0.2, rel=0.12)
+
+
+def test_known_tokens_come_back_untouched_and_are_shown_clean() -> None:
+    seen = []
+
+    def predict(s: Tensor, a: Tensor, ks: Tensor, ka: Tensor) -> tuple[Tensor, Tensor]:
+        seen.append((s[:, 0].clone(), ks[0].item(), a[:, 1].clone(), ka[1].item()))
+        return torch.full_like(s, 9.0), torch.full_like(a, 9.0)
+
+    known = unknown(2, tokens=2)
+    known.states[:, 0], known.actions[:, 1] = 3.0, 4.0
+    known.state_mask[0] = known.action_mask[1] = True
+    states, actions = Sampler(predict, cosine_signal(20)).sample(full_sequence(20, 4, 2, 2), known, generators(2))
+    assert states[:, 0].eq(3.0).all()
+    assert states[:, 1].eq(9.0).all()
+    assert actions[:, 1].eq(4.0).all()
+    assert len(seen) == 4
+    for state, state_level, action, action_level in seen:
+        assert state.eq(3.0).all()
+        assert action.eq(4.0).all()
+        assert state_level == action_level == 0
+
+
+def test_a_sample_depends_on_its_own_generator_only() -> None:
+    sampler = Sampler(mixture(torch.tensor([1.0]), torch.tensor([0.0]), 1.0), cosine_signal(LEVELS))
+    matrix = full_sequence(LEVELS, 5, 1, 1)
+    many, _ = sampler.sample(matrix, unknown(5), generators(5))
+    alone, _ = sampler.sample(matrix, unknown(1), generators(5)[3:4])
+    torch.testing.assert_close(alone[0], many[3], rtol=0, atol=0)
+    other, _ = sampler.sample(matrix, unknown(5), generators(5, seed=1))
+    assert not torch.equal(other, many)
+
+
+@pytest.mark.parametrize("gradient", ["analytic", "network"])
+def test_a_guidance_step_is_never_longer_than_its_clip(gradient: str) -> None:
+    # One call from pure noise whose prediction is its input: the sample is that prediction, moved.
+    sampler = Sampler(lambda s, a, ks, ka: (s, a), cosine_signal(LEVELS))
+    matrix, known = full_sequence(LEVELS, 1, 2, 2), unknown(3, tokens=2)
+    plain, _ = sampler.sample(matrix, known, generators(3))
+    guidance = Guidance(lambda s: 1e6 * s.sum((1, 2)), weight=1.0, clip=0.25, gradient=gradient)
+    guided, _ = sampler.sample(matrix, known, generators(3), guidance)
+    torch.testing.assert_close((guided - plain).flatten(1).norm(dim=1), torch.full((3,), 0.25))
+    gentle = Guidance(lambda s: 0.1 * s.sum((1, 2)), weight=1.0, clip=5.0, gradient=gradient)
+    guided, _ = sampler.sample(matrix, known, generators(3), gentle)
+    torch.testing.assert_close(plain - guided, torch.full((3, 2, 1), 0.1))
+
+
+def test_known_states_do_not_use_up_the_guidance_step() -> None:
+    sampler = Sampler(lambda s, a, ks, ka: (torch.zeros_like(s), a), cosine_signal(LEVELS))
+    known = unknown(1, tokens=2)
+    known.state_mask[0] = True
+    guidance = Guidance(lambda s: s.sum((1, 2)), weight=100.0, clip=0.5)
+    states, _ = sampler.sample(full_sequence(LEVELS, 1, 2, 2), known, generators(1), guidance)
+    torch.testing.assert_close(states[0, :, 0], torch.tensor([0.0, -0.5]))
+
+
+def test_a_cost_without_a_finite_gradient_is_an_error() -> None:
+    sampler = Sampler(lambda s, a, ks, ka: (torch.zeros_like(s), a), cosine_signal(LEVELS))
+    guidance = Guidance(lambda s: s.norm(dim=(1, 2)).sqrt(), weight=1.0, clip=1.0)
+    with pytest.raises(ValueError, match="no finite gradient"):
+        sampler.sample(full_sequence(LEVELS, 1, 1, 1), unknown(1), generators(1), guidance)
+
+
+def test_an_unknown_gradient_is_refused() -> None:
+    with pytest.raises(ConfigError, match="'numeric'"):
+        Guidance(lambda s: s.sum(), 1.0, 1.0, gradient="numeric")
+
+
+@pytest.fixture(scope="module")
+def planner() -> tuple[Denoiser, Sampler]:
+    """A denoiser trained on windows in which all that is to come, states and actions, is one number around 0."""
+    torch.manual_seed(0)
+    config = DenoiserConfig(1, 1, width=32, heads=2, history=1, horizon=4, levels=20)
+    denoiser, generator = Denoiser(config), torch.Generator().manual_seed(0)
+    signal = torch.as_tensor(cosine_signal(config.levels), dtype=torch.float32)
+    optimiser = torch.optim.AdamW(denoiser.parameters(), 3e-3)
+    for step in range(400):
+        optimiser.param_groups[0]["lr"] = 3e-3 * (1 - step / 400) * min(1.0, (step + 1) / 20)
+        z = torch.randn(64, 1, 1, generator=generator)
+        states = z.repeat(1, 5, 1)
+        states[:, 0] = 0.0  # the present says nothing
+        loss = sum(losses(denoiser, states, z.repeat(1, 4, 1), signal, 0, generator))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    denoiser.eval().requires_grad_(False)
+    return denoiser, Sampler(denoiser, cosine_signal(config.levels))
+
+
+@pytest.mark.parametrize(("gradient", "lead"), [("analytic", 0), ("analytic", 2), ("network", 0)])
+def test_guiding_states_moves_the_actions(planner: tuple[Denoiser, Sampler], gradient: str, lead: int) -> None:
+    # Even the present action, which attends to no future state and takes all its news from the present state's token.
+    _, sampler = planner
+    known = Known(torch.zeros(256, 5, 1), torch.zeros(256, 4, 1), torch.arange(5) < 1, torch.zeros(4, dtype=torch.bool))
+    matrix = full_sequence(20, 5, 5, 4, lead=lead)
+    guidance = Guidance(lambda s: (s[:, 1:] - 1.5).square().sum((1, 2)), 0.3, 10.0, gradient)
+    with torch.no_grad():
+        states, actions = sampler.sample(matrix, known, generators(256))
+        guided_states, guided_actions = sampler.sample(matrix, known, generators(256), guidance)
+    # Unguided, both spread around 0, and each present action belongs to the states of its own sample.
+    assert abs(states[:, 1:].mean()) < 0.2
+    assert abs(actions[:, 0].mean()) < 0.2
+    assert torch.corrcoef(torch.stack([states[:, 1, 0], actions[:, 0, 0]]))[0, 1] > 0.95
+    assert guided_states[:, 1:].mean() > 1.2
+    # The last call sees states that are guided already; with a lead it sees the finished ones, and follows them closer.
+    assert guided_actions[:, 0].mean() > (1.3 if lead else 0.8)
