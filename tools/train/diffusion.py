@@ -173,7 +173,8 @@ class Trainer:
         ):
             try:
                 while self.seconds < budget:
-                    self._train_for(min(budget - self.seconds, 10.0), journal, bar)
+                    due = max(self.evaluated + every - self.seconds, 0.0)
+                    self._train_for(min(budget - self.seconds, due, 10.0), journal, bar)
                     if self.seconds - self.evaluated >= every and self.seconds < budget:
                         self._evaluate(journal, bar)
                 if self.evaluated < self.seconds:
@@ -187,7 +188,7 @@ class Trainer:
         """Train for about `seconds` and log the means."""
         sums, steps, start = [0.0, 0.0], 0, time.perf_counter()
         before = self.seconds
-        while self.seconds - before < seconds:
+        while self.seconds - before < seconds or not steps:
             state_loss, action_loss = self._step()
             sums = [sums[0] + state_loss, sums[1] + action_loss]
             steps += 1

@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from synthetic_recording import episode
+
+from hw.config import ConfigError
+from hw.hal import Array, Instruction, PlanRequest
+from hw.robot import load_robot
+from policy.checkpoint import CheckpointError
+from policy.diffusion import checkpoint
+from policy.diffusion.config import DenoiserConfig
+from policy.diffusion.denoiser import Denoiser
+from policy.diffusion.features import Normaliser, Trajectory, raw_layout
+from policy.diffusion.runtime import Runtime
+from policy.diffusion.settings import DiffusionSettings, GuidanceSettings, load_settings
+
+ROBOT = load_robot()
+SETTINGS = DiffusionSettings(steps=4, delay=2)
+
+
+def model(seed: int = 0, **shape: Any) -> checkpoint.Model:
+    torch.manual_seed(seed)
+    config = DenoiserConfig(54, 20, **({"width": 32, "heads": 2} | shape))
+    denoiser = Denoiser(config).eval().requires_grad_(False)
+    states = Normaliser(0.1 * torch.randn(54), torch.rand(54) + 0.1)
+    actions = Normaliser(torch.tensor(ROBOT.home, dtype=torch.float32), torch.full((20,), 0.2))
+    return checkpoint.Model(denoiser, states, actions, {})
+
+
+def request(tick: int = 40, delay: int = 2, seed: int = 3) -> PlanRequest:
+    raw, _, applied = episode(ROBOT, 60, np.random.default_rng(seed))
+    return PlanRequest(tick, raw[37:41], applied[37 : 40 + delay], Instruction(np.array([0.2, 0.0, 0.1])))
+
+
+def moved(states: Array, x: float, y: float, yaw: float) -> Array:
+    layout, out = raw_layout(20), states.copy()
+    c, s = np.cos(yaw), np.sin(yaw)
+    out[:, :2] = states[:, :2] @ np.array([[c, s], [-s, c]]) + [x, y]
+    out[:, layout.slice("yaw")] += yaw
+    return out
+
+
+def speed_cost(trajectory: Trajectory, instruction: Instruction) -> Any:
+    return (trajectory.velocity[..., 0] - instruction.velocity[0]).square().mean(-1)
+
+
+def test_the_same_request_and_seed_give_the_same_plan() -> None:
+    runtime = Runtime(model(), SETTINGS, ROBOT.dt)
+    first, again = runtime.plan(request(), 7), runtime.plan(request(), 7)
+    np.testing.assert_array_equal(first.actions, again.actions)
+    np.testing.assert_array_equal(first.states, again.states)
+    assert not np.array_equal(first.actions, runtime.plan(request(), 8).actions)
+    assert not np.array_equal(first.actions, runtime.plan(request(tick=41), 7).actions)
+
+
+def test_committed_actions_are_part_of_the_plan() -> None:
+    asked = request(delay=2)
+    plan = Runtime(model(), SETTINGS, ROBOT.dt).plan(asked, 0)
+    assert plan.tick == 40
+    assert plan.actions.shape == (16, 20)
+    assert plan.states.shape == (16, raw_layout(20).size)
+    np.testing.assert_allclose(plan.actions[:2], asked.actions[3:], atol=1e-6)
+    assert np.isfinite(plan.actions).all()
+    assert plan.seconds > 0
+    # What they are matters for what follows.
+    changed = replace(asked, actions=asked.actions + 0.1 * (np.arange(5) >= 3)[:, None])
+    assert np.abs(Runtime(model(), SETTINGS, ROBOT.dt).plan(changed, 0).actions[2:] - plan.actions[2:]).max() > 1e-4
+
+
+def test_a_plan_does_not_depend_on_where_odometry_began() -> None:
+    runtime, here = Runtime(model(), SETTINGS, ROBOT.dt), request()
+    there = replace(here, states=moved(here.states, 30.0, -20.0, 2.0))
+    a, b = runtime.plan(here, 0), runtime.plan(there, 0)
+    np.testing.assert_allclose(a.actions, b.actions, atol=1e-4)
+    np.testing.assert_allclose(a.path, b.path, atol=1e-4)
+    # The predicted rows are in the odometry frame of the request, the path in its heading frame.
+    np.testing.assert_allclose(moved(a.states, 30.0, -20.0, 2.0)[:, :4], b.states[:, :4], atol=1e-4)
+    c, s = (float(f(here.states[-1, 3])) for f in (np.cos, np.sin))
+    offset = (a.states[:, :2] - here.states[-1, :2]) @ np.array([[c, -s], [s, c]])
+    np.testing.assert_allclose(a.path, offset, atol=1e-5)
+
+
+@pytest.mark.parametrize(("gradient", "weight"), [("analytic", 5.0), ("network", 50.0)])
+def test_guidance_lowers_the_cost_of_the_prediction(gradient: str, weight: float) -> None:
+    guidance = GuidanceSettings(weight=weight, clip=10.0, gradient=gradient)
+    asked, velocity = request(), raw_layout(20).slice("velocity")
+    plain = Runtime(model(), SETTINGS, ROBOT.dt).plan(asked, 0)
+    guided = Runtime(model(), replace(SETTINGS, guidance=guidance), ROBOT.dt, speed_cost).plan(asked, 0)
+    error = [np.square(p.states[:, velocity][:, 0] - 0.2).mean() for p in (plain, guided)]
+    assert error[1] < 0.8 * error[0]
+    assert np.abs(guided.actions[2:] - plain.actions[2:]).max() > 1e-5
+
+
+def test_a_batch_plans_like_each_of_its_robots() -> None:
+    runtime = Runtime(model(), SETTINGS, ROBOT.dt)
+    asked = [request(tick=t, seed=t) for t in (40, 41, 42)]
+    states, actions = np.stack([r.states for r in asked]), np.stack([r.actions for r in asked])
+    targets, _ = runtime.plan_batch(states, actions, asked[0].instruction, [(5, r.tick) for r in asked])
+    for together, alone in zip(targets, asked, strict=True):
+        np.testing.assert_allclose(together, runtime.plan(alone, 5).actions, atol=1e-5)
+
+
+def test_requests_that_cannot_be_planned_are_refused() -> None:
+    runtime, asked = Runtime(model(), SETTINGS, ROBOT.dt), request()
+    broken = asked.states.copy()
+    broken[0, 10] = np.nan
+    with pytest.raises(ValueError, match="not finite"):
+        runtime.plan(replace(asked, states=broken), 0)
+    with pytest.raises(ValueError, match=r"states are \(3, 53\), \(4, 53\) are needed"):
+        runtime.plan(replace(asked, states=asked.states[1:]), 0)
+    with pytest.raises(ValueError, match="actions are"):
+        runtime.plan(replace(asked, actions=asked.actions[:2]), 0)
+
+
+def test_settings_that_a_network_cannot_serve_are_refused() -> None:
+    with pytest.raises(ConfigError, match="lower replan or delay"):
+        Runtime(model(horizon=8), replace(SETTINGS, replan=7, delay=2), ROBOT.dt)
+    with pytest.raises(ConfigError, match="1 to 20"):
+        Runtime(model(), replace(SETTINGS, steps=21), ROBOT.dt)
+    with pytest.raises(ValueError, match="delay must be 0 to replan"):
+        DiffusionSettings(replan=2, delay=3)
+    with pytest.raises(ValueError, match="gradient"):
+        GuidanceSettings(gradient="numeric")
+
+
+def test_the_shipped_settings_load() -> None:
+    assert load_settings() == DiffusionSettings()
+
+
+def test_a_checkpoint_plans_as_what_was_saved(tmp_path: Path) -> None:
+    made, path = model(), tmp_path / "net.safetensors"
+    facts: dict[str, Any] = {"data": "made up", "licence": "Apache-2.0", "results": {}, "training": {}}
+    weights = made.denoiser.state_dict()
+    checkpoint.save(path, weights, made.config, made.states, made.actions, ROBOT, **facts)
+    loaded = checkpoint.load(path, ROBOT)
+    assert loaded.config == made.config
+    a, b = (Runtime(m, SETTINGS, ROBOT.dt).plan(request(), 0) for m in (made, loaded))
+    np.testing.assert_array_equal(a.actions, b.actions)
+    with pytest.raises(CheckpointError, match="joints do not fit"):
+        checkpoint.load(path, replace(ROBOT, joints=ROBOT.joints[1:]))
+    del weights["norm.weight"]
+    checkpoint.save(path, weights, made.config, made.states, made.actions, ROBOT, **facts)
+    with pytest.raises(CheckpointError, match="do not fit its own header"):
+        checkpoint.load(path, ROBOT)

@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hw.config import ConfigError
+from hw.hal import Array, Instruction, Plan, PlanRequest, State
+from hw.robot import load_robot
+from policy.diffusion import checkpoint
+from policy.diffusion.config import DenoiserConfig
+from policy.diffusion.denoiser import Denoiser
+from policy.diffusion.features import Normaliser, raw_layout
+from policy.diffusion.settings import DiffusionSettings
+from stack.diffusion_policy import DiffusionPolicy, diffusion_policy
+from stack.planner import InlinePlanner
+
+ROBOT = load_robot()
+INSTRUCTION = Instruction(np.array([0.1, 0.0, 0.0]))
+
+
+def state(tick: int) -> State:
+    """Standing; the height tells the tick."""
+    return State(
+        time_ns=tick * 20_000_000,
+        orientation=np.array([1.0, 0, 0, 0]),
+        gravity=np.array([0.0, 0, -1]),
+        yaw=np.float64(0.0),
+        angular_velocity=np.zeros(3),
+        velocity=np.zeros(3),
+        displacement=np.array([0.0, 0.0, tick / 100]),
+        position=ROBOT.home,
+        joint_velocity=np.zeros(20),
+        contact=np.ones(2),
+    )
+
+
+def marked(asked: PlanRequest, seed: int) -> Plan:
+    """A plan whose action for tick t is 1000 * its own tick + t."""
+    actions = 1000.0 * asked.tick + asked.tick + np.arange(16.0)[:, None] * np.ones(20)
+    return Plan(asked.tick, actions, np.zeros((16, 53)), np.zeros((16, 2)), 0.0)
+
+
+class Spy(InlinePlanner):
+    """Keeps the requests, and is late for some."""
+
+    def __init__(self, late: tuple[int, ...] = ()) -> None:
+        super().__init__(marked)
+        self.late, self.requests = late, []
+
+    def submit(self, request: PlanRequest) -> None:
+        self.requests.append(request)
+        super().submit(request)
+
+    def collect(self, tick: int, wait: bool) -> Plan | None:
+        return None if tick in self.late else super().collect(tick, wait)
+
+
+def run(policy: DiffusionPolicy, ticks: int) -> list[float]:
+    """Act for so many ticks, the guard accepting everything; the first joint's targets."""
+    applied, out = np.full(20, 0.5), []
+    for tick in range(ticks):
+        applied = policy.act(state(tick), applied, INSTRUCTION)
+        out.append(float(applied[0]))
+    return out
+
+
+def test_plans_are_adopted_after_the_delay_and_run_by_tick() -> None:
+    policy = DiffusionPolicy(Spy(), history=4, replan=4, delay=2)
+    # The history is full at tick 3; the first request is that of tick 4, adopted at 6; the next, of 8, at 10.
+    assert run(policy, 14) == [0.5] * 6 + [4006, 4007, 4008, 4009, 8010, 8011, 8012, 8013]
+    assert policy.adopted == [(4, 6), (8, 10)]
+    assert policy.latest_plan is not None
+    assert policy.latest_plan.tick == 8
+    assert policy.take_events() == ()
+
+
+def test_without_delay_a_plan_runs_from_its_own_tick() -> None:
+    policy = DiffusionPolicy(Spy(), history=4, replan=4, delay=0)
+    assert run(policy, 9)[3:] == [0.5, 4004, 4005, 4006, 4007, 8008]
+
+
+def test_requests_hold_what_was_applied_and_what_will_run_meanwhile() -> None:
+    planner = Spy()
+    policy = DiffusionPolicy(planner, history=4, replan=4, delay=2)
+    targets = run(policy, 13)
+    asked = planner.requests[2]
+    assert asked.tick == 12
+    height = raw_layout(20).slice("displacement").stop - 1
+    np.testing.assert_allclose(asked.states[:, height], np.array([9, 10, 11, 12]) / 100, rtol=1e-6)
+    # Applied at ticks 9, 10, 11, then what the running plan does at 12 and 13.
+    assert asked.actions[:, 0].tolist() == [*targets[9:12], 8012, 8013]
+
+
+def test_what_the_guard_changed_is_what_the_planner_is_told() -> None:
+    planner = Spy()
+    policy = DiffusionPolicy(planner, history=4, replan=4, delay=1)
+    for tick in range(5):
+        policy.act(state(tick), np.full(20, tick / 10), INSTRUCTION)
+    assert planner.requests[0].actions[:3, 0].tolist() == pytest.approx([0.2, 0.3, 0.4])
+
+
+def test_a_late_plan_is_not_adopted_and_the_last_goes_on_by_its_tick() -> None:
+    policy = DiffusionPolicy(Spy(late=(8,)), history=4, replan=4, delay=1)
+    assert run(policy, 15)[8:] == [4008, 4009, 4010, 4011, 4012, 12013, 12014]
+    assert policy.adopted == [(4, 5), (12, 13)]
+    assert policy.take_events() == ("the plan requested at tick 8 was not ready at 9: that of 4 goes on",)
+    assert policy.take_events() == ()
+
+
+def test_the_last_action_is_held_when_plans_stop_coming_and_it_is_said_once() -> None:
+    policy = DiffusionPolicy(Spy(late=tuple(range(8, 100, 4))), history=4, replan=4, delay=1)
+    assert run(policy, 24)[18:] == [4018, 4019, 4019, 4019, 4019, 4019]
+    ended = [text for text in policy.take_events() if "ended before another one came" in text]
+    assert ended == ["the plan of tick 4 ended before another one came: its last action is held"]
+
+
+def test_reset_forgets_the_episode() -> None:
+    policy = DiffusionPolicy(Spy(), history=4, replan=4, delay=1)
+    first = run(policy, 12)
+    policy.reset(1)
+    assert policy.adopted == []
+    assert run(policy, 12) == first
+
+
+def slow_down(trajectory: Any, instruction: Instruction) -> Any:
+    return trajectory.velocity.square().sum((-1, -2))
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> DiffusionSettings:
+    """Settings of a small network with random weights."""
+    torch.manual_seed(0)
+    config, path = DenoiserConfig(54, 20, width=32, heads=2), tmp_path / "net.safetensors"
+    states = Normaliser(torch.zeros(54), torch.ones(54))
+    actions = Normaliser(torch.tensor(ROBOT.home, dtype=torch.float32), torch.full((20,), 0.1))
+    facts: dict[str, Any] = {"data": "none", "licence": "none", "results": {}, "training": {}}
+    checkpoint.save(path, Denoiser(config).state_dict(), config, states, actions, ROBOT, **facts)
+    return DiffusionSettings(checkpoint=str(path), delay=2)
+
+
+def trace(policy: DiffusionPolicy, seed: int, wait: bool) -> Array:
+    policy._wait = wait
+    policy.reset(seed)
+    applied, out = ROBOT.home, []
+    for tick in range(13):
+        applied = policy.act(state(tick), applied, INSTRUCTION)
+        out.append(applied)
+    return np.stack(out)
+
+
+def test_in_line_and_beside_the_loop_a_seed_gives_the_same_actions(settings: DiffusionSettings) -> None:
+    inline = diffusion_policy(ROBOT, settings, slow_down)
+    process = diffusion_policy(ROBOT, settings, slow_down, process=True)
+    try:
+        first = trace(inline, 3, wait=True)
+        np.testing.assert_array_equal(first, trace(inline, 3, wait=True))
+        np.testing.assert_array_equal(first, trace(process, 3, wait=True))
+        assert process.adopted == [(4, 6), (8, 10)]
+        assert not np.array_equal(first, trace(inline, 4, wait=True))
+    finally:
+        process.close()
+
+
+@pytest.mark.parametrize("process", [False, True])
+def test_a_checkpoint_for_another_rate_is_refused_before_anything_starts(
+    settings: DiffusionSettings, process: bool
+) -> None:
+    with pytest.raises(ConfigError, match="runs at 100"):
+        diffusion_policy(replace(ROBOT, rate=100), settings, process=process)
+    with pytest.raises(ConfigError, match="lower replan or delay"):
+        diffusion_policy(ROBOT, replace(settings, replan=15, delay=2), process=process)

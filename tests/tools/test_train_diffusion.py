@@ -1,0 +1,208 @@
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hw.config import ConfigError
+from hw.robot import load_robot
+from policy.checkpoint import read_header
+from policy.diffusion.checkpoint import load
+from policy.diffusion.config import DenoiserConfig
+from policy.diffusion.dataset import Windows, read_recording
+from policy.diffusion.denoiser import Denoiser
+from policy.diffusion.training import Average, action_weight, draw_levels
+from tools.train import diffusion
+from tools.train.diffusion import Settings, Trainer
+from tools.train.journal import Journal
+
+ROBOT = load_robot()
+CONFIG = DenoiserConfig(54, 20, layers=1, width=16, heads=2)
+QUICK = Settings(minutes=0.01, batch=16, evaluate_every=0.004, warmup_steps=5)
+
+
+class Measured:
+    """Stands in for the closed loop: says what it is told, and remembers what it was shown."""
+
+    def __init__(self, *survival: float) -> None:
+        self.survival = list(survival)
+        self.steps: list[int] = []
+
+    def __call__(self, path: Path) -> Mapping[str, float]:
+        self.steps.append(read_header(path)["results"]["step"])
+        return {"survival": self.survival[min(len(self.steps), len(self.survival)) - 1]}
+
+
+@pytest.fixture(scope="module")
+def windows(synthetic_dataset: Path) -> Windows:
+    return Windows(read_recording(synthetic_dataset, ROBOT), ROBOT, CONFIG)
+
+
+def trainer(windows: Windows, out: Path, survival: Measured, settings: Settings = QUICK) -> Trainer:
+    return Trainer(windows, ROBOT, CONFIG, settings, out, "made up", "Apache-2.0", survival)
+
+
+def test_the_checkpoint_with_the_best_survival_is_kept_not_the_newest(windows: Windows, tmp_path: Path) -> None:
+    measured = Measured(0.2, 0.9, 0.5)
+    trainer(windows, tmp_path, measured).run()
+    assert len(measured.steps) >= 3
+    best = read_header(tmp_path / "best.safetensors")
+    assert best["results"]["survival"] == 0.9
+    assert best["results"]["step"] == measured.steps[1]
+    assert read_header(tmp_path / "last.safetensors")["results"]["step"] == measured.steps[-1]
+    assert best["data"] == "made up"
+    assert best["licence"] == "Apache-2.0"
+    assert load(tmp_path / "best.safetensors", ROBOT).config == CONFIG
+    assert (tmp_path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    assert list((tmp_path / "tensorboard").glob("events*"))
+    text = (tmp_path / "log.csv").read_text()
+    assert "tokens_per_s" in text
+    assert ",0.9\n" in text
+
+
+def test_ties_in_survival_go_to_the_lower_validation_loss(windows: Windows, tmp_path: Path) -> None:
+    run = trainer(windows, tmp_path, Measured(1.0))
+    losses = iter([0.5, 0.3, 0.4, *[0.6] * 1000])
+    run._validation_loss = lambda count=0: next(losses)  # type: ignore[method-assign]
+    run.run()
+    assert read_header(tmp_path / "best.safetensors")["results"]["validation_action_loss"] == 0.3
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(windows: Windows, tmp_path: Path) -> None:
+    first = trainer(windows, tmp_path, Measured(1.0))
+    step = first._step
+
+    def interrupted() -> tuple[float, float]:
+        if first.step == 12:
+            raise KeyboardInterrupt
+        return step()
+
+    first._step = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        first.run()
+    again = trainer(windows, tmp_path, Measured(1.0))
+    assert again.resume()
+    assert again.step == 12
+    # The same batch, noise and optimiser state: the next step is the one that would have followed.
+    assert again._step() == pytest.approx(step(), rel=1e-6)
+    for a, b in zip(first.network.parameters(), again.network.parameters(), strict=True):
+        torch.testing.assert_close(a, b)
+    for name, weight in first.average.weights.items():
+        torch.testing.assert_close(weight, again.average.weights[name])
+
+
+def test_a_run_that_does_not_fit_is_not_resumed(windows: Windows, tmp_path: Path) -> None:
+    assert not trainer(windows, tmp_path, Measured(1.0)).resume()
+    trainer(windows, tmp_path, Measured(1.0)).save()
+    wider = DenoiserConfig(54, 20, layers=1, width=32, heads=2)
+    with pytest.raises(ConfigError, match="width was 16, is 32"):
+        Trainer(windows, ROBOT, wider, QUICK, tmp_path, "", "", None).resume()
+    (tmp_path / "resume.pt").write_bytes(b"PK\x03\x04 cut")
+    with pytest.raises(ConfigError, match="cannot be resumed"):
+        trainer(windows, tmp_path, Measured(1.0)).resume()
+
+
+def test_training_lowers_the_loss_of_held_out_windows(windows: Windows, tmp_path: Path) -> None:
+    run = trainer(windows, tmp_path, Measured(1.0), Settings(minutes=1.0, batch=64, warmup_steps=5, learning_rate=3e-3))
+    run.average.decay = 0.9
+    before = run._validation_loss()
+    for _ in range(60):
+        run._step()
+    assert run._validation_loss() < 0.7 * before
+
+
+def test_survival_that_cannot_be_measured_stops_the_run_before_it_trains(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def missing(name: str) -> None:
+        raise ModuleNotFoundError(f"No module named '{name}'")
+
+    monkeypatch.setattr(diffusion, "import_module", missing)
+    parser = argparse.ArgumentParser()
+    diffusion.add_arguments(parser)
+    args = parser.parse_args(["--data", str(tmp_path), "--out", str(tmp_path / "run")])
+    with pytest.raises(ConfigError, match="survival cannot be measured"):
+        diffusion.main(args)
+
+
+def test_the_command_trains_from_a_folder_and_resumes(synthetic_dataset: Path, tmp_path: Path) -> None:
+    parser = argparse.ArgumentParser()
+    diffusion.add_arguments(parser)
+    options = [
+        "--data",
+        str(synthetic_dataset),
+        "--out",
+        str(tmp_path),
+        "--layers",
+        "1",
+        "--width",
+        "16",
+        "--batch",
+        "16",
+    ]
+    options += ["--threads", "1", "--survival-worlds", "0", "--evaluate-every", "0"]
+    threads = torch.get_num_threads()
+    try:
+        assert diffusion.main(parser.parse_args([*options, "--minutes", "0.004"])) == 0
+        first = read_header(tmp_path / "best.safetensors")["results"]
+        assert diffusion.main(parser.parse_args([*options, "--minutes", "0.008"])) == 0
+    finally:
+        torch.set_num_threads(threads)
+    second = read_header(tmp_path / "last.safetensors")["results"]
+    assert second["step"] > first["step"]
+    steps = [int(row.split(",")[0]) for row in (tmp_path / "log.csv").read_text().splitlines()[1:]]
+    assert steps == sorted(steps)
+    assert steps[-1] == second["step"]
+
+
+def test_the_past_is_clean_and_half_of_the_windows_share_one_level() -> None:
+    states, actions = draw_levels(CONFIG, 400, committed=2, generator=torch.Generator().manual_seed(0))
+    assert not states[:, :4].any()
+    assert not actions[:, :3].any()
+    shared, independent = states[:200, 4:], states[200:, 4:]
+    assert (shared == shared[:, :1]).all()
+    assert shared.min() == 1
+    assert shared.max() == 20
+    assert torch.equal(actions[:200, -1:], shared[:, :1])  # actions share it too
+    assert independent.float().std(1).min() > 1
+    assert independent.min() == 0
+    # Committed actions: none, one or two are clean, each a third of the time.
+    clean = (actions[:200, 3:] == 0).sum(1)
+    assert set(clean.tolist()) == {0, 1, 2}
+
+
+def test_far_actions_count_less_and_past_ones_not_at_all() -> None:
+    weight = action_weight(CONFIG)
+    assert weight[:3].tolist() == [0, 0, 0]
+    assert weight[3:11].tolist() == [1] * 8
+    assert weight[11:].tolist() == pytest.approx([0.2] * 8)
+
+
+def test_the_average_starts_quickly_and_then_forgets_slowly() -> None:
+    network = Denoiser(CONFIG)
+    average = Average(network, decay=0.99)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(1.0)
+    start = network.norm.bias.mean().item()
+    average.update(network)
+    assert average.weights["norm.bias"].mean().item() == pytest.approx(start * (1 - 2 / 11))
+    for _ in range(300):
+        average.update(network)
+    assert average.weights["norm.bias"].mean().item() == pytest.approx(start, abs=0.02)
+
+
+def test_the_journal_of_a_resumed_run_drops_what_was_logged_beyond_its_checkpoint(tmp_path: Path) -> None:
+    with Journal(tmp_path, ("loss",)) as journal:
+        for step in (1, 2, 3):
+            journal.log(step, {"loss": float(step)})
+    with Journal(tmp_path, ("loss",), step=2) as journal:
+        journal.log(3, {"loss": 30.0})
+        assert [(row["step"], float(row["loss"])) for row in journal.read()] == [("1", 1), ("2", 2), ("3", 30)]
+        with pytest.raises(KeyError, match="no column 'speed'"):
+            journal.log(4, {"speed": 1.0})
+    np.testing.assert_equal(len(Journal(tmp_path, ("loss",)).read()), 0)
