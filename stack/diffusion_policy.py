@@ -7,6 +7,7 @@ late is not adopted: the last one goes on by its tick index. So a run does not d
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Container
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -39,6 +40,7 @@ class DiffusionPolicy:
         self._history, self._replan, self._delay, self._wait = history, replan, delay, wait
         self._states: deque[Array] = deque(maxlen=history)
         self._applied: deque[Array] = deque(maxlen=history - 1)
+        self.only: Container[int] | None = None  # requests in time in a recorded run, where it is repeated
         self.reset(0)
 
     def reset(self, seed: int) -> None:
@@ -100,6 +102,8 @@ class DiffusionPolicy:
             return
         requested, self._requested = self._requested, None
         plan = self._planner.collect(requested, self._wait)
+        if self.only is not None and requested not in self.only:
+            plan = None
         if plan is None:
             running = "the goal is held" if self.latest_plan is None else f"that of {self.latest_plan.tick} goes on"
             self._events.append(f"the plan requested at tick {requested} was not ready at {tick}: {running}")

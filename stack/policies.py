@@ -49,3 +49,18 @@ def make_policy(name: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     """
     check_policy(name)
     return POLICIES[name](robot, task, realtime)
+
+
+def policy_fingerprint(name: str) -> dict[str, str | None]:
+    """Name of a policy and the hash of its checkpoint, where it has one, for the flight log."""
+    from policy.checkpoint import resolve
+    from stack.provenance import sha256
+
+    checkpoint = None
+    if name == "expert":
+        checkpoint = resolve("expert")
+    elif name == "diffusion":
+        from policy.diffusion.settings import load_settings
+
+        checkpoint = resolve(load_settings().checkpoint)
+    return {"name": name, "checkpoint_sha256": None if checkpoint is None else sha256(checkpoint)}

@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from hw.hal import Policy, Task
+from hw.hal import Task
 from hw.robot import Robot
 from policy.checkpoint import git_commit
 from stack.logformat import FORMAT, plain
@@ -18,7 +18,7 @@ from stack.logformat import FORMAT, plain
 PACKAGES = ("servoid", "numpy", "mujoco", "torch", "mcap")
 
 
-def header(settings: Any, robot: Robot, task: Task, policy: Policy) -> dict[str, Any]:
+def header(settings: Any, robot: Robot, task: Task, policy: dict[str, Any]) -> dict[str, Any]:
     """Everything that repeating a run needs, and what the repetition is checked against."""
     return {
         "format": FORMAT,
@@ -26,36 +26,37 @@ def header(settings: Any, robot: Robot, task: Task, policy: Policy) -> dict[str,
         "settings": plain(dataclasses.asdict(settings)),
         "seed": settings.seed,
         "task": {"name": task.name} | described(getattr(task, "settings", None)),
-        **fingerprint(robot, policy),
-        "versions": {name: _version(name) for name in PACKAGES} | {"python": platform.python_version()},
+        **fingerprint(robot),
+        "policy": policy,
+        "versions": versions(),
         "git_commit": git_commit(),
     }
 
 
-def fingerprint(robot: Robot, policy: Policy) -> dict[str, Any]:
-    """What must be the same for a run to come out the same: the robot, its servos and model, the policy's network."""
-    checkpoint = getattr(policy, "checkpoint", None)
+def fingerprint(robot: Robot) -> dict[str, Any]:
+    """The robot, its servos and its model, to be compared."""
     return {
         "robot": described(robot),
         "servos": {servo.name: described(servo) for servo in robot.servos},
-        "mjcf_sha256": _sha256(Path(robot.mjcf)),
-        "policy": {
-            "class": type(policy).__qualname__,
-            "checkpoint": None if checkpoint is None else Path(checkpoint).name,
-            "checkpoint_sha256": None if checkpoint is None else _sha256(Path(checkpoint)),
-        },
+        "mjcf_sha256": sha256(Path(robot.mjcf)),
     }
 
 
+def versions() -> dict[str, str | None]:
+    """Versions of what computes a run."""
+    return {name: _version(name) for name in PACKAGES} | {"python": platform.python_version()}
+
+
 def described(value: Any) -> dict[str, Any]:
-    """A dataclass as JSON values."""
+    """A dataclass as JSON values; nothing for what is none."""
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         return {}
-    described: dict[str, Any] = plain(dataclasses.asdict(value))
-    return described
+    values: dict[str, Any] = plain(dataclasses.asdict(value))
+    return values
 
 
-def _sha256(path: Path) -> str | None:
+def sha256(path: Path) -> str | None:
+    """Hash of a file's bytes; None where there is none."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +20,8 @@ from stack.estimator import Estimator
 from stack.event import Event
 from stack.interrupt import Interrupt, Stops
 from stack.loop import Listener, Loop, TickRecord
-from stack.policies import make_policy
+from stack.odometry import load_odometry
+from stack.policies import make_policy, policy_fingerprint
 from stack.safety import Guard, Phase
 from stack.steady import steady
 from stack.tasks import load_task
@@ -45,6 +46,14 @@ class Settings:
     record: Path | None = None  # flight log to write
     realtime: bool | None = None  # in step with the wall; None: only where there is hardware
     port: str | None = None
+
+
+@dataclass(frozen=True)
+class Script:
+    """What came to a recorded run from outside, for a run that repeats it."""
+
+    stops: tuple[Event, ...] = ()  # what ended it: Ctrl-C, a full disk
+    plans: frozenset[int] | None = None  # ticks of the plan requests that were answered in time
 
 
 @dataclass(frozen=True)
@@ -79,15 +88,15 @@ def run(
     on_tick: Listener | None = None,
     policy: Policy | None = None,
     confirm: Callable[[str], None] | None = None,
-    stops: Sequence[Event] = (),
+    script: Script | None = None,
 ) -> Result:
     """Do one run and return how it went, the robot with torque off.
 
     `backend` and `policy` replace those that the settings name. `on_tick` is called after each tick and must be quick.
-    `confirm` asks the person at a real robot, and returns when it may move. `stops` are the events of a recorded run
-    that ended it from outside, to be repeated. Raises ConfigError before anything is connected, BackendError when the
-    body cannot be reached.
+    `confirm` asks the person at a real robot, and returns when it may move. `script` repeats a recorded run. Raises
+    ConfigError before anything is connected, BackendError when the body cannot be reached.
     """
+    script = script or Script()
     robot = load_robot(settings.robot)
     task, gain = _task(settings, robot)
     simulated = backend_kind(settings.backend).simulated if backend is None else hasattr(backend, "truth")
@@ -98,6 +107,8 @@ def run(
         )
     with ExitStack() as stack:
         pilot = make_policy(settings.policy, robot, task, realtime) if policy is None else policy
+        if script.plans is not None and hasattr(pilot, "only"):
+            pilot.only = script.plans
         if hasattr(pilot, "close"):
             stack.callback(pilot.close)
         body = backend or make_backend(
@@ -116,7 +127,7 @@ def run(
         # From here on a Ctrl-C is a request, until the motors are off.
         interrupt = stack.enter_context(Interrupt())
         guard = Guard(robot, motors, gain)
-        estimator = Estimator(robot)
+        estimator = Estimator(robot, load_odometry(robot))
         director = Director(robot, guard, estimator, task, pilot, push)
         tally = _Tally()
         listeners: list[Listener] = [tally]
@@ -126,7 +137,14 @@ def run(
             from stack.recorder import Recorder
 
             recorder = Recorder.create(
-                settings.record, header(settings, robot, task, pilot), wait=simulated and not realtime
+                settings.record,
+                header(
+                    settings,
+                    robot,
+                    task,
+                    policy_fingerprint(settings.policy) if policy is None else {"name": type(policy).__qualname__},
+                ),
+                wait=simulated and not realtime,
             )
             listeners.append(recorder)
         if on_tick is not None:
@@ -134,7 +152,7 @@ def run(
         if realtime:
             stack.enter_context(steady(not simulated, lambda text: guard.note("system", text)))
         clock = RealTime(body.clock) if realtime and not isinstance(body.clock, WallClock) else body.clock
-        requests = Stops(interrupt, lambda: recorder.error if recorder is not None else None, stops)
+        requests = Stops(interrupt, lambda: recorder.error if recorder is not None else None, script.stops)
         loop = Loop(
             sensors, estimator, director, guard, Schedule(clock, robot.rate), interrupt, requests, tuple(listeners)
         )

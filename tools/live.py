@@ -13,7 +13,7 @@ from stack.loop import TickRecord
 from stack.safety import Phase
 
 WINDOW = 250  # ticks that the timing is taken over
-INTERVAL = {True: 0.1, False: 1.0}  # s of the wall between updates: on a terminal, elsewhere
+INTERVAL = {True: 0.1, False: 1.0}  # s between updates: of the wall on a terminal, of the robot elsewhere
 
 
 class LiveLine:
@@ -34,7 +34,7 @@ class LiveLine:
         )
         if record.proposal.instruction is not None and self._start_ns is None:
             self._start_ns = record.observation.time_ns
-        now = time.monotonic()
+        now = time.monotonic() if self._tty else record.observation.time_ns * 1e-9
         if now - self._shown >= INTERVAL[self._tty]:
             self._shown = now
             self._show(self.text(record))

@@ -1,0 +1,137 @@
+"""Repeat a recorded simulated run and say whether it comes out identical.
+
+Runs the log's configuration and seed again, without its observations, and compares every observation, state, command,
+plan and event bit by bit. Exit code 0: identical; 1: it differs, and the first difference is named.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import defaultdict
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from hw.config import ConfigError
+from stack.event import Event
+from stack.flightlog import FlightLog, read_log
+from stack.logformat import MACHINE_DEPENDENT, messages, plain
+from stack.loop import TickRecord
+from stack.session import Script, Settings, run
+from tools import exit_codes
+from tools.output import add_json_argument, reporting
+
+Tick = dict[str, list[dict[str, Any]]]  # channel -> its messages of one tick
+
+
+@dataclass(frozen=True)
+class Difference:
+    tick: int
+    channel: str
+    field: str
+
+    def __str__(self) -> str:
+        return f"tick {self.tick}: {self.channel} {self.field}"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", type=Path, help="flight log of a simulated run")
+    add_json_argument(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        log = read_log(args.log)
+        changed = changes(log)
+        for text in changed:
+            report.line(f"not as it was recorded: {text}")
+        ticks, difference = replay(log)
+        if difference is None:
+            report.line(f"identical over {ticks} ticks" + ("" if log.complete else ", as far as the log goes"))
+        else:
+            report.line(f"differs, first at {difference}")
+        report.result(
+            {
+                "identical": difference is None,
+                "ticks": ticks,
+                "complete": log.complete,
+                "changed": changed,
+                "first_difference": None if difference is None else vars(difference),
+            }
+        )
+    return exit_codes.DONE if difference is None else exit_codes.FAILED
+
+
+def replay(log: FlightLog) -> tuple[int, Difference | None]:
+    """Repeat a log's run: how many ticks were compared, and the first difference. Raises ConfigError."""
+    settings = _settings(log)
+    if settings.backend != "sim":
+        raise ConfigError(f"{log.path}: recorded on '{settings.backend}': only simulated runs can be repeated")
+    stops = [Event(**event) for event in log.messages["/event"] if event["kind"] in ("interrupt", "record")]
+    plans = frozenset(int(message["requested"]) for message in log.messages["/plan"])
+    recorded = _by_tick(log)
+    repeated: dict[int, Tick] = {}
+
+    def compare(record: TickRecord) -> None:
+        tick: Tick = defaultdict(list)
+        for channel, message in messages(record):
+            tick[channel].append(plain(message))
+        repeated[record.tick] = tick
+
+    run(settings, on_tick=compare, script=Script(tuple(stops), plans if plans else None))
+    if not log.complete and recorded:
+        recorded.pop(max(recorded))  # its messages may be cut in two
+    for number in sorted(recorded.keys() | (repeated.keys() if log.complete else set())):
+        difference = _difference(number, recorded.get(number), repeated.get(number))
+        if difference is not None:
+            return len(recorded), difference
+    return len(recorded), None
+
+
+def changes(log: FlightLog) -> list[str]:
+    """What is not as it was when the log was written: robot, servos, model, network, packages, source."""
+    from hw.robot import load_robot
+    from stack.policies import policy_fingerprint
+    from stack.provenance import fingerprint, versions
+
+    now = fingerprint(load_robot(_settings(log).robot))
+    now |= {"policy": policy_fingerprint(_settings(log).policy), "versions": versions()}
+    names = {
+        "robot": "the robot's file",
+        "servos": "a servo's file",
+        "mjcf_sha256": "the robot's model",
+        "policy": "the policy's checkpoint",
+        "versions": "installed packages",
+    }
+    return [text for key, text in names.items() if log.header.get(key) != now[key]]
+
+
+def _settings(log: FlightLog) -> Settings:
+    known = {f.name for f in fields(Settings)}
+    values = {name: value for name, value in log.header["settings"].items() if name in known}
+    return Settings(**(values | {"record": None, "realtime": False}))
+
+
+def _by_tick(log: FlightLog) -> dict[int, Tick]:
+    ticks: dict[int, Tick] = defaultdict(lambda: defaultdict(list))
+    for channel, channel_messages in log.messages.items():
+        if channel in MACHINE_DEPENDENT and MACHINE_DEPENDENT[channel] is None:
+            continue
+        for message in channel_messages:
+            ticks[message["tick"]][channel].append(message)
+    return ticks
+
+
+def _difference(number: int, recorded: Tick | None, repeated: Tick | None) -> Difference | None:
+    if recorded is None or repeated is None:
+        return Difference(number, "/run", "length: " + ("the repetition is longer" if repeated else "it ended earlier"))
+    for channel in sorted((recorded.keys() | repeated.keys()) - MACHINE_DEPENDENT.keys() | {"/plan"}):
+        before, after = recorded.get(channel, []), repeated.get(channel, [])
+        if len(before) != len(after):
+            return Difference(number, channel, f"{len(before)} messages, now {len(after)}")
+        ignored = MACHINE_DEPENDENT.get(channel) or ()
+        for old, new in zip(before, after, strict=True):
+            for field in sorted(old.keys() | new.keys()):
+                if field not in ignored and old.get(field) != new.get(field):
+                    return Difference(number, channel, field)
+    return None
