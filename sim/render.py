@@ -15,7 +15,8 @@ from hw.hal import Array
 from hw.robot import Robot
 from sim.model import build
 
-AZIMUTH, ELEVATION, DISTANCE = 140.0, -18.0, 1.1  # degrees and m, of the camera that follows the robot
+AZIMUTH, ELEVATION, DISTANCE = 140.0, -20.0, 1.3  # degrees and m, of the camera that follows the robot
+ASIDE = 30.0  # degrees that it looks past the goal, where there is one: both are in the picture all the way
 FOLLOW = 0.08  # share of the way to the robot that the camera goes each frame: calm, yet never far behind
 GOAL_COLOUR = (0.15, 0.65, 0.30, 0.8)
 TRAIL_COLOUR = (0.20, 0.35, 0.75, 0.9)
@@ -54,7 +55,11 @@ def render(robot: Robot, frames: list[Frame], width: int = 640, height: int = 48
             renderer.scene.flags[flag] = False
         camera = mujoco.MjvCamera()
         camera.azimuth, camera.elevation, camera.distance = AZIMUTH, ELEVATION, DISTANCE
-        camera.lookat[:] = frames[0].place if frames else 0.0
+        if frames:
+            camera.lookat[:] = frames[0].place
+            if frames[0].goal is not None:
+                ahead = frames[0].goal - frames[0].place[:2]
+                camera.azimuth = np.degrees(np.arctan2(ahead[1], ahead[0])) + ASIDE
         trail: list[Array] = []
         for frame in frames:
             data.qpos[0:3], data.qpos[3:7], data.qpos[joints] = frame.place, frame.orientation, frame.joints

@@ -14,6 +14,7 @@ from stack.loop import Adopted, Estimator, Proposal
 from stack.safety import Guard, Phase
 
 WAIT_SECONDS = 1.0  # for a first sample from every sensor
+STILL_SECONDS = 0.5  # after homing, when the body has stopped swinging: gravity is taken from there, not from the way
 SETTLE_SECONDS = 1.5  # standing still at home, in which the estimator learns the gyro's bias
 
 
@@ -46,6 +47,8 @@ class Director:
             self._wake(tick, observation, state)
         elif phase is Phase.READY:
             self._settled += 1
+            if self._settled == round(STILL_SECONDS * self._robot.rate):
+                self._estimator.reset()
             if self._settled >= SETTLE_SECONDS * self._robot.rate:
                 self._estimator.reset_odometry()
                 self._guard.start()

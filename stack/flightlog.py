@@ -69,6 +69,9 @@ def read_log(path: Path | str) -> FlightLog:
                     complete = True
         except _BROKEN:
             complete = False
+    if not complete and found["/timing"]:
+        last = found["/timing"][-1]["tick"]  # a tick's last message: what comes after belongs to a tick cut in two
+        found = {name: [m for m in part if m.get("tick", last) <= last] for name, part in found.items()}
     if not found["/run"]:
         raise ConfigError(f"{path}: not a flight log, or cut short before its header was written")
     header = found["/run"][0]

@@ -79,8 +79,6 @@ def replay(log: FlightLog) -> tuple[int, Difference | None]:
         repeated[record.tick] = tick
 
     run(settings, on_tick=compare, script=Script(tuple(stops), plans if plans else None))
-    if not log.complete and recorded:
-        recorded.pop(max(recorded))  # its messages may be cut in two
     for number in sorted(recorded.keys() | (repeated.keys() if log.complete else set())):
         difference = _difference(number, recorded.get(number), repeated.get(number))
         if difference is not None:
