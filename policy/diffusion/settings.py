@@ -31,7 +31,7 @@ class DiffusionSettings:
     steps: int = 5  # network calls a plan
     lead: int = 0  # extra calls by which the states are finished before the actions
     replan: int = 4  # ticks between requests
-    delay: int = 1  # ticks from a request to the adoption of its plan
+    delay: int = 2  # ticks from a request to the adoption of its plan
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
 
     def __post_init__(self) -> None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Survival = Callable[[Path], Mapping[str, float]]
 
 MEANS = ("minutes", "loss", "state_loss", "action_loss", "learning_rate", "tokens_per_s")
-COLUMNS = (*MEANS, "validation_action_loss", "survival")
+COLUMNS = (*MEANS, "validation_action_loss", "survival", "velocity_error")
 
 
 @dataclass(frozen=True)
@@ -255,9 +255,9 @@ class Trainer:
             self._ship(self.out / "best.safetensors", results)
         self.evaluated = self.seconds
         self.save()
-        row = {"minutes": self.seconds / 60, "validation_action_loss": loss}
-        journal.log(self.step, row | {k: v for k, v in results.items() if k == "survival"})
-        panels = [["state_loss", "action_loss", "validation_action_loss"], ["survival"]]
+        row = {name: value for name, value in results.items() if name in COLUMNS}
+        journal.log(self.step, {"minutes": self.seconds / 60, **row})
+        panels = [["state_loss", "action_loss", "validation_action_loss"], ["survival"], ["velocity_error"]]
         journal.plot(self.out / "learning_curve.png", panels, x="minutes")
         text = ", ".join(f"{name} {value:.4g}" for name, value in results.items())
         note = " (best)" if better else ""
