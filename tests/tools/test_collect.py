@@ -176,14 +176,17 @@ def test_command_and_task_go_together_and_last(table: pa.Table) -> None:
     assert (gaps >= 100).all()
 
 
-def test_same_seed_same_files(collected: Path, tmp_path: Path) -> None:
-    again, other = tmp_path / "again", tmp_path / "other"
+def test_same_options_same_files(collected: Path, tmp_path: Path) -> None:
+    again, other, quiet = tmp_path / "again", tmp_path / "other", tmp_path / "quiet"
     assert cli.main([*COMMAND.split(), str(again)]) == 0
     assert cli.main([*COMMAND.split(), str(other), "--seed", "1"]) == 0
+    assert cli.main([*COMMAND.split(), str(quiet), "--noise", "0", "0"]) == 0
     ours, theirs = files(collected), files(again)
     assert ours.keys() == theirs.keys()
     # The commit is read from a tree that may have changed meanwhile.
     assert [name for name in ours if ours[name] != theirs[name] and name != "meta/servoid.yaml"] == []
+    recording = read_recording(quiet, load_robot())
+    np.testing.assert_array_equal(recording.action, recording.applied)
     assert files(other)["data/chunk-000/file-000.parquet"] != ours["data/chunk-000/file-000.parquet"]
 
 
@@ -359,6 +362,7 @@ def test_files_are_split_by_size_and_found_again(tmp_path: Path, monkeypatch: py
         ("--frames 0", "--frames"),
         ("--worlds 0", "--worlds"),
         ("--randomise 25", "share between 0 and 1"),
+        ("--noise 1.3 0.5", "the lower one first"),
         ("--seconds 2", "at least 3 s"),
         ("--policy exprt", "no such checkpoint"),
     ],

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -45,6 +46,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SHARE",
         help="share of episodes on a randomised robot (default: %(default)s)",
     )
+    parser.add_argument(
+        "--noise",
+        type=float,
+        nargs=2,
+        default=[0.5, 1.3],
+        metavar=("LOW", "HIGH"),
+        help="scale of an episode's action noise, drawn between these (default: 0.5 1.3)",
+    )
     parser.add_argument("--plain-odometry", action="store_true", help="leg odometry without the learned correction")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=0, help="of the simulation; 0: all cores (default)")
@@ -63,7 +72,7 @@ def main(args: argparse.Namespace) -> int:
             f"{result['begun']} episodes fell ({minutes:.0f} minutes walked), {result['seconds']:.0f} s"
         )
         if not 0.05 <= share <= 0.15 and minutes > 60:  # less walking says little
-            report.line("between 5 and 15 % is wanted: enough to learn recovery from, not so much that it fails")
+            report.line("5 to 15 % is wanted, enough to learn recovery from: change --noise")
         report.result(result)
     return exit_codes.DONE
 
@@ -74,6 +83,8 @@ def _check(args: argparse.Namespace) -> None:
             raise ConfigError(f"--{name} {getattr(args, name)}: at least 1 is needed")
     if not 0.0 <= args.randomise <= 1.0:
         raise ConfigError(f"--randomise {args.randomise:g}: a share between 0 and 1 is needed")
+    if not 0.0 <= args.noise[0] <= args.noise[1] < math.inf:
+        raise ConfigError(f"--noise {args.noise[0]:g} {args.noise[1]:g}: 0 or more is needed, the lower one first")
     if args.seed < 0:
         raise ConfigError(f"--seed {args.seed}: 0 or more is needed")
 
@@ -100,7 +111,7 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
         "policy": {"name": "gait"} if tracker is None else _source(resolve(args.policy)),
         "odometry": {"name": "legs"} if odometry is None else _source(resolve("odometry")),
     }
-    settings = DisturbanceSettings()
+    settings = DisturbanceSettings(scale=(args.noise[0], args.noise[1]))
     writer = DatasetWriter(
         args.out,
         robot_type=robot.name,
