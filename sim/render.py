@@ -75,8 +75,8 @@ def render(robot: Robot, frames: list[Frame], width: int = 640, height: int = 48
 
 def _draw(scene: mujoco.MjvScene, frame: Frame, trail: list[Array]) -> None:
     if frame.goal is not None:
-        _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (0.05, 0.05, 0.002), frame.goal, 0.003, GOAL_COLOUR)
-        _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (0.004, 0.004, 0.12), frame.goal, 0.12, GOAL_COLOUR)
+        _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (0.05, 0.002, 0), frame.goal, 0.003, GOAL_COLOUR)
+        _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (0.004, 0.12, 0), frame.goal, 0.12, GOAL_COLOUR)
     for point in frame.plan if frame.plan is not None else ():
         _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (0.006, 0, 0), point, 0.012, PLAN_COLOUR)
     for point in trail[-(_ROOM // 2) :]:

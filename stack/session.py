@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -158,13 +158,18 @@ def run(
         )
         try:
             loop.run()
-        finally:
-            late_events = guard.events()
-            tally.events += late_events
-            result = tally.result(director, guard, task, settings)
+        except BaseException as error:
             if recorder is not None:
-                recorder.events(late_events)
-                recorder.close(result.summary())
+                recorder.events(guard.events())
+                recorder.close({"outcome": "error", "error": f"{type(error).__name__}: {error}"})
+            raise
+        last = guard.events()
+        tally.events += last
+        result = tally.result(director, guard, task, settings)
+        if recorder is not None:
+            recorder.events(last)
+            recorder.close(result.summary())
+            result = _with_failure(result, recorder.error)
         return result
 
 
@@ -180,6 +185,14 @@ def _task(settings: Settings, robot: Robot) -> tuple[Task, float]:
     if settings.seconds is not None:
         values["seconds"] = repr(settings.seconds)
     return load_task(settings.task, values, robot.dt), gain
+
+
+def _with_failure(result: Result, error: str | None) -> Result:
+    """The result with a failure of the log that came too late to stop the run."""
+    if error is None or any(event.kind == "record" for event in result.events):
+        return result
+    last = result.events[-1]
+    return replace(result, events=(*result.events, Event(last.tick, last.time, "record", None, error)))
 
 
 def _pushes(task: Task) -> bool:

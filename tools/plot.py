@@ -80,7 +80,9 @@ def _save(figure: Any, out: Path) -> None:
 
 def _title(log: FlightLog) -> str:
     settings, result = log.header["settings"], log.result
-    end = "cut short" if result is None else f"{result['outcome']} after {result['seconds']:.1f} s"
+    end = "cut short" if result is None else result["outcome"]
+    if result is not None and "seconds" in result:
+        end += f" after {result['seconds']:.1f} s"
     return f"{settings['task']} with {settings['policy']} on {settings['robot']}, seed {settings['seed']}: {end}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 
 import numpy as np
@@ -9,11 +10,11 @@ import pytest
 from fake_body import FakeBody, spoiled, tilted
 
 from hw.config import ConfigError
-from hw.hal import BackendError, Mode
+from hw.hal import BackendError, Mode, Plan
 from hw.robot import load_robot
 from stack.flightlog import read_log
 from stack.safety import Phase
-from stack.session import Settings, run
+from stack.session import Script, Settings, run
 
 ROBOT = load_robot("op3")
 
@@ -218,6 +219,76 @@ def test_the_log_tells_the_run(tmp_path):
     assert len(log.messages["/instruction"]) == result.ticks
     assert log.messages["/command"][-1]["phase"] == str(Phase.DAMPED)
     assert len(log.messages["/event"]) == len(result.events)
+
+
+class Planning(Still):
+    """Adopts a plan every fourth tick, two ticks after it was asked for; `late` requests come to nothing."""
+
+    only = None
+
+    def __init__(self, late=()):
+        self.late = late
+
+    def reset(self, seed):
+        super().reset(seed)
+        self.adopted, self.latest_plan, self.notes = [], None, []
+
+    def target(self, call):
+        tick = call - 1
+        requested = tick - 2
+        if requested >= 0 and requested % 4 == 0:
+            late = requested in self.late if self.only is None else requested not in self.only
+            if late:
+                self.notes.append(f"plan of {requested} is late")
+            else:
+                path = np.array([[0.1, 0.0], [0.2, 0.0]])
+                actions = np.tile(ROBOT.home + 0.001 * requested, (2, 1))
+                self.latest_plan = Plan(requested, actions, np.zeros((2, 5)), path, 0.01)
+                self.adopted.append((requested, tick))
+        return ROBOT.home if self.latest_plan is None else self.latest_plan.actions[0]
+
+    def take_events(self):
+        notes, self.notes = tuple(self.notes), []
+        return notes
+
+
+def test_plans_are_logged_with_their_ticks_and_late_ones_noted(tmp_path):
+    path = tmp_path / "run.mcap"
+    result, _, _ = stand(policy=Planning(late=(8,)), settings={"record": path})
+    log = read_log(path)
+    plans = [(m["requested"], m["adopted"]) for m in log.messages["/plan"]]
+    assert plans[:3] == [(0, 2), (4, 6), (12, 14)]
+    assert [event.text for event in result.events if event.kind == "plan"] == ["plan of 8 is late"]
+
+
+def test_a_script_repeats_which_plans_came_in_time():
+    def sent(**kwargs):
+        _, body, _ = stand(**kwargs)
+        return [command.position for command in body.sent]
+
+    recorded = sent(policy=Planning(late=(8, 20)))
+    in_time = frozenset(range(0, 60, 4)) - {8, 20}
+    np.testing.assert_array_equal(sent(policy=Planning(), script=Script(plans=in_time)), recorded)
+    assert not np.array_equal(sent(policy=Planning()), recorded)
+
+
+def test_a_log_of_a_run_that_broke_says_so(tmp_path):
+    body = Simulated(ROBOT)
+
+    def cut(record):
+        body.unreachable = record.tick > 50
+
+    with pytest.raises(BackendError):
+        stand(body, on_tick=cut, settings={"record": tmp_path / "run.mcap"})
+    log = read_log(tmp_path / "run.mcap")
+    assert log.complete
+    assert log.result["outcome"] == "error"
+    assert "cable" in log.result["error"]
+
+
+def test_garbage_is_collected_again_after_a_real_time_run():
+    stand(settings={"realtime": True}, seconds=0.1)
+    assert gc.get_freeze_count() == 0
 
 
 def test_a_full_disk_ends_the_run_safe(tmp_path, monkeypatch):
