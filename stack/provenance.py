@@ -18,8 +18,12 @@ from stack.logformat import FORMAT, plain
 PACKAGES = ("servoid", "numpy", "mujoco", "torch", "mcap")
 
 
-def header(settings: Any, robot: Robot, task: Task, policy: dict[str, Any]) -> dict[str, Any]:
-    """Everything that repeating a run needs, and what the repetition is checked against."""
+def header(settings: Any, robot: Robot, task: Task, body: str, policy: dict[str, Any]) -> dict[str, Any]:
+    """Everything that repeating a run needs, and what the repetition is checked against.
+
+    `body` is the backend's name; `policy` holds at least a name. Both may be others than the settings say, where a
+    program brought its own.
+    """
     return {
         "format": FORMAT,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -27,6 +31,7 @@ def header(settings: Any, robot: Robot, task: Task, policy: dict[str, Any]) -> d
         "seed": settings.seed,
         "task": {"name": task.name} | described(getattr(task, "settings", None)),
         **fingerprint(robot),
+        "backend": body,
         "policy": policy,
         "versions": versions(),
         "git_commit": git_commit(),

@@ -92,7 +92,8 @@ def run(
 ) -> Result:
     """Do one run and return how it went, the robot with torque off.
 
-    `backend` and `policy` replace those that the settings name. `on_tick` is called after each tick and must be quick.
+    `backend` and `policy` replace those that the settings name; a backend that has a `truth` is a simulation, which
+    starts itself and need not keep to real time. `on_tick` is called after each tick and must be quick.
     `confirm` asks the person at a real robot, and returns when it may move. `script` repeats a recorded run. Raises
     ConfigError before anything is connected, BackendError when the body cannot be reached.
     """
@@ -142,6 +143,7 @@ def run(
                     settings,
                     robot,
                     task,
+                    body.name,
                     policy_fingerprint(settings.policy) if policy is None else {"name": type(policy).__qualname__},
                 ),
                 wait=simulated and not realtime,

@@ -65,8 +65,10 @@ def main(args: argparse.Namespace) -> int:
 def replay(log: FlightLog) -> tuple[int, Difference | None]:
     """Repeat a log's run: how many ticks were compared, and the first difference. Raises ConfigError."""
     settings = _settings(log)
-    if settings.backend != "sim":
-        raise ConfigError(f"{log.path}: recorded on '{settings.backend}': only simulated runs can be repeated")
+    if log.header["backend"] != "sim":
+        raise ConfigError(f"{log.path}: recorded on '{log.header['backend']}': only simulated runs can be repeated")
+    if log.header["policy"]["name"] != settings.policy:
+        raise ConfigError(f"{log.path}: recorded with a program's own policy: only that program can repeat it")
     stops = [Event(**event) for event in log.messages["/event"] if event["kind"] in ("interrupt", "record")]
     plans = frozenset(int(message["requested"]) for message in log.messages["/plan"])
     recorded = _by_tick(log)

@@ -107,6 +107,22 @@ def test_replay_is_identical_and_says_where_a_changed_log_differs(capsys):
     assert (difference.tick, difference.channel, difference.field) == (150, "/command", "position")
 
 
+def test_what_only_a_program_can_repeat_is_refused(capsys):
+    assert main([*RUN, "--record", "a.mcap"]) == 0
+
+    from hw.config import ConfigError
+    from tools import replay
+
+    for key, value, message in (
+        ("backend", "dynamixel", "only simulated"),
+        ("policy", {"name": "MyPolicy"}, "own policy"),
+    ):
+        log = read_log("a.mcap")
+        log.header[key] = value
+        with pytest.raises(ConfigError, match=message):
+            replay.replay(log)
+
+
 def test_a_truncated_log_replays_as_far_as_it_goes(tmp_path, capsys):
     assert main([*RUN, "--record", "a.mcap"]) == 0
     data = (tmp_path / "a.mcap").read_bytes()
