@@ -17,7 +17,7 @@ from stack.attitude import Attitude, up_vector
 from stack.odometry import OdometryFeatures
 
 _CORNER_SOFTNESS = 0.003  # m of height over which corners share the contact
-_FOOT_SOFTNESS = 0.005  # m of height over which feet share the load
+_FOOT_SOFTNESS = 0.001  # m of height over which feet share the load
 
 
 class Estimator:

@@ -14,7 +14,7 @@ from hw.hal import Array
 class Step:
     """One tick of `n` worlds, by the truth. Reference values are those of the frame that was to be reached."""
 
-    velocity: Array  # (n, 2) m/s of the base, heading frame, averaged over about half a gait cycle
+    velocity: Array  # (n, 2) m/s of the base, heading frame, averaged over a gait cycle
     yaw_rate: Array  # (n,) rad/s, averaged likewise
     height: Array  # (n,) m
     gravity: Array  # (n, 3)
@@ -28,7 +28,7 @@ class Step:
     foot_height: Array  # (n, n_feet) m of the sole's centre
     foot_velocity: Array  # (n, n_feet, 3) m/s
     foot_up: Array  # (n, n_feet, 3)
-    reference_velocity: Array  # (n, 2)
+    reference_velocity: Array  # (n, 2) averaged like the measured one, as is the yaw rate
     reference_yaw_rate: Array  # (n,)
     reference_height: Array  # (n,)
     reference_joints: Array  # (n, n_joints)

@@ -13,8 +13,7 @@ from policy.tracker.rewards import Step, total
 from tools.train.fleet import Fleet
 from tools.train.settings import ExpertSettings
 
-_SMOOTH = 0.24  # s: velocity is judged over about half a cycle, within which a walk sways
-_NOW = np.array([0])
+_CYCLE = 24  # ticks of a gait cycle, over which velocity is judged: within one, a walk sways
 
 
 class Tracking:
@@ -30,7 +29,9 @@ class Tracking:
         self.push_scale = 1.0
         self.terms: dict[str, float] = {}
         self._next_command, self._next_push = np.zeros(n, int), np.zeros(n, int)
-        self._velocity, self._yaw_rate = np.zeros((n, 2)), np.zeros(n)
+        # Of the last cycle, newest at `ticks % _CYCLE`: velocity and yaw rate, measured and asked.
+        self._twists = np.zeros((_CYCLE, n, 6))
+        self._twist = np.zeros((n, 6))
         self._targets = np.zeros((3, n, len(robot.joints)))
         self._reset(np.ones(n, bool))
         self.actor, self.critic = self._observe()
@@ -43,7 +44,7 @@ class Tracking:
         self.observation.reset(where)
         self.ticks[where] = self._next_command[where] = 0
         self._next_push[where] = 25
-        self._velocity[where], self._yaw_rate[where] = 0.0, 0.0
+        self._twists[:, where], self._twist[where] = 0.0, 0.0
         self._targets[:, where] = fleet.applied[where]
 
     def _observe(self) -> tuple[Array, Array]:
@@ -58,8 +59,7 @@ class Tracking:
                 truth.velocity * 2.0,
                 truth.foot_force * 0.03,
                 truth.foot_velocity.reshape(self.n, -1),
-                self._velocity * 2.0,
-                self._yaw_rate[:, None],
+                self._twist,
                 np.array([[b.stiffness * 0.1, b.voltage - 12, b.friction, b.command_delay * 50] for b in bodies if b]),
                 np.array([b.zero for b in bodies if b]) * 30,
             ],
@@ -91,6 +91,22 @@ class Tracking:
             self._next_push[i] = self.ticks[i] + round(rng.uniform(*s.push_every) * rate)
         self.fleet.worlds.push(push)
 
+    def _measure(self) -> None:
+        """Average what was measured and what was asked over the last cycle."""
+        truth, asked = self.fleet.truth, self._reference
+        now = np.concatenate(
+            [
+                truth.velocity[:, :2],
+                truth.angular_velocity[:, 2:],
+                asked.velocity[:, 0],
+                asked.yaw_rate[:, :1],
+            ],
+            -1,
+        )
+        row, worlds = self.ticks % _CYCLE, np.arange(self.n)
+        self._twist += (now - self._twists[row, worlds]) / _CYCLE
+        self._twists[row, worlds] = now
+
     def step(self, action: Array) -> tuple[Array, Array, Array]:
         """Act for a tick with residuals `(n, n_joints)`. Returns reward a tick, done and time-out `(n,)`."""
         reference = self._reference.position[:, 0]
@@ -101,12 +117,10 @@ class Tracking:
         self.ticks += 1
         truth = self.fleet.truth
         fallen = truth.fallen
-        share = self.robot.dt / _SMOOTH
-        self._velocity += share * (truth.velocity[:, :2] - self._velocity)
-        self._yaw_rate += share * (truth.angular_velocity[:, 2] - self._yaw_rate)
+        self._measure()
         step = Step(
-            velocity=self._velocity,
-            yaw_rate=self._yaw_rate,
+            velocity=self._twist[:, 0:2],
+            yaw_rate=self._twist[:, 2],
             height=truth.position[:, 2],
             gravity=truth.gravity,
             angular_velocity=truth.angular_velocity,
@@ -119,8 +133,8 @@ class Tracking:
             foot_height=truth.foot_position[..., 2],
             foot_velocity=truth.foot_velocity,
             foot_up=truth.foot_up,
-            reference_velocity=self._reference.velocity[:, 0],
-            reference_yaw_rate=self._reference.yaw_rate[:, 0],
+            reference_velocity=self._twist[:, 3:5],
+            reference_yaw_rate=self._twist[:, 5],
             reference_height=self._reference.height[:, 0],
             reference_joints=reference,
             reference_contact=contact,

@@ -1,0 +1,177 @@
+"""Run a task many times in simulation and judge it by the truth.
+
+Every episode is a `servoid run` of its own, with its own random stream: results do not depend on the number of workers,
+and any episode can be repeated with `servoid run TASK --seed S`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import time
+from typing import Any
+
+from tools.output import add_json_argument, reporting
+from tools.parser import add_set_argument, settings
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("task", help="see `servoid tasks`")
+    parser.add_argument("--episodes", type=int, default=50, help="(default: %(default)s)")
+    parser.add_argument("--workers", type=int, default=0, help="processes (default: one a core)")
+    parser.add_argument("--backend", default="sim", help="(default: %(default)s)")
+    parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
+    parser.add_argument("--policy", default="diffusion", help="diffusion, expert or gait (default: %(default)s)")
+    parser.add_argument("--randomise", action="store_true", help="draw the robot anew for each episode")
+    parser.add_argument("--seconds", type=float, help="instead of the task's own")
+    parser.add_argument("--seed", type=int, default=0, help="of the first episode's stream (default: %(default)s)")
+    add_set_argument(parser)
+    add_json_argument(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    from hw.config import ConfigError
+
+    if args.episodes < 1:
+        raise ConfigError(f"--episodes: {args.episodes} is not a number of episodes; give 1 or more")
+    with reporting(args.json) as report:
+        begun = time.monotonic()
+        values = settings(args)
+        rows = run_all(args, values, report)
+        summary = summarise(args, rows, time.monotonic() - begun)
+        report.table(["figure", "value"], [[key, _text(value)] for key, value in summary.items()])
+        report.result(summary)
+    return 0
+
+
+def episode_seed(seed: int, episode: int) -> int:
+    """The seed that repeats episode `episode` with `servoid run`."""
+    import numpy as np
+
+    return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
+
+
+def run_all(args: argparse.Namespace, values: dict[str, str], report: Any) -> list[dict[str, Any]]:
+    """All episodes' rows, in order, on `--workers` processes. Bad settings are refused before any starts."""
+    import multiprocessing as mp
+
+    from tqdm import tqdm
+
+    from stack.session import Settings
+
+    seeds = [episode_seed(args.seed, i) for i in range(args.episodes)]
+    jobs = [
+        Settings(
+            task=args.task,
+            backend=args.backend,
+            robot=args.robot,
+            policy=args.policy,
+            randomise=args.randomise,
+            seconds=args.seconds,
+            seed=seed,
+            set=values,
+        )
+        for seed in seeds
+    ]
+    workers = min(args.workers or os.cpu_count() or 1, len(jobs))
+    if workers == 1:
+        return [episode(job) for job in tqdm(jobs, unit="episode", mininterval=2.0)]
+    episode_check(jobs[0])
+    with mp.get_context("spawn").Pool(workers, _one_thread) as pool:
+        return list(tqdm(pool.imap(episode, jobs), total=len(jobs), unit="episode", mininterval=2.0))
+
+
+def _one_thread() -> None:
+    """A worker's numpy and torch use one thread: the workers are the parallelism. Ctrl-C is the parent's."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+
+
+def episode_check(job: Any) -> None:
+    """Raise here, in the parent, what every episode would raise: an unknown task, policy, robot or key."""
+    from dataclasses import replace
+
+    from stack.session import run
+
+    run(replace(job, seconds=0.1))
+
+
+def episode(job: Any) -> dict[str, Any]:
+    """One run, judged by the truth."""
+    from hw.robot import load_robot
+    from stack.backends import make_backend
+    from stack.session import run
+    from stack.tasks import load_task
+    from tools.witness import Witness
+
+    robot = load_robot(job.robot)
+    backend = make_backend(job.backend, robot, seed=job.seed, randomise=job.randomise, port=job.port)
+    witness = Witness(backend, robot.dt)  # type: ignore[arg-type]
+    result = run(job, backend=backend, on_tick=witness)
+    trace = witness.trace()
+    task = load_task(job.task, _task_values(job), robot.dt)
+    task.reset(witness.task_rng(job.seed))
+    return {
+        "seed": job.seed,
+        "outcome": result.outcome,
+        "success": bool(task.success(trace)),
+        "fell": trace.fallen,
+        "seconds": result.seconds,
+        "metrics": task.metrics(trace) if len(trace.yaw) else {},
+        "odometry_error_m": witness.odometry_error(result.trace),
+    }
+
+
+def _task_values(job: Any) -> dict[str, str]:
+    values = {key: value for key, value in job.set.items() if key != "gain"}
+    return values if job.seconds is None else {**values, "seconds": repr(job.seconds)}
+
+
+def wilson(successes: int, n: int) -> list[float]:
+    """95 % confidence interval of a share (E. B. Wilson, 1927)."""
+    z, p = 1.959964, successes / n
+    centre, spread = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return [max((centre - spread) / (1 + z * z / n), 0.0), min((centre + spread) / (1 + z * z / n), 1.0)]
+
+
+def summarise(args: argparse.Namespace, rows: list[dict[str, Any]], wall_seconds: float) -> dict[str, Any]:
+    """What `--json` prints. Metrics are means over the episodes that have them."""
+    import numpy as np
+
+    n, successes = len(rows), sum(row["success"] for row in rows)
+    names = sorted({name for row in rows for name in row["metrics"]})
+    metrics: dict[str, Any] = {}
+    for name in names:
+        values = np.array([row["metrics"].get(name, np.nan) for row in rows], dtype=float)
+        metrics[name] = float(np.nanmean(values)) if np.isfinite(values).any() else None
+    metrics["odometry_error_m"] = float(np.mean([row["odometry_error_m"] for row in rows]))
+    return {
+        "task": args.task,
+        "policy": args.policy,
+        "backend": args.backend,
+        "robot": args.robot,
+        "randomised": args.randomise,
+        "episodes": n,
+        "seed": args.seed,
+        "success_rate": successes / n,
+        "success_ci95": wilson(successes, n),
+        "fall_rate": sum(row["fell"] for row in rows) / n,
+        "mean_seconds": float(np.mean([row["seconds"] for row in rows])),
+        "metrics": metrics,
+        "wall_seconds": wall_seconds,
+        "failed_seeds": [row["seed"] for row in rows if not row["success"]],
+    }
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_text(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(_text(item) for item in value[:10]) + (" ..." if len(value) > 10 else "")
+    return str(value)
