@@ -29,7 +29,7 @@ class DiffusionSettings:
 
     checkpoint: str = "diffusion"  # a shipped one, or the path of a .safetensors file
     steps: int = 5  # network calls a plan
-    lead: int = 0  # extra calls by which the states are finished before the actions
+    lead: int = 1  # extra calls by which the states are finished before the actions
     replan: int = 4  # ticks between requests
     delay: int = 2  # ticks from a request to the adoption of its plan
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)

@@ -26,7 +26,7 @@ def test_it_prints_one_row_for_each_kind_of_guidance(capfd: pytest.CaptureFixtur
     ]
     for row in rows:
         assert row["tokens"] == 39
-        assert row["calls_per_plan"] == 5
+        assert row["calls_per_plan"] == 6
         assert 0 < row["call_median_ms"] <= row["call_p99_ms"]
         # A plan is at least its network calls.
         assert row["plan_median_ms"] > 3 * row["call_median_ms"]
