@@ -87,12 +87,16 @@ class Limits:
 
 @dataclass(frozen=True)
 class Imu:
-    """Errors of the IMU: standard deviation of a sample's noise, half-width of the bias at power-on."""
+    """Errors of the IMU: standard deviation of a sample's noise, half-width of the bias at power-on.
+
+    `average` [s] is the span that its low-pass filter averages over: samples at the loop's rate alone would alias.
+    """
 
     gyro_noise: float
     gyro_bias: float
     accelerometer_noise: float
     accelerometer_bias: float
+    average: float
     latency: float
 
 

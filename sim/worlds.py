@@ -68,6 +68,7 @@ class Worlds:
         self._noise = np.zeros((n, _NOISE_ROWS, 6 + nj))
         self._commands = np.zeros((n, _DELAYED, nj))  # oldest first
         self._play = np.zeros((n, nj))
+        self._imu_span = max(round(robot.imu.average / TIMESTEP), 1)
         span = 2 * self.substeps  # samples kept: those of this tick and of the one before
         self._record = {
             "qpos": np.zeros((n, span, self.model.nq)),
@@ -81,7 +82,7 @@ class Worlds:
         self.truth = Truth(self.model, robot, self._state_qpos, self._state_qvel, self._sensors)
 
     def reset(self, ids: Array, rngs: Sequence[np.random.Generator], joints: Array | None = None) -> None:
-        """Put worlds `ids` on the ground at pose `joints` `(len(ids), n_joints)` (default: home) and draw new robots."""
+        """Put worlds `ids` on the ground at pose `joints` `(len(ids), n_joints)` (default: home); draws new robots."""
         pose = np.broadcast_to(self.robot.home if joints is None else joints, (len(ids), len(self.robot.joints)))
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for i, rng in zip(ids, rngs, strict=True):
@@ -157,7 +158,8 @@ class Worlds:
         speed = self._record["qvel"][rows, at][:, self._dof] + _VELOCITY_NOISE * noise[:, 6:]
         velocity = np.round(speed / self._velocity_unit) * self._velocity_unit
         effort = np.round(self._record["actuator_force"][rows, at] / self._unit) * self._unit
-        imu = self._record["sensordata"][rows, last - self._imu_age]
+        span = last - self._imu_age[:, None] - np.arange(self._imu_span)
+        imu = self._record["sensordata"][rows[:, None], span, :6].mean(1)
         errors = self.robot.imu
         gyro = _tilt(imu[:, 0:3], self._tilt) + self._gyro_bias + errors.gyro_noise * noise[:, 0:3]
         force = _tilt(imu[:, 3:6], self._tilt) + self._acc_bias + errors.accelerometer_noise * noise[:, 3:6]

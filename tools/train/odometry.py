@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    os.environ.setdefault("OMP_NUM_THREADS", "2")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # the worlds use the cores
     from hw.robot import load_robot
     from policy import checkpoint
     from tools.train.walker import load_tracker
@@ -78,7 +78,7 @@ def record(robot: Any, tracker: Any, worlds: int, seconds: float, seed: int) -> 
     command, start = np.zeros((worlds, 3)), np.zeros(worlds, np.int32)
     noise = rng.uniform(0.0, 0.1, (worlds, 1))
     for k in trange(ticks, desc="walking", unit="tick", mininterval=5.0):
-        state = fleet.observe()
+        fleet.observe()
         rows[:, k] = fleet.estimator.features.newest
         errors[:, k] = fleet.truth.velocity - fleet.estimator.leg_velocity
         starts[:, k] = start
@@ -95,7 +95,6 @@ def record(robot: Any, tracker: Any, worlds: int, seconds: float, seed: int) -> 
             fleet.reset(fallen)
             walker.reset(fallen)
             start[fallen] = k + 1
-        del state
     return {"rows": rows, "starts": starts, "errors": errors}
 
 
@@ -109,6 +108,7 @@ def fit(data: dict[str, Array], steps: int, seed: int) -> Any:
     from stack.odometry import OFFSETS
 
     torch.manual_seed(seed)
+    torch.set_num_threads(os.cpu_count() or 1)
     rows, errors, starts = (torch.from_numpy(data[k]) for k in ("rows", "errors", "starts"))
     worlds, ticks, _ = rows.shape
     held = max(worlds // 8, 1)
