@@ -102,6 +102,10 @@ class LegInverse:
         axis, offset = legs.axis, legs.offset
         if axis.shape[1] != 6 or not np.array_equal(np.abs(axis).argmax(-1), np.tile(self.ORDER, (len(axis), 1))):
             raise ConfigError(f"{name}: legs: the gait needs legs of yaw, roll, pitch, knee, ankle pitch, ankle roll")
+        hip = [offset[:, 1, 1], offset[:, 1, 0] + offset[:, 2, 0], offset[:, 2, 2]]  # between the axes
+        leg = [offset[:, 3, 0], offset[:, 4, 0], offset[:, 5, 2], offset[:, 2:, 1].sum(-1)]  # off the straight line
+        if np.abs([*hip, *leg]).max() > 1e-3:
+            raise ConfigError(f"{name}: legs: the gait needs axes that meet in a point at the hip and at the ankle")
         self.sign = np.take_along_axis(axis, np.tile(self.ORDER, (len(axis), 1))[..., None], -1)[..., 0]
         self.thigh, self.shank = -offset[:, 3, 2], -offset[:, 4, 2]
         # The pitch joints lie beside the leg's plane: their sideways offset is undone at the ankle.

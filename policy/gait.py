@@ -52,8 +52,7 @@ class Gait:
         self._inverse, self._index = LegInverse(legs, robot.name), legs.index
         self._side = np.sign(self._inverse.hip[:, 1])  # 1 left, -1 right
         self._shift = np.where(self._side > 0, 0.0, 0.5)  # the right foot steps half a cycle later
-        self._arm = [robot.names.index(name) for name in ("l_sho_pitch", "r_sho_pitch")]
-        self._half_lean = settings.lean
+        self._arm = [robot.names.index(name) for name in ("l_sho_pitch", "r_sho_pitch") if name in robot.names]
         self._limit, self._slew = np.array(settings.max_velocity), np.array(settings.acceleration) * robot.dt
         self._phase_step = robot.dt / settings.cycle
         self.phase = np.zeros(shape)
@@ -118,7 +117,7 @@ class Gait:
         x0, y0 = s.foot_forward, self._inverse.hip[:, 1] + self._side * s.foot_apart
         x = x0 + (vx - wz * y0) * period * travel
         y = y0 + (vy + wz * x0) * period * travel
-        y = y + (s.sway * activity * np.sin(2 * np.pi * (phase - 0.0)))[..., None]  # away from the foot that steps
+        y = y + (s.sway * activity * np.sin(2 * np.pi * phase))[..., None]  # away from the foot that steps
         z = self._inverse.hip[:, 2] - s.height + s.lift * lift
         cos, sin = np.cos(s.lean), np.sin(s.lean)
         ankle = np.stack([cos * x - sin * z, y, sin * x + cos * z], -1)  # seen from the leaning base

@@ -12,14 +12,14 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from hw.config import ConfigError
 from hw.hal import Array, Command, Mode, Observation
 from hw.legs import Legs
 from hw.robot import Robot
 from sim.model import TIMESTEP, build
-from sim.randomise import Body, draw
+from sim.randomise import COMMAND_DELAY, LATENCY, Body, draw
 from sim.truth import Truth
 
-_DELAYED = 3  # commands that may still be on their way: a delay of up to two ticks
 _NOISE_ROWS = 64  # ticks of sensor noise drawn at a time
 _VELOCITY_NOISE = 0.02  # rad/s, standard deviation, before quantisation
 _KP, _VMAX = 4, 7  # indices in a dcmotor's gainprm
@@ -37,6 +37,9 @@ class Worlds:
         self.robot, self.n, self.randomise = robot, n, randomise
         self.model = build(robot) if model is None else model
         self.substeps = round(robot.dt / TIMESTEP)
+        if abs(self.substeps * TIMESTEP - robot.dt) > 1e-9:
+            whole = round(1 / TIMESTEP)
+            raise ConfigError(f"{robot.name}: rate: {robot.rate} does not divide the physics' {whole} steps a second")
         self.batch = Batch(self.model, n, threads)
         self._legs = Legs(robot)
         joints = [self.model.joint(name) for name in robot.names]
@@ -50,6 +53,12 @@ class Worlds:
         self._nominal_stiffness = np.array([servo.stiffness for servo in servos])
         self._braking = np.array([servo.braking_torque for servo in servos])
         self._voltage_unit = servos[0].voltage_unit
+
+        # Commands that may still be on their way, and samples that may still be on theirs.
+        delay = max(COMMAND_DELAY[1], *(servo.command_delay for servo in servos))
+        latency = max(LATENCY[1], robot.imu.latency, *(servo.position_latency for servo in servos))
+        self._delayed = int(np.ceil(delay / robot.dt - 1e-6)) + 1
+        span = max(2 * self.substeps, round(latency / TIMESTEP) + 1)
 
         b, nj = self.batch, len(robot.joints)
         self._state_qpos, self._state_qvel = b.bind("qpos"), b.bind("qvel")
@@ -65,18 +74,17 @@ class Worlds:
         self._delay, self._joint_age, self._imu_age = np.zeros(n), np.zeros(n, int), np.zeros(n, int)
         self._zero, self._backlash = np.zeros((n, nj)), np.zeros((n, 1))
         self._gyro_bias, self._acc_bias, self._tilt = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2))
-        self._noise = np.zeros((n, _NOISE_ROWS, 6 + nj))
-        self._commands = np.zeros((n, _DELAYED, nj))  # oldest first
+        self._noise, self._noise_block = np.zeros((n, _NOISE_ROWS, 6 + nj)), np.full(n, -1)
+        self._commands = np.zeros((n, self._delayed, nj))  # oldest first
         self._play = np.zeros((n, nj))
         self._imu_span = max(round(robot.imu.average / TIMESTEP), 1)
-        span = 2 * self.substeps  # samples kept: those of this tick and of the one before
         self._record = {
             "qpos": np.zeros((n, span, self.model.nq)),
             "qvel": np.zeros((n, span, self.model.nv)),
             "sensordata": np.zeros((n, span, self.model.nsensordata)),
             "actuator_force": np.zeros((n, span, self.model.nu)),
         }
-        self._fresh = {key: value[:, self.substeps :].copy() for key, value in self._record.items()}
+        self._fresh = {key: value[:, -self.substeps :].copy() for key, value in self._record.items()}
         self.ticks = np.zeros(n, int)  # since each world's reset
         self.tick = 0
         self.truth = Truth(self.model, robot, self._state_qpos, self._state_qvel, self._sensors)
@@ -100,7 +108,7 @@ class Worlds:
         self._play[ids] = pose - self._zero[ids]
         for key, value in self._record.items():
             value[ids] = getattr(self.batch, key)[ids][:, None]
-        self.ticks[ids] = 0
+        self.ticks[ids], self._noise_block[ids] = 0, -1
 
     def _place(self, i: int, body: Body) -> None:
         self.bodies[i] = body
@@ -129,12 +137,12 @@ class Worlds:
 
         # The command in force at a substep is the newest that was written at least `delay` before it.
         start = np.arange(self.substeps) * TIMESTEP - self._delay[:, None]
-        which = np.clip(np.floor(start / self.robot.dt + 1e-6).astype(int) + _DELAYED - 1, 0, _DELAYED - 1)
+        which = np.clip(np.floor(start / self.robot.dt + 1e-6).astype(int) + self._delayed - 1, 0, self._delayed - 1)
         control = np.take_along_axis(self._commands, which[:, :, None], 1) - self._zero[:, None]
         self.batch.rollout(self.substeps, control, record=tuple(self._record), out=self._fresh)
         for key, value in self._record.items():
-            value[:, : self.substeps] = value[:, self.substeps :]
-            value[:, self.substeps :] = self._fresh[key]
+            value[:, : -self.substeps] = value[:, self.substeps :]
+            value[:, -self.substeps :] = self._fresh[key]
         self.ticks += 1
         self.tick += 1
 
@@ -149,7 +157,7 @@ class Worlds:
 
     def observe(self) -> Observation:
         """What the rig's sensors say now: delayed, quantised, biased and noisy."""
-        rows, last = np.arange(self.n), 2 * self.substeps - 1
+        rows, last = np.arange(self.n), self._record["qpos"].shape[1] - 1
         noise = self._draw_noise()
         at = last - self._joint_age
         q = self._record["qpos"][rows, at][:, self._qpos]
@@ -181,10 +189,14 @@ class Worlds:
         )
 
     def _draw_noise(self) -> Array:
-        """This tick's standard normal noise `(n, 6 + n_joints)`, refilled from each world's own stream."""
-        row = self.ticks % _NOISE_ROWS
-        for i in np.flatnonzero(row == 0):
+        """This tick's standard normal noise `(n, 6 + n_joints)`, refilled from each world's own stream.
+
+        A second call within a tick gives the same.
+        """
+        block, row = np.divmod(self.ticks, _NOISE_ROWS)
+        for i in np.flatnonzero(block != self._noise_block):
             self._rngs[i].standard_normal(out=self._noise[i])
+        self._noise_block[:] = block
         return self._noise[np.arange(self.n), row]
 
 

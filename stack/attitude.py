@@ -56,6 +56,7 @@ class Attitude:
         up = up / np.linalg.norm(up, axis=-1, keepdims=True)
         # The shortest turn that takes the measured up to z.
         q = np.stack([1 + up[..., 2], up[..., 1], -up[..., 0], np.zeros_like(up[..., 0])], -1)
+        q = np.where(up[..., 2:] < -1 + 1e-9, [0.0, 1.0, 0.0, 0.0], q)  # on its head any half turn is the shortest
         q = q / np.linalg.norm(q, axis=-1, keepdims=True)
         turn = yaw_of(q)
         q = _multiply(np.stack([np.cos(turn / 2), 0 * turn, 0 * turn, -np.sin(turn / 2)], -1), q)

@@ -15,6 +15,8 @@ from typing import Any
 from tools.output import add_json_argument, reporting
 from tools.parser import add_set_argument, settings
 
+_ENDED = ("succeeded", "failed", "timed_out")  # outcomes of runs whose task ended by itself
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", help="see `servoid tasks`")
@@ -35,6 +37,8 @@ def main(args: argparse.Namespace) -> int:
 
     if args.episodes < 1:
         raise ConfigError(f"--episodes: {args.episodes} is not a number of episodes; give 1 or more")
+    if args.workers < 0:
+        raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
     with reporting(args.json) as report:
         begun = time.monotonic()
         values = settings(args)
@@ -101,7 +105,7 @@ def episode_check(job: Any) -> None:
 
 
 def episode(job: Any) -> dict[str, Any]:
-    """One run, judged by the truth."""
+    """One run, judged by the truth. One that the guard broke off is no success, however far it came."""
     from hw.robot import load_robot
     from stack.backends import make_backend
     from stack.session import run
@@ -118,8 +122,8 @@ def episode(job: Any) -> dict[str, Any]:
     return {
         "seed": job.seed,
         "outcome": result.outcome,
-        "success": bool(task.success(trace)),
-        "fell": trace.fallen,
+        "success": result.outcome in _ENDED and bool(task.success(trace)),
+        "fell": trace.fallen or result.outcome == "fell",
         "seconds": result.seconds,
         "metrics": task.metrics(trace) if len(trace.yaw) else {},
         "odometry_error_m": witness.odometry_error(result.trace),
@@ -143,12 +147,11 @@ def summarise(args: argparse.Namespace, rows: list[dict[str, Any]], wall_seconds
     import numpy as np
 
     n, successes = len(rows), sum(row["success"] for row in rows)
-    names = sorted({name for row in rows for name in row["metrics"]})
+    measured = [{**row["metrics"], "odometry_error_m": row["odometry_error_m"]} for row in rows]
     metrics: dict[str, Any] = {}
-    for name in names:
-        values = np.array([row["metrics"].get(name, np.nan) for row in rows], dtype=float)
+    for name in sorted({name for row in measured for name in row}):
+        values = np.array([row.get(name, np.nan) for row in measured], dtype=float)
         metrics[name] = float(np.nanmean(values)) if np.isfinite(values).any() else None
-    metrics["odometry_error_m"] = float(np.mean([row["odometry_error_m"] for row in rows]))
     return {
         "task": args.task,
         "policy": args.policy,

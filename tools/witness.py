@@ -7,7 +7,6 @@ import numpy as np
 from hw.hal import Array, Trace
 from sim.backend import SimBackend
 from stack.loop import TickRecord
-from stack.safety import Phase
 from stack.session import TASK_STREAM
 
 
@@ -23,7 +22,7 @@ class Witness:
         instruction, truth = record.proposal.instruction, self._truth
         if instruction is None:
             return
-        self._fallen |= bool(truth.fallen[0]) and record.phase is Phase.RUNNING
+        self._fallen |= bool(truth.fallen[0])
         rate = -float(truth.gravity[0] @ truth.angular_velocity[0])
         self._rows.append(
             (truth.position[0].copy(), float(truth.yaw[0]), truth.velocity[0], rate, instruction.velocity)
@@ -35,7 +34,10 @@ class Witness:
         return np.random.default_rng([seed, TASK_STREAM])
 
     def trace(self) -> Trace:
-        """The run by the truth."""
+        """The run by the truth; without rows if the guard never let the task begin."""
+        if not self._rows:
+            none = np.zeros((0, 3))
+            return Trace(self._dt, none, np.zeros(0), none, np.zeros(0), none, self._fallen)
         position, yaw, velocity, rate, command = (np.array(column) for column in zip(*self._rows, strict=True))
         yaw = np.unwrap(yaw)
         offset = position - position[0] * [1.0, 1.0, 0.0]
@@ -52,6 +54,8 @@ class Witness:
         )
 
     def odometry_error(self, estimate: Trace) -> float:
-        """Distance [m] between where the robot ended and where it believed to be."""
+        """Distance [m] between where the robot ended and where it believed to be; NaN if the task never began."""
+        if not self._rows:
+            return float("nan")
         end = self.trace().displacement[-1, :2]
         return float(np.linalg.norm(end - estimate.displacement[-1, :2]))

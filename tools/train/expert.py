@@ -59,6 +59,7 @@ class Trainer:
             self.ppo.load(saved, None, True)
         else:
             self._warm_up()
+        forget_after(out / "progress.csv", self.samples)
         self.writer = SummaryWriter(str(out), purge_step=self.samples)
         self.lengths: deque[int] = deque(maxlen=500)
 
@@ -155,6 +156,22 @@ class Trainer:
         plot(self.out / "progress.csv", self.out / "progress.png")
 
 
+def forget_after(path: Path, samples: int) -> None:
+    """Drop the rows of a learning curve that lie after `samples`: they were not saved, or are of another run."""
+    if not path.exists():
+        return
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    kept = [row for row in rows if float(row["samples"]) <= samples]
+    if not kept:
+        path.unlink()
+    elif len(kept) < len(rows):
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(kept[0]))
+            writer.writeheader()
+            writer.writerows(kept)
+
+
 def _observations(env: Any) -> Any:
     import torch
     from tensordict import TensorDict
@@ -214,7 +231,9 @@ def export(actor: Any, robot: Any, settings: Any, path: Path, samples: int) -> N
 
 
 def plot(source: Path, target: Path) -> None:
-    """Draw the learning curve of a run's CSV."""
+    """Draw the learning curve of a run's CSV, once it has two rows."""
+    if not source.exists():
+        return
     import matplotlib
 
     matplotlib.use("Agg")

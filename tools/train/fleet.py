@@ -54,6 +54,7 @@ class Fleet:
         for i in ids:
             bias[i] = self.worlds.bodies[i].gyro_bias + self.rngs[i].normal(0.0, _BIAS_LEFT, 3)  # type: ignore[union-attr]
         self.estimator.reset(where, bias)
+        self.applied = self.applied.copy()  # `step` gave the old array away as a label
         self.applied[ids] = pose
 
     def observe(self) -> State:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hw.config import CONFIGS, load_yaml
+from hw.config import CONFIGS, load_marked, nearest
+from policy.tracker.rewards import TERMS
 
 
 @dataclass(frozen=True)
@@ -33,5 +34,9 @@ class ExpertSettings:
 
 
 def load_settings() -> ExpertSettings:
-    """Load the settings. Raises ConfigError."""
-    return load_yaml(CONFIGS / "policies" / "expert.yaml", ExpertSettings)
+    """Load the settings. Raises ConfigError, also for a reward that is no term."""
+    settings, marks = load_marked(CONFIGS / "policies" / "expert.yaml", ExpertSettings)
+    for name in settings.rewards:
+        if name not in TERMS:
+            raise marks.error(f"rewards.{name}", f"no such reward term; {nearest(name, TERMS)}")
+    return settings
