@@ -1,0 +1,85 @@
+"""The worked example of docs/own-robot.md, as a reader would type it in, and the errors that it promises."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hw.config import ConfigError
+from hw.robot import Imu, Joint, Limits, Link, Robot, load_robot
+from sim.model import build
+from sim.worlds import Worlds
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = (ROOT / "docs" / "own-robot.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (yaml,), (xml,) = blocks("yaml"), blocks("xml")
+    (tmp_path / "stilts.yaml").write_text(yaml)
+    (tmp_path / "stilts.xml").write_text(xml)
+    return tmp_path
+
+
+def test_the_example_loads_and_stands_in_simulation(folder: Path) -> None:
+    robot = load_robot(folder / "stilts.yaml")
+    assert robot.names == ("l_hip", "l_knee", "r_hip", "r_knee")
+    worlds = Worlds(robot, 1, threads=1)
+    worlds.reset(np.array([0]), [np.random.default_rng(0)])
+    assert worlds.truth.position[0, 2] == pytest.approx(robot.standing_height, abs=1e-3)
+    assert worlds.truth.foot_position[0, :, 2] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_the_comparison_of_both_files_passes_and_finds_a_difference(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    (code,) = blocks("python")
+    exec(compile(code, "own-robot.md", "exec"), {})
+    text = Path("stilts.yaml").read_text()
+    assert text.count("offset: [0, 0, -0.14], axis: [0, -1, 0]") == 1
+    Path("stilts.yaml").write_text(text.replace("-0.14], axis: [0, -1, 0]", "-0.15], axis: [0, -1, 0]"))
+    with pytest.raises(AssertionError, match="right"):
+        exec(compile(code, "own-robot.md", "exec"), {})
+
+
+@pytest.mark.parametrize(
+    ("change", "number"),
+    [
+        (('joint name="l_knee"', 'joint name="l_knee2"'), 0),
+        (('site name="imu"', 'site name="imu2"'), 1),
+        (('geom name="l_sole"', 'geom name="l_sole2"'), 2),
+        (("<freejoint/>", '<freejoint/><body><joint name="tail"/><geom size="0.01"/></body>'), 3),
+    ],
+)
+def test_what_the_body_lacks_is_reported_as_promised(folder: Path, change: tuple[str, str], number: int) -> None:
+    (promised,) = blocks("text")
+    path = folder / "stilts.xml"
+    text = path.read_text()
+    assert change[0] in text
+    path.write_text(text.replace(*change))
+    with pytest.raises(ConfigError) as caught:
+        build(load_robot(folder / "stilts.yaml"))
+    assert str(caught.value).replace(f"{folder}{os.sep}", "") == promised.splitlines()[number]
+
+
+def test_every_key_is_explained() -> None:
+    """A key that is added to the robot's file must be added to the table."""
+    table = "\n".join(line for line in PAGE.splitlines() if line.startswith("| `"))
+    parts = {"bus": "bus.baud", "limits": Limits, "imu": Imu, "feet": "feet.NAME", "legs": Link, "joints": Joint}
+    prefixes = {"limits": "limits.", "imu": "imu.", "legs": "legs.NAME[i].", "joints": "joints[i]."}
+    for key in (f.name for f in fields(Robot)):
+        part = parts.get(key, key)
+        names = [part] if isinstance(part, str) else [prefixes[key] + f.name for f in fields(part)]
+        for name in names:
+            assert f"`{name}" in table, f"{name} is not in the table of docs/own-robot.md"
