@@ -75,6 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Train; returns 0 when the time budget is used up. Raises ConfigError."""
+    # Threads that spin while they wait for each other make a step ten times slower when another program is running.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded
     import torch
 
     from hw.robot import load_robot
