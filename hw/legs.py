@@ -10,6 +10,7 @@ import numpy as np
 from hw.config import ConfigError
 from hw.hal import Array
 from hw.robot import Robot
+from hw.vectors import cross
 
 
 def _skew(axis: Array) -> Array:
@@ -64,7 +65,7 @@ class Legs:
         `dq` is `(..., n_legs, joints)` rad/s; both results are `(..., n_legs, 3)` in the base frame.
         """
         rates = axes * dq[..., None]
-        linear = np.cross(rates, point[..., None, :] - origins).sum(-2)
+        linear = cross(rates, point[..., None, :] - origins).sum(-2)
         return linear, rates.sum(-2)
 
     def soles(self, q: Array) -> tuple[Array, Array]:

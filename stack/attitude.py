@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from hw.hal import Array
+from hw.vectors import cross, joined, split
 
 _GRAVITY = 9.81
 _CORRECTION = 0.5  # 1/s: how fast the accelerometer turns the estimate
@@ -22,19 +23,19 @@ _BIAS_MEMORY = 3.0  # s of standing that the bias is averaged over
 def rotate(quaternion: Array, vector: Array) -> Array:
     """Turn `(..., 3)` from the base frame into the odometry frame."""
     w, u = quaternion[..., :1], quaternion[..., 1:]
-    t = 2.0 * np.cross(u, vector)
-    return vector + w * t + np.cross(u, t)
+    t = 2.0 * cross(u, vector)
+    return vector + w * t + cross(u, t)
 
 
 def up_vector(quaternion: Array) -> Array:
     """Upward unit vector seen from the base `(..., 3)`."""
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1)
+    w, x, y, z = split(quaternion)
+    return joined(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
 
 
 def yaw_of(quaternion: Array) -> Array:
     """Heading `(...,)` rad in -pi..pi."""
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    w, x, y, z = split(quaternion)
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
@@ -75,7 +76,7 @@ class Attitude:
         good = np.isfinite(norm) & (norm > 1.0)
         measured = np.where(good, specific_force / np.where(good, norm, 1.0), 0.0)
         trust = np.where(good, 1.0 / (1.0 + (np.where(good, norm - _GRAVITY, 0.0) / _TRUST) ** 2), 0.0)
-        turn = rate + _CORRECTION * trust * np.cross(measured, up_vector(self.quaternion))
+        turn = rate + _CORRECTION * trust * cross(measured, up_vector(self.quaternion))
         angle = 0.5 * self._dt * turn
         step = np.concatenate([np.ones((*self._shape, 1)), angle], -1)
         q = _multiply(self.quaternion, step)
@@ -97,14 +98,11 @@ class Attitude:
 
 def _multiply(a: Array, b: Array) -> Array:
     """Hamilton product of `(..., 4)` quaternions."""
-    aw, ax, ay, az = np.moveaxis(a, -1, 0)
-    bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        -1,
+    aw, ax, ay, az = split(a)
+    bw, bx, by, bz = split(b)
+    return joined(
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
     )

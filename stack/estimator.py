@@ -12,6 +12,7 @@ import numpy as np
 from hw.hal import Array, Observation, State
 from hw.legs import Legs
 from hw.robot import Robot
+from hw.vectors import cross, joined, split
 from policy.mlp import Mlp
 from stack.attitude import Attitude, up_vector
 from stack.odometry import OdometryFeatures
@@ -74,7 +75,7 @@ class Estimator:
         share /= share.sum(-1, keepdims=True)
         point = np.einsum("...lk,...lki->...li", share, corners)
         linear, _ = self._legs.velocity(point, origins, axes, leg_rate)
-        foot_velocity = -(linear + np.cross(rate[..., None, :], point))  # of the base, were this foot fixed
+        foot_velocity = -(linear + cross(rate[..., None, :], point))  # of the base, were this foot fixed
         ground = lowest.min(-1, keepdims=True)
         contact = np.exp(-(lowest - ground) / _FOOT_SOFTNESS)
         contact /= contact.sum(-1, keepdims=True)
@@ -90,7 +91,7 @@ class Estimator:
 
         yaw = self._attitude.yaw - self._heading0
         c, s = np.cos(yaw), np.sin(yaw)
-        step = np.stack([c * velocity[..., 0] - s * velocity[..., 1], s * velocity[..., 0] + c * velocity[..., 1]], -1)
+        step = joined(c * velocity[..., 0] - s * velocity[..., 1], s * velocity[..., 0] + c * velocity[..., 1])
         self._displacement[..., :2] += step * self.robot.dt
         self._displacement[..., 2] = -ground[..., 0]
         half = self._heading0 / 2
@@ -123,11 +124,11 @@ def _heading_frame(up: Array) -> Array:
     forward[..., 0] = 1.0
     forward = forward - up[..., :1] * up
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True) + 1e-9
-    return np.stack([forward, np.cross(up, forward), up], -2)
+    return np.stack([forward, cross(up, forward), up], -2)
 
 
 def _unyaw(quaternion: Array, half: Array) -> Array:
     """Turn a quaternion about z by minus twice `half`."""
     c, s = np.cos(half), -np.sin(half)
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    return np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], -1)
+    w, x, y, z = split(quaternion)
+    return joined(c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w)
