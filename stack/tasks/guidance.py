@@ -55,17 +55,17 @@ def integrate_twist(velocity: Array, times: Array) -> tuple[Array, Array]:
 
 
 def twist_cost(trajectory: Trajectory, velocity: Array, weights: Weights) -> Any:
-    """Weighted squared errors against the twist `velocity` `(3,)` or `(batch, 3)`, mean over the horizon: `(batch,)`.
+    """Weighted squared errors against the twist `velocity` `(3,)` or `(batch, 3)`: `(batch,)`.
 
-    Differentiable with respect to the trajectory.
+    Velocities are compared by their means over the horizon, displacement and yaw at its end. Tick by tick, the sway of
+    every walk would be an error, least for a robot that stands. Differentiable with respect to the trajectory.
     """
-    horizon = trajectory.yaw.shape[-1]
-    times = trajectory.dt * np.arange(1, horizon + 1)
-    place, yaw = integrate_twist(velocity, times)
+    end = np.array([trajectory.dt * trajectory.yaw.shape[-1]])
+    place, yaw = integrate_twist(velocity, end)
     as_tensor = trajectory.displacement.new_tensor
-    twist = as_tensor(np.asarray(velocity, dtype=float))[..., None, :]
-    cost = weights.velocity * ((trajectory.velocity - twist[..., :2]) ** 2).sum(-1)
-    cost = cost + weights.yaw_rate * (trajectory.yaw_rate - twist[..., 2]) ** 2
-    cost = cost + weights.displacement * ((trajectory.displacement - as_tensor(place)) ** 2).sum(-1)
-    cost = cost + weights.yaw * (trajectory.yaw - as_tensor(yaw)) ** 2
-    return cost.mean(-1)
+    twist = as_tensor(np.asarray(velocity, dtype=float))
+    cost = weights.velocity * ((trajectory.velocity.mean(-2) - twist[..., :2]) ** 2).sum(-1)
+    cost = cost + weights.yaw_rate * (trajectory.yaw_rate.mean(-1) - twist[..., 2]) ** 2
+    short = trajectory.displacement[..., -1, :] - as_tensor(place[..., 0, :])
+    cost = cost + weights.displacement * (short**2).sum(-1)
+    return cost + weights.yaw * (trajectory.yaw[..., -1] - as_tensor(yaw[..., 0])) ** 2
