@@ -58,7 +58,8 @@ class Worlds:
         delay = max(COMMAND_DELAY[1], *(servo.command_delay for servo in servos))
         latency = max(LATENCY[1], robot.imu.latency, *(servo.position_latency for servo in servos))
         self._delayed = int(np.ceil(delay / robot.dt - 1e-6)) + 1
-        span = max(2 * self.substeps, round(latency / TIMESTEP) + 1)
+        self._imu_span = max(round(robot.imu.average / TIMESTEP), 1)
+        span = max(2 * self.substeps, round(latency / TIMESTEP) + 1 + self._imu_span)
 
         b, nj = self.batch, len(robot.joints)
         self._state_qpos, self._state_qvel = b.bind("qpos"), b.bind("qvel")
@@ -77,7 +78,6 @@ class Worlds:
         self._noise, self._noise_block = np.zeros((n, _NOISE_ROWS, 6 + nj)), np.full(n, -1)
         self._commands = np.zeros((n, self._delayed, nj))  # oldest first
         self._play = np.zeros((n, nj))
-        self._imu_span = max(round(robot.imu.average / TIMESTEP), 1)
         self._record = {
             "qpos": np.zeros((n, span, self.model.nq)),
             "qvel": np.zeros((n, span, self.model.nv)),
