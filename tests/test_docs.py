@@ -12,8 +12,12 @@ import pytest
 
 from hw.config import ConfigError
 from hw.robot import Imu, Joint, Limits, Link, Robot, load_robot
+from policy.checkpoint import REQUIRED
+from policy.diffusion.features import raw_layout
 from sim.model import build
 from sim.worlds import Worlds
+from stack.logformat import SCHEMAS
+from tools.collect import _features
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = (ROOT / "docs" / "own-robot.md").read_text()
@@ -83,3 +87,19 @@ def test_every_key_is_explained() -> None:
         names = [part] if isinstance(part, str) else [prefixes[key] + f.name for f in fields(part)]
         for name in names:
             assert f"`{name}" in table, f"{name} is not in the table of docs/own-robot.md"
+
+
+def test_every_channel_column_and_header_key_is_explained() -> None:
+    """A field that a log, a dataset or a checkpoint gains must be added to docs/files.md."""
+    page = (ROOT / "docs" / "files.md").read_text()
+    rows = {line.split("|")[1].strip(): line for line in page.splitlines() if line.startswith("| `")}
+    for channel, schema in SCHEMAS.items():
+        for field in schema["properties"].keys() - {"tick"}:
+            assert f"`{field}`" in rows[f"`{channel}`"], f"{channel} {field}"
+    columns = _features(load_robot())
+    assert columns.keys() <= {name.strip("`") for name in rows}
+    for field, _ in raw_layout(1).fields:
+        assert f"`{field}`" in rows["`observation.state`"]
+    assert raw_layout(20).size == 13 + 2 * 20
+    keys = re.findall(r"`(\w+)`", "".join(rows))
+    assert set(REQUIRED) <= set(keys)
