@@ -1,5 +1,5 @@
 # make demo: install, then walk to a goal.   make test: install what tests need, then run all of them.
-# make clean: remove the environment and what runs left.   PYTHON=... chooses the interpreter (3.11 or newer).
+# make clean: remove the environment and caches; what was recorded and trained under runs/ stays.   PYTHON=... chooses the interpreter (3.11 or newer).
 
 PYTHON ?= $(shell for p in python3.11 python3; do $$p -c '' 2>/dev/null && echo $$p && break; done)
 VENV ?= .venv
@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 .PHONY: demo test clean
 
 demo: $(VENV)/.installed-demo
-	mkdir -p runs
+	mkdir -p runs && rm -f runs/demo.mcap runs/demo.mp4 runs/demo.png
 	$(BIN)/servoid run goal --backend sim --seed 1 --record runs/demo.mcap --video runs/demo.mp4
 
 test: $(VENV)/.installed-test
@@ -33,5 +33,5 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 clean:
-	rm -rf $(VENV) build *.egg-info runs .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -7,6 +7,7 @@ leading world dimensions: `(..., n_joints)`. A value that was not read is NaN, n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol
@@ -128,6 +129,64 @@ class Backend(Protocol):
 
 class BackendError(Exception):
     """A body cannot be reached or refused: exit code 3."""
+
+
+class Truth(Protocol):
+    """What a simulation knows of its bodies. Rewards and evaluation read it; policies, estimators and tasks never do.
+
+    Arrays are `(n, ...)`, world frame unless said otherwise.
+    """
+
+    @property
+    def position(self) -> Array:
+        """Base position `(n, 3)` m."""
+        ...
+
+    @property
+    def yaw(self) -> Array:
+        """Heading `(n,)` rad in -pi..pi."""
+        ...
+
+    @property
+    def gravity(self) -> Array:
+        """Unit vector along gravity in the base frame `(n, 3)`."""
+        ...
+
+    @property
+    def velocity(self) -> Array:
+        """Base velocity `(n, 3)` m/s in the heading frame."""
+        ...
+
+    @property
+    def angular_velocity(self) -> Array:
+        """Base angular velocity `(n, 3)` rad/s in the base frame."""
+        ...
+
+    @property
+    def fallen(self) -> Array:
+        """Whether each body has fallen `(n,)`."""
+        ...
+
+
+class World(Protocol):
+    """Many simulated bodies. An episode draws from its own random stream, so it does not depend on its neighbours."""
+
+    n: int
+
+    @property
+    def truth(self) -> Truth: ...
+
+    def reset(self, ids: Array, rngs: Sequence[np.random.Generator], joints: Array | None = None) -> None:
+        """Start new episodes in the worlds `ids`, drawing their robots anew, at a pose `(len(ids), n_joints)` rad."""
+        ...
+
+    def observe(self) -> Observation: ...
+
+    def step(self, command: Command) -> None: ...
+
+    def push(self, velocity: Array) -> None:
+        """Change the bases' velocity by `(n, 2)` m/s, world frame."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)

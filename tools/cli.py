@@ -29,7 +29,7 @@ class Verb:
 VERBS: dict[str, Verb] = {
     "tasks": Verb("list what can be run, with settings", "tools.tasks"),
     "doctor": Verb("check whether this machine is ready", "tools.doctor"),
-    "run": Verb("run a task on a simulated, virtual or real robot", "tools.run"),
+    "run": Verb("run a task on a robot", "tools.run"),
     "rollout": Verb("run a task many times in simulation and measure it", "tools.rollout"),
     "collect": Verb("record demonstrations of the expert as a dataset", "tools.collect"),
     "train": Verb(

@@ -12,6 +12,8 @@ import os
 import time
 from typing import Any
 
+from hw.config import ConfigError
+from hw.hal import Backend, Truth
 from tools.output import add_json_argument, reporting
 from tools.parser import add_set_argument, settings
 
@@ -33,8 +35,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    from hw.config import ConfigError
-
     if args.episodes < 1:
         raise ConfigError(f"--episodes: {args.episodes} is not a number of episodes; give 1 or more")
     if args.workers < 0:
@@ -114,7 +114,7 @@ def episode(job: Any) -> dict[str, Any]:
 
     robot = load_robot(job.robot)
     backend = make_backend(job.backend, robot, seed=job.seed, randomise=job.randomise, port=job.port)
-    witness = Witness(backend, robot.dt)  # type: ignore[arg-type]
+    witness = Witness(simulated_truth(backend), robot.dt)
     result = run(job, backend=backend, on_tick=witness)
     trace = witness.trace()
     task = load_task(job.task, _task_values(job), robot.dt)
@@ -128,6 +128,14 @@ def episode(job: Any) -> dict[str, Any]:
         "metrics": task.metrics(trace) if len(trace.yaw) else {},
         "odometry_error_m": witness.odometry_error(result.trace),
     }
+
+
+def simulated_truth(backend: Backend) -> Truth:
+    """The truth of a simulated body. Raises ConfigError for another: an episode is judged by the truth."""
+    truth: Truth | None = getattr(backend, "truth", None)
+    if truth is None:
+        raise ConfigError(f"backend '{backend.name}' has no truth to judge by: use a simulated one, or `servoid run`")
+    return truth
 
 
 def _task_values(job: Any) -> dict[str, str]:

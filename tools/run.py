@@ -1,4 +1,4 @@
-"""Run a task on a simulated, virtual or real robot.
+"""Run a task on a robot.
 
 Writes a flight log, for `servoid plot` and `servoid replay`. Ctrl-C lowers the robot and turns torque off; a second one
 turns torque off at once. Exit code 0: the goal was met; 1: the task failed; 4: the guard stopped the run.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.hal import Array, Trace
-from sim.backend import SimBackend
+from hw.hal import Array, Trace, Truth
 from stack.loop import TickRecord
 from stack.session import TASK_STREAM
 
@@ -13,8 +12,8 @@ from stack.session import TASK_STREAM
 class Witness:
     """An `on_tick` listener: one row for each tick of the task."""
 
-    def __init__(self, backend: SimBackend, dt: float) -> None:
-        self._truth, self._dt = backend.truth, dt
+    def __init__(self, truth: Truth, dt: float) -> None:
+        self._truth, self._dt = truth, dt
         self._rows: list[tuple[Array, float, Array, float, Array]] = []
         self._fallen = False
 

@@ -43,7 +43,7 @@ def _kernel(squared: Array, width: float) -> Array:
 def velocity(s: Step) -> Array:
     """Planar velocity near the reference's: a wide kernel to find it and a narrow one to hold it."""
     error = ((s.velocity - s.reference_velocity) ** 2).sum(-1)
-    return 0.5 * _kernel(error, 0.2) + 0.5 * _kernel(error, 0.06)
+    return 0.5 * _kernel(error, 0.15) + 0.5 * _kernel(error, 0.05)
 
 
 def yaw_rate(s: Step) -> Array:

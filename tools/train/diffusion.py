@@ -84,7 +84,7 @@ def main(args: argparse.Namespace) -> int:
     from policy.diffusion.dataset import Windows, read_recording
     from policy.diffusion.features import token_layout
 
-    survival = _survival(args.survival_seconds, args.survival_worlds, args.seed) if args.survival_worlds else None
+    survival = _survival(args) if args.survival_worlds else None
     torch.set_num_threads(args.threads)
     robot = load_robot(args.robot)
     names = ("layers", "width", "heads", "history", "horizon", "levels", "mask")
@@ -102,7 +102,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _survival(seconds: float, worlds: int, seed: int) -> Survival:
+def _survival(args: argparse.Namespace) -> Survival:
     """The closed-loop measurement, looked for before training starts. Raises ConfigError."""
     try:
         measure = import_module("tools.train.survival").closed_loop_survival
@@ -111,7 +111,8 @@ def _survival(seconds: float, worlds: int, seed: int) -> Survival:
             f"closed-loop survival cannot be measured ({error}); "
             "--survival-worlds 0 keeps the best checkpoint by validation loss instead"
         ) from error
-    return partial(measure, seconds=seconds, worlds=worlds, seed=seed)
+    seconds, worlds = args.survival_seconds, args.survival_worlds
+    return partial(measure, seconds=seconds, worlds=worlds, seed=args.seed, robot_name=args.robot)
 
 
 class Trainer:

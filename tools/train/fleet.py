@@ -10,6 +10,7 @@ import numpy as np
 from hw.hal import Array, Command, Mode, State
 from hw.robot import Robot
 from policy.mlp import Mlp
+from sim.truth import Truth
 from sim.worlds import Worlds
 from stack.estimator import Estimator
 from stack.limits import limit
@@ -33,7 +34,7 @@ class Fleet:
         self.state: State
 
     @property
-    def truth(self):  # type: ignore[no-untyped-def]
+    def truth(self) -> Truth:
         """The worlds' truth, for rewards and evaluation."""
         return self.worlds.truth
 

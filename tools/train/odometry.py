@@ -166,8 +166,10 @@ def drift(
 ) -> Drift:
     """Walk with commands changed every 5 s and compare the estimate's end with the truth's.
 
-    Counts walks that stayed up and covered more than a metre.
+    Counts walks that stayed up and covered more than a metre. The path is measured from cycle to cycle: within one, the
+    gait's sway would add to it, up to its double.
     """
+    from policy.gait import load_gait
     from tools.train.fleet import Fleet
     from tools.train.walker import Walker
 
@@ -179,16 +181,19 @@ def drift(
     alive, path, command = everything.copy(), np.zeros(walks), np.zeros((walks, 3))
     turned, start = np.zeros(walks), fleet.truth.position[:, :2].copy()
     last, heading, state = start, fleet.truth.yaw.copy(), fleet.observe()
-    for k in range(round(seconds * robot.rate)):
+    ticks, cycle = round(seconds * robot.rate), round(load_gait().cycle * robot.rate)
+    for k in range(ticks):
         if k % (5 * robot.rate) == 0:
             low, high = [-0.1, -0.1, -0.8], [0.3, 0.1, 0.8]
             command = np.array([rng.uniform(low, high) for rng in fleet.rngs])
         fleet.step(walker.act(command))
         state = fleet.observe()
         truth = fleet.truth
-        path += np.linalg.norm(truth.position[:, :2] - last, axis=-1)
+        if (k + 1) % cycle == 0 or k == ticks - 1:
+            path += np.linalg.norm(truth.position[:, :2] - last, axis=-1)
+            last = truth.position[:, :2].copy()
         turned += (truth.yaw - heading + np.pi) % (2 * np.pi) - np.pi
-        last, heading = truth.position[:, :2].copy(), truth.yaw.copy()
+        heading = truth.yaw.copy()
         alive &= ~truth.fallen
     error = np.linalg.norm(state.displacement[:, :2] - (last - start), axis=-1)
     use = alive & (path > 1.0)

@@ -30,6 +30,7 @@ class ExpertSettings:
     yaw_rate: tuple[float, float]
     stand: float
     forward: float
+    single: float
     rewards: dict[str, float]
 
 

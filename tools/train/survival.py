@@ -30,7 +30,7 @@ def closed_loop_survival(
     from tools.train.fleet import Fleet
 
     robot, settings = load_robot(robot_name), replace(load_settings(), checkpoint=str(checkpoint))
-    runtime = load_runtime(robot, settings, load_task("walk", {}).cost)
+    runtime = load_runtime(robot, settings, load_task("walk", {}, robot.dt).cost)
     history, horizon = runtime.model.config.history, runtime.model.config.horizon
     fleet = Fleet(robot, worlds, load_odometry(robot), seed=seed)
     everything = np.ones(worlds, bool)

@@ -13,6 +13,7 @@ from policy.tracker.rewards import Step, total
 from tools.train.fleet import Fleet
 from tools.train.settings import ExpertSettings
 
+_MIXED_SPEED = 0.35  # m/s
 _CYCLE = 24  # ticks of a gait cycle, over which velocity is judged: within one, a walk sways
 
 
@@ -73,14 +74,7 @@ class Tracking:
         command = self.gait.target.copy()
         for i in np.flatnonzero(self.ticks >= self._next_command):
             rng = self.fleet.rngs[i]
-            kind = rng.random()
-            command[i] = rng.uniform([s.vx[0], s.vy[0], s.yaw_rate[0]], [s.vx[1], s.vy[1], s.yaw_rate[1]])
-            if kind < s.stand:
-                command[i] = 0.0
-            elif kind < s.stand + s.forward:
-                command[i, 1:] = 0.0
-            elif command[i, 0] > 0.35:  # no fast walking while turning or side-stepping
-                command[i, 0] -= 0.35
+            command[i] = _draw(rng, s)
             self._next_command[i] = self.ticks[i] + round(rng.uniform(*s.command_every) * rate)
         self.gait.command(command)
         push = np.zeros((self.n, 2))
@@ -149,3 +143,19 @@ class Tracking:
             self._reset(done)
         self.actor, self.critic = self._observe()
         return reward * self.robot.dt, done, late
+
+
+def _draw(rng: np.random.Generator, s: ExpertSettings) -> Array:
+    """A command `(3,)`: standing, straight ahead, along one other axis, or any mixture."""
+    command = rng.uniform([s.vx[0], s.vy[0], s.yaw_rate[0]], [s.vx[1], s.vy[1], s.yaw_rate[1]])
+    kind = rng.random()
+    if kind < s.stand:
+        return np.zeros(3)
+    if kind < s.stand + s.forward:
+        return command * [1.0, 0.0, 0.0]
+    if kind < s.stand + s.forward + s.single:
+        axis = rng.integers(3)
+        return np.where(np.arange(3) == axis, np.minimum(command, [0.0, np.inf, np.inf]), 0.0)
+    if command[0] > _MIXED_SPEED:  # no fast walking while turning or side-stepping
+        command[0] -= _MIXED_SPEED
+    return command
