@@ -1,0 +1,153 @@
+"""Rollouts count honestly, the same on any number of workers, and any episode can be run again."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hw.config import ConfigError
+from hw.hal import Trace
+from hw.robot import load_robot
+from sim.backend import SimBackend
+from stack.session import Settings, run
+from tools import rollout
+from tools.witness import Witness
+
+WORDS = ["walk", "--policy", "gait", "--seconds", "3", "--episodes", "2", "--seed", "3"]
+KEYS = {
+    "task", "policy", "backend", "robot", "randomised", "episodes", "seed", "success_rate", "success_ci95", "fall_rate",
+    "mean_seconds", "metrics", "wall_seconds",
+}  # fmt: skip
+
+
+def options(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    rollout.add_arguments(parser)
+    return parser.parse_args([*WORDS, *words])
+
+
+def rolled(capfd: pytest.CaptureFixture[str], *words: str) -> dict:
+    assert rollout.main(options("--json", *words)) == 0
+    (line,) = capfd.readouterr().out.splitlines()
+    return json.loads(line)
+
+
+def test_one_and_two_workers_give_the_same_and_all_that_was_promised(capfd: pytest.CaptureFixture[str]) -> None:
+    one = rolled(capfd, "--workers", "1")
+    two = rolled(capfd, "--workers", "2")
+    assert set(one) >= KEYS
+    assert one.pop("wall_seconds") > 0
+    assert two.pop("wall_seconds") > 0
+    assert one == two
+    assert (one["task"], one["policy"], one["backend"], one["robot"]) == ("walk", "gait", "sim", "op3")
+    assert (one["episodes"], one["seed"], one["randomised"]) == (2, 3, False)
+    assert one["mean_seconds"] == pytest.approx(3.0, abs=0.05)
+    assert one["success_rate"] + one["fall_rate"] == 1.0
+    assert {"velocity_error_mps", "top_speed_mps", "odometry_error_m"} <= set(one["metrics"])
+
+
+def test_an_episode_can_be_run_again_by_its_seed() -> None:
+    seed = rollout.episode_seed(3, 1)
+    assert seed == rollout.episode_seed(3, 1) != rollout.episode_seed(3, 0)
+    job = Settings(task="walk", policy="gait", seconds=2.0, seed=seed, randomise=True, set={"push": "0.1"})
+    row = rollout.episode(job)
+    backend = SimBackend(load_robot(), seed=seed, randomise=True)
+    witness = Witness(backend.truth, 0.02)
+    again = run(job, backend=backend, on_tick=witness)
+    assert row["outcome"] == again.outcome
+    assert row["seconds"] == again.seconds
+    assert row["odometry_error_m"] == witness.odometry_error(again.trace)
+    plain = run(job)  # as `servoid run --seed` does it
+    np.testing.assert_array_equal(plain.trace.displacement, again.trace.displacement)
+
+
+@pytest.mark.parametrize(
+    ("successes", "n", "low", "high"),
+    # R: binom.confint(x, n, methods = "wilson")
+    [(0, 10, 0.0, 0.2775), (10, 10, 0.7225, 1.0), (5, 10, 0.2366, 0.7634), (190, 200, 0.9104, 0.9726)],
+)
+def test_wilson_interval(successes: int, n: int, low: float, high: float) -> None:
+    assert rollout.wilson(successes, n) == pytest.approx([low, high], abs=5e-4)
+
+
+def trace(fallen: bool) -> Trace:
+    rows = np.zeros((200, 3))
+    return Trace(0.02, rows, np.zeros(200), rows, np.zeros(200), rows, fallen)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "fallen", "success", "fell"),
+    [
+        ("succeeded", False, True, False),
+        ("timed_out", False, True, False),  # it believed to have failed, and had not
+        ("succeeded", True, False, True),
+        ("fell", False, False, True),  # the guard was quicker than the fall
+        ("stopped", False, False, False),  # the guard broke it off: no success, however far it came
+        ("interrupted", False, False, False),
+    ],
+)
+def test_success_is_by_the_truth_and_only_of_whole_runs(
+    monkeypatch: pytest.MonkeyPatch, outcome: str, fallen: bool, success: bool, fell: bool
+) -> None:
+    result = SimpleNamespace(outcome=outcome, seconds=4.0, trace=trace(False))
+    monkeypatch.setattr("stack.session.run", lambda *a, **k: result)
+    monkeypatch.setattr(Witness, "trace", lambda self: trace(fallen))
+    monkeypatch.setattr(Witness, "odometry_error", lambda self, estimate: 0.01)
+    row = rollout.episode(Settings(task="walk", policy="gait"))
+    assert (row["success"], row["fell"]) == (success, fell)
+
+
+def test_a_run_that_never_began_is_counted_and_not_a_crash(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A randomised robot may fall while it stands up, before the task's first tick."""
+    for task in ("walk", "goal", "stand"):
+        result = SimpleNamespace(outcome="stopped", seconds=0.0, trace=trace(False))
+        monkeypatch.setattr("stack.session.run", lambda *a, result=result, **k: result)
+        row = rollout.episode(Settings(task=task, policy="gait"))
+        assert not row["success"]
+        assert row["metrics"] == {}
+        good = {**row, "success": True, "metrics": {"distance_m": 2.0}, "odometry_error_m": 0.02, "seconds": 4.0}
+        summary = rollout.summarise(options(), [row, good], 1.0)
+        assert summary["metrics"] == {"distance_m": 2.0, "odometry_error_m": 0.02}
+        assert summary["success_rate"] == 0.5
+        assert summary["failed_seeds"] == [row["seed"]]
+
+
+def test_the_witness_sees_the_run_in_the_frame_it_started_in() -> None:
+    backend = SimBackend(load_robot(), seed=1)
+    witness = Witness(backend.truth, 0.02)
+    half = np.pi / 4  # facing along y
+    truth = backend.truth
+    instruction = SimpleNamespace(velocity=np.array([0.1, 0, 0]))
+    record = SimpleNamespace(proposal=SimpleNamespace(instruction=instruction))
+    truth.qpos[0, :2], truth.qpos[0, 3:7] = (1.0, 2.0), (np.cos(half), 0, 0, np.sin(half))
+    witness(record)
+    truth.qpos[0, :2] = 1.0, 2.5
+    witness(record)
+    witness(SimpleNamespace(proposal=SimpleNamespace(instruction=None)))  # homing is not the task
+    seen = witness.trace()
+    np.testing.assert_allclose(seen.displacement[:, :2], [[0, 0], [0.5, 0]], atol=1e-12)
+    np.testing.assert_allclose(seen.yaw, 0.0, atol=1e-12)
+    assert not seen.fallen
+    assert witness.odometry_error(seen) == 0.0
+    truth.qpos[0, 2] = 0.1
+    witness(record)
+    assert witness.trace().fallen
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--episodes", "0"], "--episodes"),
+        (["--workers", "-1"], "--workers"),
+        (["--policy", "gate"], "gait"),
+        (["--set", "vz=1"], "vz"),
+        (["--robot", "op4"], "op4"),
+    ],
+)
+def test_bad_choices_are_refused_before_anything_runs(words: list[str], named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        rollout.main(options(*words))

@@ -1,0 +1,168 @@
+"""The expert's training: its world, what it saves, how it goes on, and what it exports."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hw.robot import load_robot
+from policy.mlp import Mlp
+from policy.tracker.observation import TrackerObservation
+from tools.train.expert import Trainer, _observations, forget_after, plot
+from tools.train.fleet import Fleet
+from tools.train.settings import load_settings
+from tools.train.tracking import Tracking
+
+ROBOT = load_robot()
+SETTINGS = replace(load_settings(), hidden=(32, 16), horizon=6, mini_batches=2, episode_seconds=1.0)
+
+
+def trainer(out: Path, fresh: bool = False, samples: float = 1e6) -> Trainer:
+    out.mkdir(exist_ok=True)
+    return Trainer(Tracking(ROBOT, 8, None, SETTINGS), out, samples, fresh)
+
+
+def rows(out: Path) -> list[float]:
+    with (out / "progress.csv").open() as file:
+        return [float(row["samples"]) for row in csv.DictReader(file)]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trainer]:
+    out = tmp_path_factory.mktemp("expert")
+    first = trainer(out)
+    before = first.ppo.actor.mlp[0].weight.detach().clone()
+    for _ in range(2):
+        row = first._iteration()
+        assert all(math.isfinite(value) for value in row.values())
+    assert not (first.ppo.actor.mlp[0].weight == before).all()
+    first._save()
+    return out, first
+
+
+def test_two_iterations_are_saved_with_their_curve(trained: tuple[Path, Trainer]) -> None:
+    out, first = trained
+    assert first.samples == 2 * 6 * 8
+    assert rows(out) == [48, 96]
+    assert (out / "progress.png").stat().st_size > 1000
+    assert list(out.glob("events.out.tfevents.*"))
+
+
+def test_it_goes_on_where_it_was(trained: tuple[Path, Trainer]) -> None:
+    out, first = trained
+    again = trainer(out)
+    assert again.samples == first.samples
+    for ours, theirs in zip(again.ppo.actor.state_dict().values(), first.ppo.actor.state_dict().values(), strict=True):
+        assert (ours == theirs).all()
+    again._iteration()
+    assert again.samples == 144
+    assert rows(out) == [48, 96, 144]
+    # Killed here, before it saved: the next call repeats that iteration, and the curve does not count it twice.
+    assert trainer(out).samples == 96
+    assert rows(out) == [48, 96]
+
+
+def test_the_export_acts_as_the_trained_actor(trained: tuple[Path, Trainer]) -> None:
+    import torch
+
+    out, first = trained
+    network, head = Mlp.load(out / "expert.safetensors", "tracker", ROBOT, TrackerObservation(ROBOT).size)
+    first.ppo.actor.eval()
+    with torch.inference_mode():
+        expected = first.ppo.actor(_observations(first.env)).numpy()
+    np.testing.assert_allclose(network(first.env.actor), expected, atol=1e-4)
+    assert np.abs(expected).max() > 0.01
+    assert head["results"] == {"samples": 96}
+    assert head["config"]["rewards"] == SETTINGS.rewards
+
+
+def test_a_fresh_start_leaves_no_curve_of_the_old_run(tmp_path: Path) -> None:
+    trainer(tmp_path)._iteration()
+    other = trainer(tmp_path, fresh=True)
+    assert other.samples == 0
+    assert not (tmp_path / "progress.csv").exists()
+
+
+def test_a_budget_that_is_used_up_still_saves(tmp_path: Path) -> None:
+    trainer(tmp_path, samples=0.5).learn(0.0)  # no iteration, and so no curve to draw
+    assert (tmp_path / "state.pt").exists()
+    assert (tmp_path / "expert.safetensors").exists()
+
+
+def test_the_curve_keeps_what_was_saved(tmp_path: Path) -> None:
+    path = tmp_path / "progress.csv"
+    forget_after(path, 5)  # nothing there is no error
+    path.write_text("samples,reward\n1.0,2.0\n2.0,3.0\n3.0,4.0\n")
+    forget_after(path, 2)
+    assert path.read_text().split() == ["samples,reward", "1.0,2.0", "2.0,3.0"]
+    plot(tmp_path / "none.csv", tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
+
+
+def test_a_world_learns_the_same_whatever_its_neighbours() -> None:
+    """Commands, pushes, robots and noise come from the world's own stream, over falls and time-outs."""
+
+    def lived(n: int) -> tuple[list[bytes], list[float]]:
+        env, seen, rewards = Tracking(ROBOT, n, None, SETTINGS), [], []
+        action = np.random.default_rng(0).standard_normal((70, 1, 20))
+        for k in range(70):
+            reward, done, _ = env.step(np.repeat(0.5 * action[k], n, 0))
+            seen += [env.critic[0].tobytes(), done[0].tobytes()]
+            rewards.append(reward[0])
+        return seen, rewards
+
+    (alone, reward), (among, their_reward) = lived(1), lived(3)
+    assert alone == among
+    np.testing.assert_allclose(reward, their_reward, rtol=1e-9)  # numpy sums in an order that depends on the shape
+
+
+def test_falls_and_time_outs_end_episodes_and_only_time_outs_are_late() -> None:
+    env = Tracking(ROBOT, 4, None, SETTINGS)
+    ended, late = np.zeros(4, int), np.zeros(4, int)
+    for _ in range(110):
+        action = np.zeros((4, 20))
+        action[0, 11] = 8.0  # a knee folded far beyond its reference: this one falls
+        _, done, out = env.step(action)
+        assert (done | ~out).all()
+        ended += done
+        late += out
+        assert (env.ticks[done] == 0).all()
+        assert np.isfinite(env.critic).all()
+    assert env.limit == 50
+    assert (late[1:] >= 1).all()
+    assert ended[0] > late[0]
+
+
+def test_the_actor_sees_nothing_of_the_truth_that_the_critic_sees() -> None:
+    env = Tracking(ROBOT, 2, None, SETTINGS)
+    assert env.actor.shape == (2, TrackerObservation(ROBOT).size)
+    assert env.critic.shape[1] > env.actor.shape[1]
+    np.testing.assert_array_equal(env.critic[:, : env.actor.shape[1]], env.actor)
+
+
+def test_a_label_is_not_changed_by_a_later_reset() -> None:
+    fleet = Fleet(ROBOT, 2, None, threads=1)
+    fleet.reset(np.ones(2, bool))
+    fleet.observe()
+    label = fleet.step(ROBOT.home + np.full((2, 20), 0.05))
+    kept = label.copy()
+    fleet.reset(np.ones(2, bool))
+    np.testing.assert_array_equal(label, kept)
+    np.testing.assert_array_equal(fleet.applied, np.tile(ROBOT.home, (2, 1)))
+
+
+def test_noise_moves_the_robot_and_not_the_label() -> None:
+    fleet = Fleet(ROBOT, 2, None, threads=1)
+    fleet.reset(np.ones(2, bool))
+    fleet.observe()
+    target, noise = np.tile(ROBOT.home, (2, 1)), np.full((2, 20), 0.05)
+    clean = fleet.step(target, noise)
+    np.testing.assert_array_equal(clean, target)
+    np.testing.assert_allclose(fleet.applied, target + noise)
+    assert np.abs(fleet.step(target + 3.0) - fleet.applied).max() == 0.0  # without noise the label is what ran
+    assert np.abs(fleet.applied - (target + noise)).max() <= ROBOT.limits.joint_speed * ROBOT.dt + 1e-9
