@@ -1,0 +1,43 @@
+"""The policies of one robot do what trained and collected: the same as their batched twins."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from hw.hal import Instruction, State
+from hw.robot import load_robot
+from stack.expert_policy import ExpertPolicy
+from stack.gait_policy import GaitPolicy
+from tools.train.fleet import Fleet
+from tools.train.walker import Walker, load_tracker
+
+ROBOT = load_robot()
+
+
+@pytest.mark.parametrize("kind", [GaitPolicy, ExpertPolicy])
+def test_one_robot_acts_as_a_world_of_the_fleet(kind: type) -> None:
+    fleet, everything = Fleet(ROBOT, 2, None, seed=3, threads=1), np.ones(2, bool)
+    walker = Walker(fleet, load_tracker(ROBOT) if kind is ExpertPolicy else None)
+    fleet.reset(everything)
+    walker.reset(everything)
+    walker.gait.reset()  # a run starts at phase 0
+    policy = kind(ROBOT, None, False)
+    for attempt in range(2):  # a reset makes a used policy new
+        policy.reset(attempt)
+        if attempt:
+            fleet.reset(everything)
+            walker.reset(everything)
+            walker.gait.reset()
+        for tick in range(40):
+            state = fleet.observe()
+            command = np.array([[0.2, 0.0, 0.3], [0.0, 0.0, 0.0]]) * (tick > 5)
+            values = {f.name: getattr(state, f.name) for f in fields(State)}
+            one = State(**{name: value if name == "time_ns" else value[0] for name, value in values.items()})
+            target = policy.act(one, fleet.applied[0], Instruction(command[0]))
+            targets = walker.act(command)
+            np.testing.assert_allclose(target, targets[0], atol=1e-5)
+            fleet.step(targets)
+        assert np.abs(targets[0] - ROBOT.home).max() > 0.1

@@ -1,0 +1,52 @@
+"""Learning the odometry's correction: what is recorded, and that fitting takes the error out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from hw.robot import load_robot
+from stack.odometry import OFFSETS, OdometryFeatures
+from tools.train import odometry
+
+ROBOT = load_robot()
+
+
+@pytest.fixture(scope="module")
+def recorded() -> dict[str, np.ndarray]:
+    return odometry.record(ROBOT, None, 6, 4.0, seed=0)
+
+
+def test_a_recording_is_what_the_network_will_see(recorded: dict[str, np.ndarray]) -> None:
+    size = OdometryFeatures(ROBOT).size
+    assert recorded["rows"].shape == (6, 200, size)
+    assert np.isfinite(recorded["rows"]).all()
+    assert 0.02 < np.abs(recorded["errors"]).mean() < 0.5
+    # A row looks back to the start of its own episode, never into the one before a fall.
+    starts = recorded["starts"]
+    assert (starts <= np.arange(200)).all()
+    assert (np.diff(starts, axis=1) >= 0).all()
+    changed = np.argwhere(np.diff(starts, axis=1) > 0)
+    assert len(changed)  # 10 % noise and pushes: some gait falls
+    for world, tick in changed:
+        assert starts[world, tick + 1] == tick + 1
+
+
+def test_fitting_takes_a_systematic_slip_out(recorded: dict[str, np.ndarray], capsys: pytest.CaptureFixture) -> None:
+    threads = torch.get_num_threads()
+    data = {**recorded, "errors": 0.3 * recorded["rows"][..., :3] + np.float32(0.1)}
+    network = odometry.fit(data, steps=25, seed=0)
+    torch.set_num_threads(threads)
+    ticks = np.arange(30, 200, 10)
+    windows = data["rows"][:, ticks[:, None] - OFFSETS].reshape(6, len(ticks), -1)
+    slip = data["errors"][:, ticks]
+    assert np.square(slip - network(windows)).mean() < 0.25 * np.square(slip).mean()
+    assert "corrected: rms" in capsys.readouterr().out
+
+
+def test_walks_that_cover_no_metre_do_not_count() -> None:
+    """Sway is no path: two seconds of walking sway a metre, and cover none."""
+    result = odometry.drift(ROBOT, None, None, walks=4, seconds=2.0, seed=1)
+    assert result.walks == 0
+    assert np.isnan(result.p90)
