@@ -206,8 +206,7 @@ def status(id: int, error: int = 0, data: bytes = b"") -> bytes:
 
 def fast_status(blocks: Sequence[tuple[int, int, bytes]]) -> bytes:
     """The answer to a fast read: (ID, error, data) of each servo in turn."""
-    length = 1 + sum(FAST_BLOCK + len(data) for _, _, data in blocks)
-    frame = bytearray(_HEAD.pack(HEADER, BROADCAST, length, Instruction.STATUS))
+    frame = bytearray(fast_head([len(data) for _, _, data in blocks]))
     for id, error, data in blocks:
         frame += bytes([error, id]) + data
         frame += crc16(frame).to_bytes(2, "little")
@@ -222,6 +221,11 @@ def as_status(received: Packet) -> Status | None:
     return Status(received.id, error & ~ALERT, bool(error & ALERT), received.params[1:])
 
 
+def fast_head(lengths: Sequence[int]) -> bytes:
+    """How the answer to a fast read of `lengths` bytes begins."""
+    return _HEAD.pack(HEADER, BROADCAST, 1 + FAST_BLOCK * len(lengths) + sum(lengths), Instruction.STATUS)
+
+
 def parse_fast(stream: bytes, ids: Sequence[int], lengths: Sequence[int]) -> list[Status | None]:
     """The blocks of the answer to a fast read of `lengths` bytes from `ids`; None for each that did not come whole.
 
@@ -229,8 +233,7 @@ def parse_fast(stream: bytes, ids: Sequence[int], lengths: Sequence[int]) -> lis
     on from block to block, that of a damaged one is taken as received, so that it does not spoil those after it.
     """
     blocks: list[Status | None] = [None] * len(ids)
-    length = 1 + FAST_BLOCK * len(ids) + sum(lengths)
-    head = _HEAD.pack(HEADER, BROADCAST, length, Instruction.STATUS)
+    head = fast_head(lengths)
     start = stream.find(head)
     if start < 0:
         return blocks

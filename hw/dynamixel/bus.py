@@ -1,0 +1,299 @@
+"""The half-duplex bus: one write, one sleep until the answer must have ended, one read.
+
+Every exchange has a deadline: the time on the wire, the servos' return delay, and a small margin. After anything went
+wrong the line is drained to silence before the next packet, or that would collide with what is still to come. The bus
+can be left at any moment by an exception (Ctrl-C): the next call finds the mark and cleans up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from hw.dynamixel import codec
+from hw.dynamixel.codec import MAX_ID, OVERHEAD, Packet, Parser, Reset, Status, as_status, parse_fast
+from hw.dynamixel.group import GroupRead, Request
+from hw.dynamixel.port import Port, drain
+from hw.dynamixel.tables import Item
+from hw.hal import Clock
+
+MARGIN = 0.0025  # s after the predicted end: a USB adapter's latency timer of 1 ms, and the host's own delays
+BITS = 10  # of a byte on the wire
+PING_DATA = 3  # bytes: model number, firmware
+PING_GAP_NS = 3_000_000  # that a servo may take to its turn in a broadcast ping
+EEPROM_SECONDS = 0.02  # that a servo may take to write its EEPROM before it answers
+_POLL_NS = 100_000
+_QUIET_NS = 300_000  # of silence that end a drain: several bytes at any baud in use
+_DRAIN_NS = 3_000_000  # that a drain may take within a tick
+_SETTLE_NS = 25_000_000  # of silence after a lost single answer: above the latency of an untuned adapter
+
+
+class Ping(NamedTuple):
+    """What a servo says it is."""
+
+    id: int
+    model: int
+    firmware: int
+    alert: bool
+
+
+@dataclass(slots=True)
+class Counters:
+    """What happened on the bus since it was opened."""
+
+    exchanges: int = 0
+    bytes_out: int = 0
+    bytes_in: int = 0
+    lost: int = 0  # answers that did not come, or not whole
+    recovered: int = 0  # of these, how many a second request in the same tick brought
+    refused: int = 0  # answers with an error
+    bad_crc: int = 0
+    garbage: int = 0  # bytes that belong to no packet
+    stray: int = 0  # bytes that came when nothing was due: late answers, echoes, noise
+    unexpected: int = 0  # packets that answer nothing that was asked
+    duplicates: int = 0  # second answers of a servo that say the same
+    conflicts: int = 0  # second answers that say something else: two servos with an ID
+    drains: int = 0
+    babble: int = 0  # drains that found no silence
+
+
+class Bus:
+    """Protocol 2.0 on a port. Methods raise BackendError when the port is gone; a servo that is silent is a None."""
+
+    def __init__(self, port: Port, clock: Clock, *, return_delay: float = 0.0, margin: float = MARGIN) -> None:
+        """`return_delay` [s] is the servos' setting, `margin` [s] what an answer may be later than predicted."""
+        self.port, self.clock = port, clock
+        self.counters = Counters()
+        self.return_delay = return_delay
+        self.margin = margin
+        self._parser = Parser()
+        self._dirty = True  # something may still come that must not be taken for an answer
+        self._busy_until = 0
+        self._quiet_ns = _QUIET_NS
+
+    # The control cycle -----------------------------------------------------------------------------------------------
+
+    def send(self, packet: bytes) -> None:
+        """Send what nobody answers: a sync or bulk write, an action. Returns as soon as the adapter has it."""
+        self._prepare()
+        self._busy_until = self._write(packet)
+        self._dirty = False
+
+    def read_group(self, group: GroupRead, before: bytes = b"") -> int:
+        """Read a group; those that are lost are asked once more, by a plain read. `before` goes out ahead, in the same
+        write: a packet that nobody answers. Returns how many did not answer."""
+        request: Request | None = group.begin()
+        assert request is not None
+        first = self._exchange_group(group, request, before)
+        if first:
+            request = group.again()
+            if request is not None:
+                again = self._exchange_group(group, request)
+                self.counters.recovered += len(request.ids) - len(again)
+        group.settle()
+        return len(group.ids) - sum(group.fresh)
+
+    def _exchange_group(self, group: GroupRead, request: Request, before: bytes = b"") -> list[int]:
+        self._prepare()
+        sampled = self._write(before + request.packet)
+        deadline = sampled + self._wire_ns(request.answer, len(request.ids))
+        if request.fast:
+            stream = bytearray()
+            self._collect(deadline, lambda data: _fast_done(stream, data, request))
+            for status in parse_fast(bytes(stream), request.ids, request.lengths):
+                if status is not None:
+                    self._take(group, request, status, sampled, {})
+        else:
+            seen: dict[int, Status] = {}
+
+            def done(data: bytes) -> bool:
+                for status in self._statuses(data):
+                    self._take(group, request, status, sampled, seen)
+                return len(seen) == len(request.ids)
+
+            self._collect(deadline, done)
+        lost = group.end(request)
+        self.counters.lost += len(lost)
+        self._dirty = bool(lost)
+        return lost
+
+    def _take(self, group: GroupRead, request: Request, status: Status, sampled: int, seen: dict[int, Status]) -> None:
+        if status.id in seen:
+            if seen[status.id] == status:
+                self.counters.duplicates += 1
+            else:
+                self.counters.conflicts += 1
+                group.reject(status.id)
+        elif group.accept(request, status, sampled):
+            seen[status.id] = status
+            self.counters.refused += status.error != 0
+        else:
+            self.counters.unexpected += 1
+
+    # One servo at a time ---------------------------------------------------------------------------------------------
+
+    def ping(self, id: int, tries: int = 2) -> Ping | None:
+        status = self._ask(codec.ping(id), id, PING_DATA, tries)
+        return _as_ping(status) if status else None
+
+    def read(self, id: int, address: int, length: int, tries: int = 3) -> Status | None:
+        """Read bytes. The status has an error and no data if the servo refused."""
+        return self._ask(codec.read(id, address, length), id, length, tries)
+
+    def write(self, id: int, address: int, data: bytes, tries: int = 3) -> Status | None:
+        """Write bytes, waiting as long as EEPROM takes. Its status tells whether the servo refused."""
+        return self._ask(codec.write(id, address, data), id, 0, tries, EEPROM_SECONDS)
+
+    def read_item(self, id: int, item: Item, tries: int = 3) -> int | None:
+        """Raw value of a register; None if the servo is silent or refused."""
+        status = self.read(id, item.address, item.width, tries)
+        return item.decode(status.data) if status and not status.error else None
+
+    def write_item(self, id: int, item: Item, value: int, tries: int = 3) -> bool:
+        """Whether the servo acknowledged. Raises ValueError if the value does not fit the register."""
+        status = self.write(id, item.address, item.encode(value), tries)
+        return status is not None and not status.error
+
+    def reg_write(self, id: int, address: int, data: bytes) -> Status | None:
+        """Write at the next `action`."""
+        return self._ask(codec.reg_write(id, address, data), id, 0, 1)
+
+    def action(self) -> None:
+        """Let every registered write happen, at once."""
+        self.send(codec.action())
+
+    def reboot(self, id: int) -> Status | None:
+        """Restart a servo: torque is off and RAM as after power-on, some 0.3 s later."""
+        return self._ask(codec.reboot(id), id, 0, 1)
+
+    def clear(self, id: int) -> Status | None:
+        """Forget whole turns."""
+        return self._ask(codec.clear(id), id, 0, 1)
+
+    def factory_reset(self, id: int, spare: Reset) -> Status | None:
+        return self._ask(codec.factory_reset(id, spare), id, 0, 1, EEPROM_SECONDS)
+
+    def broadcast_ping(self) -> list[Ping]:
+        """Everyone who answers, in the order that they did; an ID that answers twice is listed twice."""
+        self._prepare()
+        sent = self._write(codec.ping())
+        byte = self._byte_ns()
+        end = sent + (MAX_ID + 1) * (PING_GAP_NS + (OVERHEAD + PING_DATA) * byte)
+        found: list[Ping] = []
+
+        def done(data: bytes) -> bool:
+            found.extend(_as_ping(s) for s in self._statuses(data) if len(s.data) == PING_DATA and not s.error)
+            return False
+
+        self._collect(end, done, first=sent, poll_ns=5_000_000)
+        self._dirty = False
+        return found
+
+    def set_baud(self, baud: int) -> None:
+        """Change the port's own speed."""
+        self.clock.sleep_until(self._busy_until)
+        self.port.set_baud(baud)
+        self._dirty = True
+
+    def _ask(self, packet: bytes, id: int, length: int, tries: int, patience: float = 0.0) -> Status | None:
+        for _ in range(tries):
+            self._prepare()
+            sent = self._write(packet)
+            answer: list[Status] = []
+
+            def done(data: bytes, answer: list[Status] = answer) -> bool:
+                for status in self._statuses(data):
+                    if status.id == id and (status.error or len(status.data) == length):
+                        answer.append(status)
+                    else:
+                        self.counters.unexpected += 1
+                return bool(answer)
+
+            predicted = sent + self._wire_ns(OVERHEAD + length, 1)
+            self._collect(predicted, done, extra_ns=round(patience * 1e9))
+            if answer:
+                self._dirty = False
+                self.counters.duplicates += len(answer) - 1
+                self.counters.refused += answer[0].error != 0
+                return answer[0]
+            self.counters.lost += 1
+            self._quiet_ns = _SETTLE_NS  # a late answer to this would look like one to the next
+        return None
+
+    # The line --------------------------------------------------------------------------------------------------------
+
+    def _prepare(self) -> None:
+        """Make sure that nothing is on its way, in either direction."""
+        self.clock.sleep_until(self._busy_until)
+        if self._dirty:
+            quiet = self._quiet_ns
+            dropped, silent = drain(self.port, self.clock, quiet, quiet + _DRAIN_NS)
+            self.counters.drains += 1
+            self.counters.babble += not silent
+            self._dirty, self._quiet_ns = False, _QUIET_NS
+        else:
+            dropped = len(self.port.read())
+        self.counters.stray += dropped
+        self.counters.garbage += self._parser.pending
+        self._parser.reset()
+
+    def _write(self, packet: bytes) -> int:
+        """Write; returns when the last byte leaves. Until its answer was seen, the line counts as dirty."""
+        self._dirty = True
+        self.port.write(packet)
+        end = self.clock.now_ns() + len(packet) * self._byte_ns()
+        self.counters.exchanges += 1
+        self.counters.bytes_out += len(packet)
+        return end
+
+    def _collect(
+        self,
+        predicted: int,
+        done: Callable[[bytes], bool],
+        *,
+        extra_ns: int = 0,
+        first: int | None = None,
+        poll_ns: int = _POLL_NS,
+    ) -> None:
+        """Feed what comes to `done` until it is satisfied, or the deadline is over. The first look is when the answer
+        must have ended; it is on time if it came before we look, however late that is."""
+        deadline = predicted + round(self.margin * 1e9) + extra_ns
+        self.clock.sleep_until(predicted if first is None else first)
+        while True:
+            data = self.port.read()
+            self.counters.bytes_in += len(data)
+            if data and done(data):
+                return
+            now = self.clock.now_ns()
+            if now >= deadline:
+                return
+            self.clock.sleep_until(min(now + poll_ns, deadline))
+
+    def _statuses(self, data: bytes) -> list[Status]:
+        parser, counters = self._parser, self.counters
+        garbage, bad = parser.garbage, parser.bad_crc
+        packets: list[Packet] = parser.feed(data)
+        counters.garbage += parser.garbage - garbage
+        counters.bad_crc += parser.bad_crc - bad
+        return [status for packet in packets if (status := as_status(packet)) is not None]
+
+    def _byte_ns(self) -> int:
+        return round(BITS * 1e9 / self.port.baud)
+
+    def _wire_ns(self, size: int, answers: int) -> int:
+        return size * self._byte_ns() + round(answers * self.return_delay * 1e9)
+
+
+def _as_ping(status: Status) -> Ping:
+    data = status.data
+    return Ping(status.id, data[0] | data[1] << 8, data[2], status.alert)
+
+
+def _fast_done(stream: bytearray, data: bytes, request: Request) -> bool:
+    """Add `data` to what came of a fast frame; whether that is all of it."""
+    stream += data
+    if len(stream) < request.answer:
+        return False
+    start = stream.find(request.head)
+    return start >= 0 and len(stream) >= start + request.answer
