@@ -29,6 +29,9 @@ class GaitSettings:
     lift: float
     sway: float
     arm_swing: float  # rad for each m/s forward
+    sideways_gain: float  # soft legs drag their feet: how much longer than asked steps to the side are
+    backward_gain: float  # and steps backward
+    backward_shift: float  # m that the feet trail for each m/s backward, so that the heels come free
     max_velocity: tuple[float, float, float]  # forward, sideways, turning
     acceleration: tuple[float, float, float]  # a second
     ankle_pitch_gain: float
@@ -112,10 +115,12 @@ class Gait:
         lift = np.where(swinging, np.sin(np.pi * u) ** 2, 0.0) * activity[..., None]
 
         period = (1.0 - swing_share) * s.cycle  # that a foot stands
-        vx, vy, wz = velocity[..., None, 0], velocity[..., None, 1], velocity[..., None, 2]
+        vx, vy, wz = velocity[..., None, 0], s.sideways_gain * velocity[..., None, 1], velocity[..., None, 2]
+        backward = np.minimum(vx, 0.0)
+        vx = vx + (s.backward_gain - 1.0) * backward
         yaw = wz * period * travel
         x0, y0 = s.foot_forward, self._inverse.hip[:, 1] + self._side * s.foot_apart
-        x = x0 + (vx - wz * y0) * period * travel
+        x = x0 + s.backward_shift * backward + (vx - wz * y0) * period * travel
         y = y0 + (vy + wz * x0) * period * travel
         y = y + (s.sway * activity * np.sin(2 * np.pi * phase))[..., None]  # away from the foot that steps
         z = self._inverse.hip[:, 2] - s.height + s.lift * lift

@@ -22,6 +22,7 @@ from sim.truth import Truth
 
 _NOISE_ROWS = 64  # ticks of sensor noise drawn at a time
 _VELOCITY_NOISE = 0.02  # rad/s, standard deviation, before quantisation
+_GRAVITY = 9.81  # m/s2
 _KP, _VMAX = 4, 7  # indices in a dcmotor's gainprm
 
 
@@ -97,7 +98,7 @@ class Worlds:
             self._rngs[i] = rng
             self._place(i, draw(rng, self.robot, self.model.nbody, rng.random() < self.randomise))
         self._state_qpos[ids] = 0.0
-        self._state_qpos[ids, 2], self._state_qpos[ids, 3:7] = self._legs.stand(pose)
+        self._state_qpos[ids, 2], self._state_qpos[ids, 3:7] = self._legs.stand(pose - self._zero[ids])
         self._state_qpos[ids[:, None], self._qpos] = pose - self._zero[ids]
         self._state_qvel[ids] = 0.0
         if self.randomise > 0:
@@ -108,6 +109,9 @@ class Worlds:
         self._play[ids] = pose - self._zero[ids]
         for key, value in self._record.items():
             value[ids] = getattr(self.batch, key)[ids][:, None]
+        # The limp body has just been put down; its sensors have read a standing one for long.
+        self._record["sensordata"][ids, :, 0:3] = 0.0
+        self._record["sensordata"][ids, :, 3:6] = -_GRAVITY * self.truth.gravity[ids][:, None]
         self.ticks[ids], self._noise_block[ids] = 0, -1
 
     def _place(self, i: int, body: Body) -> None:

@@ -46,6 +46,13 @@ def velocity(s: Step) -> Array:
     return 0.5 * _kernel(error, 0.15) + 0.5 * _kernel(error, 0.05)
 
 
+def progress(s: Step) -> Array:
+    """Share of the reference's speed that is reached along its direction: it pulls where `velocity` is flat."""
+    squared = (s.reference_velocity**2).sum(-1)
+    along = (s.velocity * s.reference_velocity).sum(-1) / np.maximum(squared, 1e-6)
+    return np.where(squared > 0.03**2, np.clip(along, 0.0, 1.0), 1.0)
+
+
 def yaw_rate(s: Step) -> Array:
     """Yaw rate near the reference's."""
     error = (s.yaw_rate - s.reference_yaw_rate) ** 2
@@ -121,7 +128,7 @@ def fall(s: Step) -> Array:
 TERMS: Mapping[str, Callable[[Step], Array]] = {
     term.__name__: term
     for term in (
-        velocity, yaw_rate, pose, contact, clearance, upright, height, sway_rate, slip, level_feet, impact, target_rate,
+        velocity, progress, yaw_rate, pose, contact, clearance, upright, height, sway_rate, slip, level_feet, impact, target_rate,
         target_acceleration, effort, fall,
     )
 }  # fmt: skip

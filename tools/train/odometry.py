@@ -18,11 +18,11 @@ _MEAN_WEIGHT = 20.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
-    parser.add_argument("--policy", default="expert", help="what walks: gait, or a tracker (default: expert)")
+    parser.add_argument("--policy", default="expert", help="what walks beside the gait (default: expert)")
     parser.add_argument("--out", type=Path, default=Path("runs/odometry.safetensors"), help="checkpoint to write")
-    parser.add_argument("--worlds", type=int, default=256)
-    parser.add_argument("--seconds", type=float, default=80.0, help="of walking a world (default: %(default)s)")
-    parser.add_argument("--steps", type=int, default=4000, help="of the optimiser (default: %(default)s)")
+    parser.add_argument("--worlds", type=int, default=192)
+    parser.add_argument("--seconds", type=float, default=60.0, help="of walking a world (default: %(default)s)")
+    parser.add_argument("--steps", type=int, default=3000, help="of the optimiser (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
 
 
@@ -34,11 +34,17 @@ def main(args: argparse.Namespace) -> int:
 
     robot = load_robot(args.robot)
     tracker = None if args.policy == "gait" else load_tracker(robot, args.policy)
-    data = record(robot, tracker, args.worlds, args.seconds, args.seed)
+    on_gait = args.worlds if tracker is None else args.worlds // 3
+    data = record(robot, None, on_gait, args.seconds, args.seed)
+    if tracker is not None:  # both ways of walking, and the tracker walking on the best odometry there is
+        known = _shipped(robot)
+        tracked = record(robot, tracker, args.worlds - on_gait, args.seconds, args.seed + 1, known)
+        data = mixed(data, tracked, args.seed)
     network = fit(data, args.steps, args.seed)
     before = drift(robot, tracker, None, walks=64, seconds=30.0, seed=args.seed + 1)
     after = drift(robot, tracker, network, walks=64, seconds=30.0, seed=args.seed + 1)
-    for name, result in (("legs alone", before), ("corrected", after)):
+    baseline = drift(robot, None, network, walks=64, seconds=30.0, seed=args.seed + 1)
+    for name, result in (("legs alone", before), ("corrected", after), ("corrected, on the gait", baseline)):
         print(
             f"{name}: displacement error {100 * result.median:.1f} % of the path (median), "
             f"{100 * result.p90:.1f} % (90th percentile), yaw drift {result.yaw_p90:.3f} rad a minute "
@@ -48,7 +54,7 @@ def main(args: argparse.Namespace) -> int:
         "odometry",
         robot,
         config={"hidden": [len(bias) for _, bias in network.layers[:-1]]},
-        data=f"{args.worlds} randomised worlds of {args.seconds:g} s walked by {args.policy}, seed {args.seed}",
+        data=f"{args.worlds} randomised worlds of {args.seconds:g} s walked by gait and {args.policy}, seed {args.seed}",
         licence="Apache-2.0",
         results={"drift_p90": round(after.p90, 4), "drift_p90_legs_alone": round(before.p90, 4)},
     )
@@ -58,14 +64,33 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def record(robot: Any, tracker: Any, worlds: int, seconds: float, seed: int) -> dict[str, Array]:
+def _shipped(robot: Any) -> Any:
+    """The odometry that is there already, or None."""
+    from policy.checkpoint import CheckpointError
+    from stack.odometry import load_odometry
+
+    try:
+        return load_odometry(robot)
+    except CheckpointError:
+        return None
+
+
+def mixed(a: dict[str, Array], b: dict[str, Array], seed: int) -> dict[str, Array]:
+    """Worlds of two recordings in random order, so that those held out are of both."""
+    order = np.random.default_rng(seed).permutation(len(a["rows"]) + len(b["rows"]))
+    return {key: np.concatenate([a[key], b[key]])[order] for key in a}
+
+
+def record(
+    robot: Any, tracker: Any, worlds: int, seconds: float, seed: int, odometry: Any = None
+) -> dict[str, Array]:
     """Walk randomised worlds; returns rows `(n, ticks, features)`, starts `(n, ticks)` and errors `(n, ticks, 3)`."""
     from tqdm import trange
 
     from tools.train.fleet import Fleet
     from tools.train.walker import Walker
 
-    fleet = Fleet(robot, worlds, None, randomise=0.7, seed=seed + 1000)
+    fleet = Fleet(robot, worlds, odometry, randomise=0.7, seed=seed + 1000)
     walker = Walker(fleet, tracker)
     ticks = round(seconds * robot.rate)
     rows = np.zeros((worlds, ticks, fleet.estimator.features.size), np.float32)
