@@ -19,6 +19,7 @@ class Request:
         padded = [(id, address - pad, length + pad) for id, address, length in parts]
         self.ids = [id for id, _, _ in parts]
         self.lengths = [length for _, _, length in padded]
+        self.expected = dict(zip(self.ids, self.lengths, strict=True))
         self.pad = pad
         self.fast = fast and len(parts) > 1
         same = len({(address, length) for _, address, length in padded}) == 1
@@ -76,12 +77,13 @@ class GroupRead:
     def accept(self, request: Request, status: Status, time_ns: int) -> bool:
         """Take an answer to `request`; False if it is none."""
         i = self._index.get(status.id)
-        if i is None or status.id not in request.ids or self.fresh[i]:
+        expected = request.expected.get(status.id)
+        if i is None or expected is None or self.fresh[i]:
             return False
         if status.error:
             self.error[i], self.alert[i] = status.error, status.alert
             return True
-        if len(status.data) != request.lengths[request.ids.index(status.id)]:
+        if len(status.data) != expected:
             return False
         self.data[i], self.time_ns[i], self.fresh[i] = status.data[request.pad :], time_ns, True
         self.error[i], self.alert[i], self.misses[i] = 0, status.alert, 0
