@@ -1,0 +1,188 @@
+"""Instructions from the wire to the devices, and their replies onto it, each in its turn."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+
+from hw.dynamixel import codec
+from hw.dynamixel.codec import FAST_BLOCK, FAST_HEAD, Instruction, Packet, Parser, Status
+from sim.rig.device import Device
+from sim.rig.faults import STATUS_KINDS, Chunk, Dice
+from sim.rig.wire import FRAME_BITS, Wire, same_baud
+
+TURNAROUND_NS = 2_000  # from the last byte of a request to the first of the reply, at return delay 0
+_SILENCE_NS = 5_000_000  # a packet that stops for so long is given up
+_STATUS_BYTES = 11  # of a status without data
+_PING_BYTES = 14  # of the answer to a ping
+
+Part = tuple[int, int, int]  # ID, address, length of a read
+
+
+class Bus:
+    """Devices on a wire. Devices at another baud than the host's neither hear it nor count."""
+
+    def __init__(self, wire: Wire, dice: Dice) -> None:
+        self.wire, self.dice = wire, dice
+        self.devices: list[Device] = []
+        self.instructions = 0
+        self._parser = Parser()
+        self._heard_ns = 0
+
+    def clear(self) -> None:
+        """Forget what is half received."""
+        self._parser.reset()
+
+    def receive(self, data: bytes, baud: int, now_ns: int) -> None:
+        """Bytes of the host whose last arrived at `now_ns`."""
+        if now_ns - self._heard_ns > _SILENCE_NS:
+            self._parser.reset()
+        self._heard_ns = now_ns
+        for packet in self._parser.feed(data):
+            if packet.instruction == Instruction.STATUS:
+                continue
+            self.instructions += 1
+            listening = [d for d in self.devices if d.online(now_ns) and same_baud(d.baud, baud)]
+            for device in listening:
+                device.heard(now_ns)
+            self._dispatch(packet, listening, now_ns)
+
+    def _dispatch(self, packet: Packet, listening: list[Device], now_ns: int) -> None:
+        instruction, params = packet.instruction, packet.params
+        if instruction in (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ):
+            if len(params) > 4:
+                address, length = struct.unpack_from("<HH", params)
+                parts = [(id, address, length) for id in params[4:]]
+                self._read_group(parts, listening, instruction == Instruction.FAST_SYNC_READ, now_ns)
+        elif instruction in (Instruction.BULK_READ, Instruction.FAST_BULK_READ):
+            parts = list(struct.iter_unpack("<BHH", params[: len(params) // 5 * 5]))
+            self._read_group(parts, listening, instruction == Instruction.FAST_BULK_READ, now_ns)
+        elif instruction in (Instruction.SYNC_WRITE, Instruction.BULK_WRITE):
+            writes = _sync_writes(params) if instruction == Instruction.SYNC_WRITE else _bulk_writes(params)
+            for id, address, data in writes:
+                for device in _called(listening, id):
+                    device.write(address, data, now_ns)
+        elif packet.id == codec.BROADCAST:
+            self._broadcast(packet, listening, now_ns)
+        else:
+            for device in listening:
+                if device.shadow(packet.id) and instruction not in (Instruction.PING, Instruction.READ):
+                    device.execute(instruction, params, now_ns)
+            for device in _called(listening, packet.id):
+                baud, delay = device.baud, device.return_delay_ns  # a change of either begins after the reply
+                status = device.execute(instruction, params, now_ns)
+                if status is not None:
+                    self._send(status, now_ns + TURNAROUND_NS + delay, baud, now_ns)
+
+    def _broadcast(self, packet: Packet, listening: list[Device], now_ns: int) -> None:
+        """To everyone: only a ping is answered, by each in the slot of its ID."""
+        for device in listening:
+            baud, delay = device.baud, device.return_delay_ns
+            status = device.execute(packet.instruction, packet.params, now_ns)
+            if status is not None and packet.instruction == Instruction.PING:
+                slot = device.id * (_wire_ns(_PING_BYTES, baud) + TURNAROUND_NS)
+                self._send(status, now_ns + TURNAROUND_NS + delay + slot, baud, now_ns)
+
+    def _read_group(self, parts: Sequence[Part], listening: list[Device], fast: bool, now_ns: int) -> None:
+        """Sync and bulk reads. All sample now; each transmits when the one before it has."""
+        if fast:
+            self._read_fast(parts, listening, now_ns)
+            return
+        end = now_ns
+        for id, address, length in parts:
+            devices = _called(listening, id)
+            answered = end
+            for device in devices:
+                start = end + TURNAROUND_NS + device.return_delay_ns
+                status = _sample(device, address, length, now_ns)
+                if status is not None:
+                    answered = max(answered, self._send(status, start, device.baud, now_ns))
+            if answered == end:  # those after a silent one wait for as long as its reply would have taken
+                answered += TURNAROUND_NS + _wire_ns(_STATUS_BYTES + length, self.wire.host_baud)
+            end = answered
+
+    def _read_fast(self, parts: Sequence[Part], listening: list[Device], now_ns: int) -> None:
+        """One frame to which each adds its block. Whoever does not hear its predecessor stays silent."""
+        blocks: list[Status] = []
+        start, baud = now_ns + TURNAROUND_NS, self.wire.host_baud
+        for i, (id, address, length) in enumerate(parts):
+            devices = [device for device in _called(listening, id) if device.fast()]
+            status = _sample(devices[0], address, length, now_ns) if devices else None
+            if status is None:
+                break
+            if i == 0:
+                start += devices[0].return_delay_ns
+                baud = devices[0].baud
+            data = status.data.ljust(length, b"\0")
+            blocks.append(status._replace(data=data))
+        if not blocks:
+            return
+        silent = [(id, 0, bytes(length)) for id, _, length in parts[len(blocks) :]]
+        frame = codec.fast_status([(b.id, _error(b), b.data) for b in blocks] + silent)
+        chunks: list[Chunk] = []
+        at = 0
+        for i, block in enumerate(blocks):
+            end = at + (FAST_HEAD if i == 0 else 0) + FAST_BLOCK + len(block.data)
+            piece, at = frame[at:end], end
+            fault = self.dice.strikes(STATUS_KINDS, block.id, now_ns * 1e-9)
+            if fault is None:
+                chunks.append(Chunk(piece))
+                continue
+            chunks += self.dice.spoil(fault, block, piece, block=True)
+            if fault.kind in ("drop", "truncate"):
+                break
+        self._put(chunks, start, baud, now_ns)
+
+    def _send(self, status: Status, start_ns: int, baud: int, now_ns: int) -> int:
+        """Put a status on the wire; returns when it ends."""
+        frame = codec.status(status.id, _error(status), status.data)
+        fault = self.dice.strikes(STATUS_KINDS, status.id, now_ns * 1e-9)
+        chunks = [Chunk(frame)] if fault is None else self.dice.spoil(fault, status, frame)
+        if self.dice.strikes(("garbage",), status.id, now_ns * 1e-9) is not None:
+            chunks.insert(0, Chunk(self.dice.noise(9)))
+        return self._put(chunks, start_ns, baud, now_ns)
+
+    def _put(self, chunks: list[Chunk], start_ns: int, baud: int, now_ns: int) -> int:
+        """Chunks without a pause between them go out as one."""
+        at, joined = start_ns, bytearray()
+        for chunk in chunks:
+            if chunk.wait:
+                if joined:
+                    at = self.wire.device_sends(bytes(joined), at, baud, now_ns).end_ns
+                at, joined = at + round(chunk.wait * 1e9), bytearray()
+            joined += chunk.data
+        return self.wire.device_sends(bytes(joined), at, baud, now_ns).end_ns if joined else at
+
+
+def _sample(device: Device, address: int, length: int, now_ns: int) -> Status | None:
+    params = struct.pack("<HH", address, length)
+    return device.execute(Instruction.READ, params, now_ns)
+
+
+def _called(devices: list[Device], id: int) -> list[Device]:
+    return [device for device in devices if device.answers_to(id)]
+
+
+def _error(status: Status) -> int:
+    return int(status.error) | (codec.ALERT if status.alert else 0)
+
+
+def _wire_ns(count: int, baud: int) -> int:
+    return round(count * FRAME_BITS * 1e9 / baud)
+
+
+def _sync_writes(params: bytes) -> Iterator[tuple[int, int, bytes]]:
+    if len(params) >= 4:
+        address, length = struct.unpack_from("<HH", params)
+        for at in range(4, len(params) - length, length + 1):
+            yield params[at], address, params[at + 1 : at + 1 + length]
+
+
+def _bulk_writes(params: bytes) -> Iterator[tuple[int, int, bytes]]:
+    at = 0
+    while at + 5 <= len(params):
+        id, address, length = struct.unpack_from("<BHH", params, at)
+        data = params[at + 5 : at + 5 + length]
+        if len(data) == length:
+            yield id, address, data
+        at += 5 + length

@@ -1,0 +1,198 @@
+"""The other end of a virtual rig's control socket: its clock, its truth and its faults, for rollouts and tests only."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from hw.hal import Array, BackendError
+from hw.robot import Robot, load_robot
+from sim.model import build
+from sim.truth import Truth
+
+_START_SECONDS = 60.0
+_ANSWER_SECONDS = 60.0
+
+
+class Control:
+    """A connection to a rig. Every method raises BackendError when the rig is gone or refuses."""
+
+    def __init__(self, path: str | Path) -> None:
+        self._path = str(path)
+        self._stream = socket.socket(socket.AF_UNIX)
+        self._stream.settimeout(_ANSWER_SECONDS)
+        try:
+            self._stream.connect(self._path)
+        except OSError as error:
+            raise BackendError(f"virtual rig at {self._path}: cannot be reached: {error.strerror}") from error
+        self._file = self._stream.makefile("rb")
+
+    def call(self, op: str, **arguments: Any) -> dict[str, Any]:
+        """Send a request and wait for its answer."""
+        try:
+            self._stream.sendall(json.dumps({"op": op, **arguments}).encode() + b"\n")
+            line = self._file.readline()
+        except OSError as error:
+            raise BackendError(f"virtual rig at {self._path}: does not answer: {error}") from error
+        if not line:
+            raise BackendError(f"virtual rig at {self._path}: has ended")
+        answer: dict[str, Any] = json.loads(line)
+        if "error" in answer:
+            raise BackendError(f"virtual rig at {self._path}: {op}: {answer['error']}")
+        return answer
+
+    def close(self) -> None:
+        """Leave the rig. If this connection had locked its clock, it runs free from here."""
+        self._file.close()
+        self._stream.close()
+
+    def reset(self, seed: int, *, episode: int = 0, randomise: bool = False, pose: Array | None = None) -> None:
+        """A rig as delivered, without power, held at `pose` (default: home)."""
+        joints = None if pose is None else np.asarray(pose).tolist()
+        self.call("reset", seed=seed, episode=episode, randomise=randomise, pose=joints)
+
+    def release(self) -> None:
+        """Put the robot on its feet now. By itself it is let go when all servos have torque."""
+        self.call("release")
+
+    def hold(self) -> None:
+        """Keep holding the robot when all servos have torque, until `release`."""
+        self.call("hold", auto_release=False)
+
+    def push(self, velocity: Array) -> None:
+        """Change the base's velocity by `(2,)` m/s, world frame."""
+        self.call("push", velocity=np.asarray(velocity).tolist())
+
+    def move(self, pose: dict[str, float]) -> None:
+        """Move joints of the held robot by hand [rad]."""
+        self.call("move", pose=pose)
+
+    def press(self, buttons: int) -> None:
+        """Hold down buttons of the board; 0 lets go."""
+        self.call("press", buttons=buttons)
+
+    def inject(self, kind: str, **fault: Any) -> None:
+        """Inject a fault of `sim.rig.faults`, its times counted from now."""
+        self.call("inject", fault={"kind": kind, **fault})
+
+    def accepted(self) -> list[dict[str, Any]]:
+        """Goals, torque and gains that servos took since the last call: time_ns, joint, register, value, position."""
+        return list(self.call("accepted")["accepted"])
+
+    def servos(self) -> list[dict[str, Any]]:
+        """State of each servo, in the robot's joint order."""
+        return list(self.call("servos")["servos"])
+
+    def statistics(self) -> dict[str, Any]:
+        """Faults that struck, collisions and instructions since the reset."""
+        return self.call("statistics")
+
+
+class LockedClock:
+    """Time of a rig that stands still while the controller thinks: sleeping lets it pass."""
+
+    def __init__(self, control: Control) -> None:
+        """Raises BackendError when another connection has the rig's clock."""
+        self._control = control
+        self._now: int = control.call("lock")["now"]
+
+    def now_ns(self) -> int:
+        return self._now
+
+    def sleep_until(self, time_ns: int) -> None:
+        if time_ns > self._now:
+            self._now = self._control.call("advance", to=int(time_ns))["now"]
+
+
+class RigTruth:
+    """The truth about a rig's robot, fetched on demand."""
+
+    def __init__(self, control: Control, robot: Robot) -> None:
+        self._control = control
+        model = build(robot)
+        self._arrays = {
+            "qpos": np.zeros((1, model.nq)),
+            "qvel": np.zeros((1, model.nv)),
+            "sensordata": np.zeros((1, model.nsensordata)),
+        }
+        self._truth = Truth(model, robot, *self._arrays.values())
+
+    def fetch(self) -> Truth:
+        """The truth of now; a later call changes what this one returned."""
+        answer = self._control.call("truth")
+        for name, array in self._arrays.items():
+            array[0] = answer[name]
+        return self._truth
+
+
+class RigProcess:
+    """A virtual rig in a process of its own, which outlives this one by `linger` seconds of silence."""
+
+    def __init__(
+        self,
+        robot: str | Path = "op3",
+        *,
+        clock: Literal["real", "locked"] = "locked",
+        seed: int = 0,
+        randomise: bool = False,
+        faults: str | Path | None = None,
+        linger: float = 10.0,
+    ) -> None:
+        """Raises BackendError with the reason when the rig does not start."""
+        self.robot = load_robot(robot)
+        self._folder = tempfile.TemporaryDirectory(prefix="servoid-rig-")
+        control = str(Path(self._folder.name) / "control")
+        command = [
+            sys.executable,
+            "-m",
+            "sim.rig.server",
+            "--robot",
+            str(robot),
+            "--clock",
+            clock,
+            "--control",
+            control,
+        ]
+        command += ["--seed", str(seed), "--linger", str(linger)]
+        command += ["--randomise"] if randomise else []
+        command += ["--faults", str(faults)] if faults else []
+        # A session of its own: Ctrl-C in the terminal is meant for the controller.
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True)
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        started = json.loads(line) if line else {"error": f"ended with code {self.process.wait(_START_SECONDS)}"}
+        if "error" in started:
+            self._folder.cleanup()
+            raise BackendError(f"the virtual rig did not start: {started['error']}")
+        self.port: str = started["port"]
+        self.control_path: str = started["control"]
+        self.control = Control(self.control_path)
+
+    def truth(self) -> RigTruth:
+        return RigTruth(self.control, self.robot)
+
+    def close(self) -> None:
+        """End the rig."""
+        self.control.close()
+        self.process.terminate()
+        try:
+            self.process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+        self._folder.cleanup()
+
+    def __enter__(self) -> RigProcess:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()

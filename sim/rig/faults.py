@@ -1,0 +1,197 @@
+"""Faults of a rig, injected by time, servo and probability from a YAML scenario.
+
+seed: 3
+faults:
+  - {kind: corrupt, probability: 0.01}                # of status packets, all the time
+  - {kind: overheating, servo: l_knee, at: 2.0}       # once, 2 s after the rig began
+  - {kind: dead, servo: 14, at: 2.0, until: 2.06}
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from hw.config import ConfigError, load_yaml, nearest
+from hw.dynamixel import codec
+from hw.robot import Robot
+
+Kind = Literal[
+    "drop", "late", "truncate", "duplicate", "wrong_id", "corrupt", "error_status", "stuffed",
+    "garbage", "babble", "echo", "split", "batching",
+    "reboot", "voltage", "overheating", "encoder", "shock", "overload", "torque_off", "id_conflict", "dead",
+    "baud_mismatch", "watchdog", "imu_dead", "imu_frozen", "vanish", "vanish_in_read", "stall", "brown_out",
+    "clock_step",
+]  # fmt: skip
+KINDS: tuple[str, ...] = get_args(Kind)
+STATUS_KINDS = ("drop", "late", "truncate", "duplicate", "wrong_id", "corrupt", "error_status")
+ALERTS = {"voltage": 1, "overheating": 4, "encoder": 8, "shock": 16, "overload": 32}  # bits of the hardware error
+
+
+class Outcome(Enum):
+    """What is expected of the controller."""
+
+    ABSORBED = "absorbed"  # no effect but a counter
+    NAMED = "named"  # in the log, with the servo; the run goes on
+    FATAL = "fatal"  # named, and the robot made safe
+
+
+EXPECTED: dict[str, Outcome] = {
+    **dict.fromkeys(STATUS_KINDS, Outcome.ABSORBED),
+    **dict.fromkeys(("stuffed", "garbage", "echo", "split"), Outcome.ABSORBED),
+    **dict.fromkeys(("batching", "voltage", "encoder", "clock_step"), Outcome.NAMED),
+    **dict.fromkeys(("reboot", "overheating", "shock", "overload", "torque_off", "watchdog"), Outcome.FATAL),
+    **dict.fromkeys(("id_conflict", "dead", "baud_mismatch", "babble", "imu_dead", "imu_frozen"), Outcome.FATAL),
+    **dict.fromkeys(("vanish", "vanish_in_read", "stall", "brown_out"), Outcome.FATAL),
+}
+_NEEDS_SERVO = (*ALERTS, "reboot", "torque_off", "id_conflict", "dead", "baud_mismatch", "watchdog")
+# s of lateness, V at the servos, s of the step, s of the adapter's batch, error number
+_VALUES = {"late": 0.003, "brown_out": 5.5, "clock_step": 0.5, "batching": 0.016, "error_status": 1.0}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault. Times s since the rig began or was reset; what lasts goes on to `until`, for ever if there is none.
+
+    `probability` is of each status packet or burst that the fault can strike; for what happens once, of its happening.
+    `value` is the lateness or step [s], the voltage [V] or the error number; `expect` replaces the usual outcome.
+    """
+
+    kind: Kind
+    servo: int | str | None = None  # ID or joint; none: every one
+    at: float = 0.0
+    until: float | None = None
+    probability: float = 1.0
+    value: float | None = None
+    expect: Literal["absorbed", "named", "fatal"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"unknown fault '{self.kind}'; {nearest(self.kind, KINDS)}")
+        if not 0.0 <= self.probability <= 1.0:
+            raise ValueError(f"probability {self.probability} is not within 0 and 1")
+        if self.at < 0 or (self.until is not None and self.until <= self.at):
+            raise ValueError(f"fault {self.kind}: from {self.at} to {self.until} s is no span of time")
+        if self.kind in _NEEDS_SERVO and self.servo is None:
+            raise ValueError(f"fault {self.kind} needs a servo: its ID or its joint")
+
+    @property
+    def outcome(self) -> Outcome:
+        return EXPECTED[self.kind] if self.expect is None else Outcome(self.expect)
+
+    @property
+    def amount(self) -> float:
+        """`value`, or what is usual for the kind."""
+        return _VALUES.get(self.kind, 0.0) if self.value is None else self.value
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Faults and the seed of their dice."""
+
+    faults: tuple[Fault, ...] = ()
+    seed: int = 0
+
+
+def load_scenario(path: str | Path) -> Scenario:
+    """Load a scenario. Raises ConfigError naming file, line and key."""
+    return load_yaml(Path(path), Scenario)
+
+
+def servo_id(robot: Robot, servo: int | str) -> int:
+    """ID of a servo that a fault names by ID or by joint. Raises ConfigError."""
+    if isinstance(servo, int):
+        known = [joint.id for joint in robot.joints]
+        if servo not in known:
+            raise ConfigError(f"fault: no servo of {robot.name} has ID {servo}; known: {sorted(known)}")
+        return servo
+    for joint in robot.joints:
+        if joint.name == servo:
+            return joint.id
+    raise ConfigError(f"fault: {robot.name} has no joint '{servo}'; {nearest(servo, robot.names)}")
+
+
+@dataclass
+class Chunk:
+    """Bytes that one device sends, with the silence before them [s]."""
+
+    data: bytes
+    wait: float = 0.0
+
+
+@dataclass
+class Dice:
+    """Which faults strike when. `struck` counts by kind and servo ID (0 where no servo is concerned)."""
+
+    robot: Robot
+    scenario: Scenario
+    struck: dict[tuple[str, int], int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._faults: list[tuple[Fault, int]] = []
+        self._rng = np.random.default_rng([self.scenario.seed, 7])
+        self.pending: list[tuple[float, bool, Fault, int]] = []  # time, whether it begins, of what has yet to happen
+        for fault in self.scenario.faults:
+            self.add(fault)
+
+    def add(self, fault: Fault) -> None:
+        """Schedule a fault. Raises ConfigError for an unknown servo."""
+        id = 0 if fault.servo is None else servo_id(self.robot, fault.servo)
+        if fault.kind in STATUS_KINDS or fault.kind in ("garbage", "split"):
+            self._faults.append((fault, id))
+        elif self._rng.random() < fault.probability:
+            self.pending.append((fault.at, True, fault, id))
+            if fault.until is not None:
+                self.pending.append((fault.until, False, fault, id))
+            self.pending.sort(key=lambda entry: entry[0])
+
+    def due(self, seconds: float) -> list[tuple[bool, Fault, int]]:
+        """Faults that begin (True) or end (False) by now."""
+        due = [(begins, fault, id) for at, begins, fault, id in self.pending if at <= seconds]
+        self.pending = [entry for entry in self.pending if entry[0] > seconds]
+        for begins, fault, id in due:
+            if begins:
+                self.count(fault.kind, id)
+        return due
+
+    def count(self, kind: str, id: int) -> None:
+        self.struck[kind, id] = self.struck.get((kind, id), 0) + 1
+
+    def strikes(self, kinds: tuple[str, ...], id: int, seconds: float) -> Fault | None:
+        """The first fault of these kinds that strikes servo `id` now, if any; dice are rolled."""
+        for fault, servo in self._faults:
+            if fault.kind not in kinds or servo not in (0, id):
+                continue
+            active = fault.at <= seconds < (math.inf if fault.until is None else fault.until)
+            if active and self._rng.random() < fault.probability:
+                self.count(fault.kind, id)
+                return fault
+        return None
+
+    def noise(self, count: int) -> bytes:
+        """Random bytes."""
+        return self._rng.bytes(count)
+
+    def spoil(self, fault: Fault, status: codec.Status, frame: bytes, *, block: bool = False) -> list[Chunk]:
+        """What goes over the wire instead of `frame`, the status of a servo; `block`: its part of a fast frame."""
+        spot = int(self._rng.integers(0, max(len(frame), 1)))
+        if fault.kind == "drop":
+            return []
+        if fault.kind == "late":
+            return [Chunk(frame, fault.amount)]
+        if fault.kind == "truncate":
+            return [Chunk(frame[:spot])]
+        if fault.kind == "duplicate":
+            return [Chunk(frame), Chunk(frame)]
+        if fault.kind == "corrupt" or block:
+            flipped = bytearray(frame)
+            flipped[spot] ^= 1 << int(self._rng.integers(0, 8))
+            return [Chunk(bytes(flipped))]
+        if fault.kind == "wrong_id":
+            return [Chunk(codec.status((status.id + 1) % codec.MAX_ID, status.error, status.data))]
+        return [Chunk(codec.status(status.id, int(fault.amount)))]

@@ -1,0 +1,180 @@
+"""The body that a virtual rig's motors move: the simulated backend's model, driven by voltages and read by encoders.
+
+The motor is the actuator of `sim.model`. Its controller makes a voltage of `gain * (control - angle)`; here the gain is
+one volt a radian and the control is `angle + voltage`, so that firmware of any operating mode can drive the very same
+motor: in position mode with a P gain alone, the torque is that of the simulated backend to the last bit but rounding.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from hw.hal import Array
+from hw.legs import Legs
+from hw.robot import Robot
+from sim.model import TIMESTEP, build
+from sim.randomise import Body, draw
+from sim.truth import Truth
+
+CLEARANCE = 0.05  # m between the soles and the floor while the robot is held
+_NOISE_ROWS = 64
+_VELOCITY_NOISE = 0.02  # rad/s, as in sim.worlds
+_R, _K, _KP, _VMAX = 0, 1, 4, 7  # indices in a dcmotor's gainprm
+
+
+class Plant:
+    """One body and its sensors. Joint arrays are `(n_joints,)` in the robot's order.
+
+    While it is `held`, somebody holds the base still above the floor and keeps joints without torque in their pose;
+    joints with torque move. `release` puts it on its feet.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.model = build(robot)
+        self.data = mujoco.MjData(self.model)
+        self._legs = Legs(robot)
+        joints = [self.model.joint(name) for name in robot.names]
+        self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
+        self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
+        self._nominal = {
+            name: getattr(self.model, name).copy() for name in ("body_mass", "body_inertia", "geom_friction")
+        }
+        self.resistance = self.model.actuator_gainprm[:, _R].copy()  # Ohm, at the joint: V = R/K torque + K speed
+        self.constant = self.model.actuator_gainprm[:, _K].copy()  # V s/rad
+        self.model.actuator_gainprm[:, _KP] = self.constant / self.resistance
+        self._braking = np.array([servo.braking_torque for servo in robot.servos])
+        self._noise = np.zeros((_NOISE_ROWS, 6 + len(joints)))
+        self.truth = Truth(self.model, robot, self.data.qpos[None], self.data.qvel[None], self.data.sensordata[None])
+        self.reset(0)
+
+    def reset(self, seed: int, *, episode: int = 0, randomise: bool = False, pose: Array | None = None) -> None:
+        """Hold the robot at `pose` (default: home), every draw from the stream of this seed and episode.
+
+        The stream is used as `sim.worlds` uses it: the same seed is the same robot with the same noise.
+        """
+        self._rng = np.random.default_rng([seed, episode])
+        randomise = self._rng.random() < float(randomise)
+        self.body: Body = draw(self._rng, self.robot, self.model.nbody, randomise)
+        self.stiffness = self.body.stiffness / self.robot.servos[0].stiffness  # factor on every servo's
+        self.model.body_mass[:] = self._nominal["body_mass"] * self.body.mass
+        self.model.body_inertia[:] = self._nominal["body_inertia"] * self.body.mass[:, None]
+        self.model.geom_friction[:] = self._nominal["geom_friction"]
+        self.model.geom_friction[self.model.geom("floor").id, 0] = self.body.friction
+        mujoco.mj_setConst(self.model, self.data)
+        mujoco.mj_resetData(self.model, self.data)
+        self.held, self._noise_block, self._ticks = True, -1, 0
+        self._idle_rng = np.random.default_rng([seed, episode, 1])  # while held: the episode's stream waits
+        self._idle = self._idle_rng.standard_normal(6 + len(self.robot.joints))
+        self._joint_age = round(self.body.joint_latency / TIMESTEP)
+        self._imu_age = max(round(self.body.imu_latency / TIMESTEP) - 1, 0)  # sensor data is a substep old already
+        self._imu_span = max(round(self.robot.imu.average / TIMESTEP), 1)
+        self.place(self.robot.home if pose is None else pose)
+
+    def place(self, pose: Array) -> None:
+        """Move the joints to `pose` as by hand, and hold the robot there, still and with its history still."""
+        data = self.data
+        data.qvel[:] = 0.0
+        data.qpos[self._qpos] = pose - self.body.zero
+        data.qpos[0:2] = 0.0
+        height, data.qpos[3:7] = self._legs.stand(pose)
+        data.qpos[2] = height + CLEARANCE
+        self.held = True
+        self._play = data.qpos[self._qpos].copy()
+        self._force = np.zeros((self._joint_age + 1, self.model.nu))
+        self._angle = np.repeat(self._play[None], self._joint_age + 1, 0)
+        self._speed = np.zeros_like(self._angle)
+        mujoco.mj_forward(self.model, data)
+        gravity = -self.truth.gravity[0] * -self.model.opt.gravity[2]
+        self._imu = np.repeat(np.concatenate([np.zeros(3), gravity])[None], self._imu_age + self._imu_span, 0)
+
+    def release(self) -> None:
+        """Put the held robot on its feet where it is, and let go."""
+        if self.held:
+            height, self.data.qpos[3:7] = self._legs.stand(self.joints)
+            self.data.qpos[2] = height
+            self.data.qvel[0:6] = 0.0
+            self.held, self._ticks = False, 0
+            mujoco.mj_forward(self.model, self.data)
+
+    def step(self, volts: Array, powered: Array, supply: float) -> None:
+        """Advance by one `TIMESTEP` with `volts` across the windings of `powered` servos; the rest turn freely."""
+        data, model = self.data, self.model
+        limit = np.where(powered, self._braking, 0.0)
+        model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1] = -limit, limit
+        model.actuator_gainprm[:, _VMAX] = supply
+        data.ctrl[:] = data.qpos[self._qpos] + volts
+        if not self.held:
+            mujoco.mj_step(model, data)
+            self._ticks += 1
+        else:
+            base, still = data.qpos[:7].copy(), data.qpos[self._qpos].copy()
+            mujoco.mj_step(model, data)
+            data.qpos[:7], data.qvel[:6] = base, 0.0
+            data.qpos[self._qpos] = np.where(powered, data.qpos[self._qpos], still)
+            data.qvel[self._dof] = np.where(powered, data.qvel[self._dof], 0.0)
+            self._idle_rng.standard_normal(out=self._idle)
+        q = data.qpos[self._qpos]
+        half = self.body.backlash / 2
+        self._play = np.clip(self._play, q - half, q + half)
+        _push(self._angle, self._play)
+        _push(self._speed, data.qvel[self._dof])
+        _push(self._force, data.actuator_force)
+        if not self.held:
+            _push(self._imu, data.sensordata[:6])
+
+    def push(self, velocity: Array) -> None:
+        """Change the base's velocity by `(2,)` m/s, world frame."""
+        self.data.qvel[0:2] += velocity
+
+    @property
+    def joints(self) -> Array:
+        """True joint angles as an ideal encoder would show them, mounted as this robot's are [rad]."""
+        return self.data.qpos[self._qpos] + self.body.zero
+
+    @property
+    def joint_speed(self) -> Array:
+        """True joint speeds [rad/s]."""
+        return self.data.qvel[self._dof]
+
+    @property
+    def torque(self) -> Array:
+        """True torque of the motors [N m]."""
+        return self._force[-1]
+
+    @property
+    def encoder(self) -> tuple[Array, Array, Array]:
+        """What the servos have measured by now: angle [rad], speed [rad/s] with noise, torque [N m]."""
+        noise = _VELOCITY_NOISE * self._row()[6:]
+        return self._angle[0] + self.body.zero, self._speed[0] + noise, self._force[0]
+
+    @property
+    def imu(self) -> Array:
+        """Angular velocity [rad/s] and specific force [m/s2] `(6,)` in the base frame, with the board's errors."""
+        mean, noise, errors = self._imu[: self._imu_span].mean(0), self._row()[:6], self.robot.imu
+        gyro = _tilt(mean[:3], self.body.imu_tilt) + self.body.gyro_bias + errors.gyro_noise * noise[:3]
+        force = _tilt(mean[3:], self.body.imu_tilt) + self.body.accelerometer_bias
+        return np.concatenate([gyro, force + errors.accelerometer_noise * noise[3:]])
+
+    def _row(self) -> Array:
+        """Standard normal noise `(6 + n_joints,)` of this control tick: a second read within it gives the same."""
+        if self.held:
+            return self._idle
+        tick = int(self._ticks * TIMESTEP / self.robot.dt + 1e-6)
+        block, row = divmod(tick, _NOISE_ROWS)
+        if block != self._noise_block:
+            self._rng.standard_normal(out=self._noise)
+            self._noise_block = block
+        return self._noise[row]
+
+
+def _push(history: Array, newest: Array) -> None:
+    history[:-1] = history[1:]
+    history[-1] = newest
+
+
+def _tilt(vector: Array, angles: Array) -> Array:
+    """Turn `(3,)` by small angles `(2,)` about x and y."""
+    x, y = angles
+    return vector + np.array([y * vector[2], -x * vector[2], x * vector[1] - y * vector[0]])

@@ -1,0 +1,293 @@
+"""A virtual rig: servos and board on a wire, moved by physics, under faults; its time advances when it is told to.
+
+Events happen in order of time, physics before the bus at the same instant, so that two runs of the same bytes at the
+same times are the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from hw.dynamixel.tables import table
+from hw.hal import Array
+from hw.robot import Robot
+from sim.rig.board import Board
+from sim.rig.bus import Bus
+from sim.rig.faults import ALERTS, Dice, Fault, Scenario
+from sim.rig.motors import STEP_NS, Motors
+from sim.rig.plant import Plant
+from sim.rig.servo import CENTRE, VirtualServo
+from sim.rig.wire import Wire
+
+BROWN_OUT, BOARD_BROWN_OUT = 6.0, 4.5  # V below which a servo and the board lose power
+_LONGEST_BROWN_OUT = 0.05  # s, when the scenario does not say
+_REMEMBERED = 1_000_000  # accepted writes that are kept for whoever asks
+_BABBLE = 0.8  # share of the line that a babbling device fills
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """A write that a servo took: a goal, torque or P gain. `position` is a goal position's joint angle [rad]."""
+
+    time_ns: int
+    joint: int
+    register: str
+    value: int
+    position: float
+
+
+class Rig:
+    """The rig of `robot`. Time begins at 0; the robot is held in its home pose until all servos have torque."""
+
+    def __init__(
+        self, robot: Robot, *, seed: int = 0, randomise: bool = False, scenario: Scenario | None = None
+    ) -> None:
+        self.robot, self._scenario = robot, scenario or Scenario()
+        self.plant = Plant(robot)
+        self.motors = Motors(robot, self.plant)
+        self.now_ns = 0
+        self.auto_release = True
+        self.accepted: deque[Accepted] = deque(maxlen=_REMEMBERED)
+        self.reset(seed, randomise=randomise)
+
+    def reset(self, seed: int, *, episode: int = 0, randomise: bool = False, pose: Array | None = None) -> None:
+        """A rig as delivered, its power off, held at `pose` (default: home); time goes on, faults begin anew."""
+        self.plant.reset(seed, episode=episode, randomise=randomise, pose=pose)
+        self.motors.reset()
+        baud = getattr(self, "wire", Wire()).host_baud
+        self.wire = Wire()
+        self.wire.host_baud = baud
+        self.dice = Dice(self.robot, self._scenario)
+        self.bus = Bus(self.wire, self.dice)
+        self.port_open, self.stalled, self.skew_ns = True, False, 0
+        self._echo = self._babbles = self._cut = False
+        self._origin_ns = self.now_ns
+        self._next_step_ns = (self.now_ns // STEP_NS + 1) * STEP_NS
+        self._held_back: list[tuple[int, bytes]] = []
+        self.servos = [
+            VirtualServo(self.motors, i, servo.name, eeprom, self._record)
+            for i, (servo, eeprom) in enumerate(zip(self.robot.servos, delivered(self.robot), strict=True))
+        ]
+        codes = self.servos[0].table.bauds
+        board = {"id": self.robot.bus.board_id, "baud_rate": codes.index(self.robot.bus.baud)}
+        self.board = Board(self.motors, board, self._switch)
+        self._switch(False)
+        self.bus.devices = [*self.servos, self.board]
+
+    def _record(self, joint: int, register: str, value: int, angle: float, now_ns: int) -> None:
+        if math.isfinite(angle):
+            angles = np.zeros(len(self.servos))
+            angles[joint] = angle
+            angle = float(self.motors.joint_of(angles)[joint])
+        self.accepted.append(Accepted(now_ns, joint, register, value, angle))
+
+    def _switch(self, on: bool) -> None:
+        for servo in self.servos:
+            if not servo.dead:
+                servo.power(on, self.now_ns)
+
+    @property
+    def seconds(self) -> float:
+        """Time since the rig began or was reset."""
+        return (self.now_ns - self._origin_ns) * 1e-9
+
+    # Time
+
+    def host_sends(self, data: bytes) -> None:
+        """Bytes that the host's program wrote now."""
+        if data:
+            self.wire.host_sends(data, self.now_ns)
+
+    def next_delivery(self) -> int | None:
+        """When the host will next hear something, as far as is known."""
+        times = [at for at, _ in self._held_back[:1]]
+        wire = self.wire.next_delivery()
+        return min([*times, wire]) if wire is not None else min(times, default=None)
+
+    def next_event(self) -> int:
+        """When something happens next."""
+        others = (self.wire.next_instruction(), self.next_delivery())
+        return min([self._next_step_ns, *(at for at in others if at is not None)])
+
+    def advance(self, to_ns: int) -> bytes:
+        """Live until `to_ns`. Returns what the adapter handed to the host meanwhile."""
+        heard = bytearray()
+        while (at := self.next_event()) <= to_ns:
+            self.now_ns = max(at, self.now_ns)
+            instruction = self.wire.next_instruction()
+            if self._next_step_ns <= at:
+                self._step()
+            elif instruction is not None and instruction <= at:
+                sent = self.wire.take_instruction()
+                if self._echo:
+                    self._held_back.append((self.now_ns, bytes(sent.data)))
+                self.bus.receive(bytes(sent.data), sent.baud, self.now_ns)
+            else:
+                for data in self._deliver():
+                    heard += data
+        self.now_ns = max(to_ns, self.now_ns)
+        return bytes(heard)
+
+    def _step(self) -> None:
+        begins = self._next_step_ns - STEP_NS
+        self._next_step_ns += STEP_NS
+        self.motors.step(begins)
+        for servo in self.servos:
+            servo.guard(self.now_ns)
+        self._supply()
+        for begins_now, fault, id in self.dice.due(self.seconds):
+            self._fault(begins_now, fault, id)
+        if self._babbles:
+            count = round(_BABBLE * STEP_NS * 1e-9 * self.wire.host_baud / 10)
+            self.wire.device_sends(self.dice.noise(count), self.now_ns, self.wire.host_baud, self.now_ns)
+        if self.plant.held and self.auto_release and self.motors.firmware.powered.all():
+            self.plant.release()
+
+    def _supply(self) -> None:
+        """Devices lose power when the battery's voltage breaks down."""
+        supply = self.motors.supply
+        if supply < BROWN_OUT:
+            self._switch(False)
+            if supply < BOARD_BROWN_OUT:
+                self.board.power(False, self.now_ns)
+        else:
+            self.board.power(True, self.now_ns)
+            if self.board.get("dynamixel_power"):
+                self._switch(True)
+
+    def _deliver(self) -> Iterator[bytes]:
+        data = self.wire.take_delivery(self.now_ns)
+        while self._held_back and self._held_back[0][0] <= self.now_ns:
+            data = self._held_back.pop(0)[1] + data
+        if len(data) > 1 and self.dice.strikes(("split",), 0, self.seconds) is not None:
+            middle = len(data) // 2
+            self._held_back.append((self.now_ns + 1_000_000, data[middle:]))
+            data = data[:middle]
+        if self._cut and data:
+            data, self.port_open = data[: len(data) // 2], False
+        if not self.stalled:
+            yield data
+
+    # Faults
+
+    def inject(self, fault: Fault) -> None:
+        """Add a fault to the scenario; its times count from the rig's beginning or reset. Raises ConfigError."""
+        self.dice.add(fault)
+
+    def _fault(self, begins: bool, fault: Fault, id: int) -> None:
+        """Begin or end a fault that is a state."""
+        kind = fault.kind
+        servo = next((s for s, joint in zip(self.servos, self.robot.joints, strict=True) if joint.id == id), None)
+        if servo is not None:
+            self._servo_fault(begins, fault, servo)
+        elif kind == "stuffed":
+            for each in self.servos:
+                each.stuffed = begins
+        elif kind == "echo":
+            self._echo = begins
+        elif kind == "babble":
+            self._babbles = begins
+        elif kind == "batching":
+            self.wire.adapter_ns = round(fault.amount * 1e9) if begins else 0
+        elif kind == "imu_dead":
+            self.board.imu_dead = begins
+        elif kind == "imu_frozen":
+            self.board.imu_frozen = begins
+        elif kind == "vanish":
+            self.port_open = not begins
+        elif kind == "vanish_in_read":
+            self._cut, self.port_open = begins, self.port_open or not begins
+        elif kind == "stall":
+            self.stalled = begins
+        elif kind == "clock_step" and begins:
+            self.skew_ns += round(fault.amount * 1e9)
+        elif kind == "brown_out":
+            self.motors.sag = self.motors.open_circuit - fault.amount if begins else 0.0
+            if begins and fault.until is None:
+                end = self.seconds + _LONGEST_BROWN_OUT
+                self.dice.pending = [(end, False, fault, id), *self.dice.pending]
+
+    def _servo_fault(self, begins: bool, fault: Fault, servo: VirtualServo) -> None:
+        kind, i, firmware = fault.kind, servo.index, self.motors.firmware
+        if kind in ALERTS:
+            if not begins:
+                firmware.injected[i] &= ~ALERTS[kind]
+            elif fault.until is None:
+                firmware.error[i] |= ALERTS[kind]
+            else:
+                firmware.injected[i] |= ALERTS[kind]
+        elif kind == "stuffed":
+            servo.stuffed = begins
+        elif kind == "dead":
+            servo.kill(begins, self.now_ns)
+        elif kind == "baud_mismatch":
+            other = next(c for c, baud in enumerate(servo.table.bauds) if baud != self.robot.bus.baud and baud >= 57600)
+            servo.put("baud_rate", other if begins else servo.table.bauds.index(self.robot.bus.baud))
+        elif kind == "id_conflict":  # a neighbour answers to this servo's ID, as one from the spares box would
+            neighbour = (i + 1) % len(self.servos)
+            joint = self.robot.joints[i if begins else neighbour]
+            self.servos[neighbour].put("id", joint.id)
+        elif begins and kind == "reboot":
+            servo.reboot(self.now_ns)
+        elif begins and kind == "torque_off":
+            servo.torque_off()
+        elif begins and kind == "watchdog":
+            servo.trip()
+
+    # What tests and evaluation may know
+
+    def move(self, pose: dict[str, float]) -> None:
+        """Move joints of the held robot by hand, to angles [rad]. Raises ValueError if it stands on its own."""
+        if not self.plant.held:
+            raise ValueError("the robot is not held: reset it first")
+        joints = self.plant.joints.copy()
+        for name, angle in pose.items():
+            joints[self.robot.names.index(name)] = angle
+        self.plant.place(joints)
+
+    def servo_states(self) -> list[dict[str, Any]]:
+        """Each servo's torque, error, watchdog, gain and reachability, in the robot's joint order."""
+        f = self.motors.firmware
+        return [
+            {
+                "id": servo.id,
+                "torque": servo.torque,
+                "error": servo.get("hardware_error_status"),
+                "tripped": servo.tripped,
+                "position_p_gain": servo.get("position_p_gain"),
+                "online": servo.online(self.now_ns),
+                "temperature": float(f.winding[servo.index]),
+                "speed": float(self.plant.joint_speed[servo.index]),
+            }
+            for servo in self.servos
+        ]
+
+    def take_accepted(self) -> list[dict[str, Any]]:
+        """Writes that servos took since this was last asked, oldest first."""
+        taken = [asdict(entry) for entry in self.accepted]
+        self.accepted.clear()
+        return taken
+
+
+def delivered(robot: Robot) -> list[dict[str, int]]:
+    """EEPROM of each servo as the rig is delivered: set up for the robot, limits at the joints' ranges."""
+    values = []
+    for joint, servo in zip(robot.joints, robot.servos, strict=True):
+        tick = 2 * math.pi / servo.ticks_per_turn
+        ends = [CENTRE + joint.direction * (end - joint.zero) / tick for end in joint.range]
+        values.append(
+            {
+                "id": joint.id,
+                "baud_rate": table(servo.name).bauds.index(robot.bus.baud),
+                "return_delay_time": 0,
+                "min_position_limit": max(math.floor(min(ends)), 0),
+                "max_position_limit": min(math.ceil(max(ends)), servo.ticks_per_turn - 1),
+            }
+        )
+    return values

@@ -1,0 +1,337 @@
+"""A virtual rig in a process of its own: its serial port, its control socket, and its time.
+
+    python -m sim.rig.server --robot op3 --link /tmp/rig --control /tmp/rig.sock --clock locked
+
+The first line of standard output is a JSON object with `port` and `control`. Time is the machine's, or stands still
+until the control connection that locked it advances it. When that connection closes, the rig goes on at the machine's
+pace: servos whose controller was killed go on living.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any, Literal
+
+import numpy as np
+
+from hw.config import ConfigError
+from hw.robot import load_robot
+from sim.rig.faults import Fault, Scenario, load_scenario
+from sim.rig.rig import Rig
+from sim.rig.terminal import Terminal
+
+ClockKind = Literal["real", "locked"]
+PICK_UP_SECONDS = 3.0  # without torque anywhere, before somebody picks a free-running robot up
+_FARTHEST_BEHIND = 200_000_000  # ns that a rig hurries to catch up; of longer pauses the rest never happened
+
+
+class Connection:
+    """A control connection: requests and answers are JSON objects, one a line."""
+
+    def __init__(self, stream: socket.socket) -> None:
+        self.stream = stream
+        self._buffer = b""
+
+    def lines(self) -> list[bytes] | None:
+        """Requests that have come; None when the other side is gone."""
+        try:
+            data = self.stream.recv(1 << 20)
+        except ConnectionError:
+            return None
+        if not data:
+            return None
+        *lines, self._buffer = (self._buffer + data).split(b"\n")
+        return lines
+
+    def answer(self, values: dict[str, Any]) -> bool:
+        """Send an answer; False when the other side is gone."""
+        try:
+            self.stream.sendall(json.dumps(values).encode() + b"\n")
+        except OSError:
+            return False
+        return True
+
+
+class Server:
+    """Serves `rig`. `linger` [s]: how long to go on without a control connection and without a byte on the bus."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        *,
+        clock: ClockKind = "real",
+        link: Path | None = None,
+        control: Path | None = None,
+        linger: float | None = None,
+    ) -> None:
+        """Raises OSError when the link or the socket cannot be made."""
+        self.rig = rig
+        self.terminal = Terminal(link)
+        self._locked = clock == "locked"
+        self._linger = linger
+        self._control_path = control
+        self._listener: socket.socket | None = None
+        if control is not None:
+            control.unlink(missing_ok=True)
+            self._listener = socket.socket(socket.AF_UNIX)
+            self._listener.bind(str(control))
+            self._listener.listen()
+        self._connections: dict[int, Connection] = {}
+        self._driver: int | None = None
+        self._stalled = False
+        self._running = True
+        self._wall_ns = time.monotonic_ns()  # of rig time `_rig_ns`
+        self._rig_ns = rig.now_ns
+        self._used = time.monotonic()
+        self._limp_since: int | None = None
+
+    @property
+    def port(self) -> str:
+        return self.terminal.port
+
+    def stop(self) -> None:
+        self._running = False
+
+    def serve(self) -> None:
+        """Until `stop`, or until nobody has used the rig for the time to linger."""
+        try:
+            while self._running:
+                self._turn()
+                if self._linger is not None and not self._connections:
+                    self._running = time.monotonic() - self._used < self._linger
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        self.terminal.close()
+        for connection in self._connections.values():
+            connection.stream.close()
+        if self._listener is not None:
+            self._listener.close()
+        if self._control_path is not None:
+            self._control_path.unlink(missing_ok=True)
+
+    def _turn(self) -> None:
+        timeout = 0.2
+        if not self._locked:
+            self._exchange(self._wall_now(), visible=False)
+            self._pick_up()
+            timeout = max(0.0, (self.rig.next_event() - self._wall_now()) * 1e-9)
+        watched: list[int] = list(self._connections)
+        if self._listener is not None:
+            watched.append(self._listener.fileno())
+        if self.terminal.is_open and not self._stalled and not self._locked:
+            watched.append(self.terminal.master)
+        for ready in select.select(watched, [], [], timeout)[0]:
+            if self._listener is not None and ready == self._listener.fileno():
+                stream, _ = self._listener.accept()
+                self._connections[stream.fileno()] = Connection(stream)
+            elif ready in self._connections:
+                self._requests(ready)
+
+    def _wall_now(self) -> int:
+        """Rig time by the machine's clock."""
+        wall = time.monotonic_ns()
+        now = self._rig_ns + wall - self._wall_ns
+        if now - self.rig.now_ns > _FARTHEST_BEHIND:
+            now = self.rig.now_ns + _FARTHEST_BEHIND
+            self._wall_ns, self._rig_ns = wall, now
+        return now
+
+    def _exchange(self, to_ns: int, *, visible: bool) -> int:
+        """Let the rig live until `to_ns` with what the host has sent; returns the bytes that the host can now read."""
+        rig, terminal = self.rig, self.terminal
+        sent = b""
+        if terminal.is_open and not self._stalled:
+            sent = terminal.read()
+            rig.wire.host_baud = terminal.baud or rig.wire.host_baud
+        if visible:  # locked: what the host wrote, it wrote before time went on
+            rig.host_sends(sent)
+            heard = rig.advance(to_ns)
+        else:
+            heard = rig.advance(to_ns)
+            rig.host_sends(sent)
+        if sent:
+            self._used = time.monotonic()
+        if rig.skew_ns:
+            skew, rig.skew_ns = rig.skew_ns, 0
+            self._rig_ns += skew
+            heard += rig.advance(rig.now_ns + skew)
+        if terminal.is_open:
+            terminal.write(heard, visible=visible)
+        self._plug()
+        return len(heard)
+
+    def _plug(self) -> None:
+        """Make the port what the faults say."""
+        if self.rig.port_open != self.terminal.is_open:
+            if self.rig.port_open:
+                self.terminal.open()
+            else:
+                self.terminal.close()
+            self._stalled = False
+        if self.terminal.is_open and self.rig.stalled != self._stalled:
+            self._stalled = self.rig.stalled
+            self.terminal.stall(self._stalled)
+
+    def _pick_up(self) -> None:
+        """Nobody leaves a robot lying: without torque for a while, it is held at its home pose again."""
+        rig = self.rig
+        if rig.plant.held or rig.motors.firmware.powered.any() or self._connections:
+            self._limp_since = None
+        elif self._limp_since is None:
+            self._limp_since = rig.now_ns
+        elif rig.now_ns - self._limp_since > PICK_UP_SECONDS * 1e9:
+            rig.plant.place(rig.robot.home)
+
+    # Control
+
+    def _requests(self, number: int) -> None:
+        connection = self._connections[number]
+        lines = connection.lines()
+        for line in lines or []:
+            if not connection.answer(self._request(number, line)):
+                lines = None
+                break
+        if lines is None:
+            del self._connections[number]
+            connection.stream.close()
+            self._used = time.monotonic()
+            if self._driver == number:
+                self._driver = None
+                self._run_free()
+
+    def _run_free(self) -> None:
+        self._locked = False
+        self._wall_ns, self._rig_ns = time.monotonic_ns(), self.rig.now_ns
+
+    def _request(self, number: int, line: bytes) -> dict[str, Any]:
+        try:
+            request = json.loads(line)
+            operation: Callable[..., dict[str, Any]] = getattr(self, f"_op_{request.pop('op')}")
+            if operation.__name__ in ("_op_lock",):
+                request["number"] = number
+            return {"now": self.rig.now_ns, **operation(**request)}
+        except (ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
+            return {"error": f"{type(error).__name__}: {error}"}
+
+    def _op_hello(self) -> dict[str, Any]:
+        return {"robot": self.rig.robot.name, "port": self.port, "locked": self._locked}
+
+    def _op_lock(self, number: int) -> dict[str, Any]:
+        """From here on only this connection advances time."""
+        if self._driver not in (None, number):
+            raise ValueError("another connection has the clock")
+        self._driver, self._locked = number, True
+        return {}
+
+    def _op_advance(self, to: int) -> dict[str, Any]:
+        if not self._locked:
+            raise ValueError("the clock is not locked")
+        heard = self._exchange(max(to, self.rig.now_ns), visible=True)
+        return {"now": self.rig.now_ns, "heard": heard}
+
+    def _op_reset(
+        self, seed: int, episode: int = 0, randomise: bool = False, pose: list[float] | None = None
+    ) -> dict[str, Any]:
+        self.terminal.read() if self.terminal.is_open else None
+        array = None if pose is None else np.asarray(pose, float)
+        self.rig.reset(seed, episode=episode, randomise=randomise, pose=array)
+        self._plug()
+        return {}
+
+    def _op_release(self) -> dict[str, Any]:
+        self.rig.plant.release()
+        return {}
+
+    def _op_hold(self, auto_release: bool) -> dict[str, Any]:
+        """Whether the robot is let go as soon as all servos have torque, or only by `release`."""
+        self.rig.auto_release = auto_release
+        return {}
+
+    def _op_push(self, velocity: list[float]) -> dict[str, Any]:
+        self.rig.plant.push(np.asarray(velocity, float))
+        return {}
+
+    def _op_move(self, pose: dict[str, float]) -> dict[str, Any]:
+        self.rig.move(pose)
+        return {}
+
+    def _op_press(self, buttons: int) -> dict[str, Any]:
+        self.rig.board.buttons = int(buttons)
+        return {}
+
+    def _op_inject(self, fault: dict[str, Any]) -> dict[str, Any]:
+        """A fault whose times count from now."""
+        seconds = self.rig.seconds
+        until = fault.get("until")
+        fault = {**fault, "at": seconds + fault.get("at", 0.0), "until": None if until is None else seconds + until}
+        self.rig.inject(Fault(**fault))
+        return {}
+
+    def _op_truth(self) -> dict[str, Any]:
+        plant = self.rig.plant
+        values = {name: getattr(plant.data, name).tolist() for name in ("qpos", "qvel", "sensordata")}
+        return {**values, "held": plant.held}
+
+    def _op_accepted(self) -> dict[str, Any]:
+        return {"accepted": self.rig.take_accepted()}
+
+    def _op_servos(self) -> dict[str, Any]:
+        return {"servos": self.rig.servo_states()}
+
+    def _op_statistics(self) -> dict[str, Any]:
+        struck = [{"kind": kind, "id": id, "count": n} for (kind, id), n in self.rig.dice.struck.items()]
+        rig = self.rig
+        return {"struck": struck, "collisions": rig.wire.collisions, "instructions": rig.bus.instructions}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--robot", default="op3", help="name or file")
+    parser.add_argument("--link", type=Path, help="make a link of this name to the port")
+    parser.add_argument("--faults", type=Path, help="fault scenario (YAML)")
+    parser.add_argument("--clock", choices=("real", "locked"), default="real")
+    parser.add_argument("--control", type=Path, help="control socket")
+
+
+def build(args: argparse.Namespace, *, linger: float | None = None) -> Server:
+    """A server as the arguments say. Raises ConfigError, and OSError for a link or socket that cannot be made."""
+    scenario = load_scenario(args.faults) if args.faults else Scenario()
+    rig = Rig(load_robot(args.robot), seed=args.seed, randomise=args.randomise, scenario=scenario)
+    return Server(rig, clock=args.clock, link=args.link, control=args.control, linger=linger)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="sim.rig.server")
+    add_arguments(parser)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--randomise", action="store_true")
+    parser.add_argument("--linger", type=float)
+    args = parser.parse_args()
+    try:
+        server = build(args, linger=args.linger)
+    except (ConfigError, OSError) as error:
+        print(json.dumps({"error": str(error)}), flush=True)
+        return 2
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        server.stop()
+
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, stop)
+    print(json.dumps({"port": server.port, "control": str(args.control) if args.control else None}), flush=True)
+    server.serve()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
