@@ -90,6 +90,7 @@ class Imu:
     """Errors of the IMU: standard deviation of a sample's noise, half-width of the bias at power-on.
 
     `average` [s] is the span that its low-pass filter averages over: samples at the loop's rate alone would alias.
+    `signs` are those of a real board's axes against the base's.
     """
 
     gyro_noise: float
@@ -98,6 +99,7 @@ class Imu:
     accelerometer_bias: float
     average: float
     latency: float
+    signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)

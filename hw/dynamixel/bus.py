@@ -80,17 +80,13 @@ class Bus:
         self._busy_until = self._write(packet)
         self._dirty = False
 
-    def read_group(self, group: GroupRead, before: bytes = b"") -> int:
-        """Read a group; those that are lost are asked once more, by a plain read. `before` goes out ahead, in the same
-        write: a packet that nobody answers. Returns how many did not answer."""
-        request: Request | None = group.begin()
-        assert request is not None
-        first = self._exchange_group(group, request, before)
-        if first:
-            request = group.again()
-            if request is not None:
-                again = self._exchange_group(group, request)
-                self.counters.recovered += len(request.ids) - len(again)
+    def read_group(self, group: GroupRead, before: bytes = b"", *, again: bool = True) -> int:
+        """Read a group; those that are lost are asked once more, by a plain read, unless `again` is False. `before`
+        goes out ahead, in the same write: a packet that nobody answers. Returns how many did not answer."""
+        first = self._exchange_group(group, group.begin(), before)
+        if first and again and (request := group.again()) is not None:
+            still = self._exchange_group(group, request)
+            self.counters.recovered += len(request.ids) - len(still)
         group.settle()
         return len(group.ids) - sum(group.fresh)
 

@@ -46,6 +46,10 @@ class Units:
         angle = self._direction * (ticks - self._center) * self._tick + self._zero
         return angle - _TURN * np.round((angle - self._middle) / _TURN)
 
+    def within_turn(self, ticks: Array) -> Array:
+        """Ticks as the servo counts them once torque is on: whole turns forgotten."""
+        return ticks % self._turn
+
     def goal(self, position: Array) -> Array:
         """Goal ticks (int) of joint angles [rad]. Raises ValueError naming a joint whose angle is not finite."""
         if not np.isfinite(position).all():

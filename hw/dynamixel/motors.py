@@ -1,0 +1,170 @@
+"""Goals, gains and torque to the servos. Torque comes on only where the servo already is, and off until it says so."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+
+from hw.dynamixel import codec
+from hw.dynamixel.bus import Bus
+from hw.dynamixel.codec import SyncWriter
+from hw.dynamixel.group import GroupRead
+from hw.dynamixel.survey import Found
+from hw.dynamixel.units import Units
+from hw.dynamixel.watch import Watch
+from hw.faults import describe
+from hw.hal import Array, BackendError, Command, Mode
+
+WATCHDOG = 4  # of 20 ms: a servo that hears nothing for so long stops by itself
+TRIES = 4  # to switch torque, before it is an error
+OUTSIDE = 12  # ticks (1 degree) that a joint may be beyond its servo's limits when torque comes on
+_GAINS = struct.Struct("<HHH")  # D, I, P in the order of their registers
+_CHECKED = struct.Struct("<HHH")
+
+
+class DynamixelMotors:
+    """The writing half of the backend."""
+
+    def __init__(self, bus: Bus, found: Sequence[Found], units: Units, watch: Watch, present: GroupRead) -> None:
+        """`present` is the group of the control cycle, whose newest positions torque comes on at."""
+        table = found[0].table
+        self._bus, self._found, self._units, self._watch, self._present = bus, found, units, watch, present
+        self._ids = [servo.joint.id for servo in found]
+        self._goal = table.item("goal_position")
+        self._torque, self._watchdog = table.item("torque_enable"), table.item("bus_watchdog")
+        self._profile = table.item("profile_acceleration").address
+        self._d_gain = table.item("position_d_gain")
+        self._goals = SyncWriter(self._ids, self._goal.address, self._goal.width, signed=True)
+        self._default_d = [servo.table.item("position_d_gain").default or 0 for servo in found]
+        self._default_i = [servo.table.item("position_i_gain").default or 0 for servo in found]
+        self._gain: Array | None = None  # P gains that were sent last
+        self.on = any(servo.get("torque_enable") for servo in found)  # torque may be on
+
+    @property
+    def armed(self) -> bool:
+        """Whether torque was switched on by this program."""
+        return self._watch.armed
+
+    def write(self, command: Command) -> None:
+        """Send a command. Raises BackendError where torque does not go on or off, naming the joints."""
+        if command.mode is Mode.OFF:
+            self.off()
+        elif command.mode is Mode.DAMP:
+            if self.armed:  # a limp robot is not made stiff to be damped
+                self._send_gains(np.zeros(len(self._ids), dtype=int), damped=True)
+        else:
+            gain = self._units.gain(command.gain)
+            if not self.armed:
+                self._arm(gain)
+            goals = self._units.goal(command.position)
+            if self._gain is None or not np.array_equal(gain, self._gain):
+                self._send_gains(gain)
+            self._bus.send(self._goals.packet(goals.tolist()))
+
+    def off(self) -> None:
+        """Torque off, asked again of those that do not say that it is. Raises BackendError naming them."""
+        left = list(range(len(self._ids)))
+        for _ in range(TRIES):
+            self._write(self._watchdog.address, left, [b"\0"] * len(left))
+            self._write(self._torque.address, left, [b"\0"] * len(left))
+            left = self._unconfirmed(left, b"\0")
+            if not left:
+                self.on, self._gain = False, None
+                self._watch.expect(False)
+                return
+        raise BackendError(
+            f"{self._names(left)} did not say that torque is off: hold the robot and switch its power off"
+        )
+
+    def _arm(self, gain: Array) -> None:
+        """Torque on without a jump: goal at the present position and gains first, all checked before torque."""
+        everyone = list(range(len(self._ids)))
+        if broken := [i for i in everyone if self._watch.fault[i] & 0xFF]:
+            reasons = ", ".join(describe(int(self._watch.fault[broken[0]]) & 0xFF))
+            raise BackendError(f"{self._names(broken)} reports {reasons}: let it cool, then switch it off and on")
+        goals = self._goals_here()
+        self._watch.expect(False)
+        self._gain = None
+        for _ in range(TRIES):
+            self._write(self._watchdog.address, everyone, [b"\0"] * len(everyone))  # lifts an expired one, too
+            self._write(self._profile, everyone, [bytes(8)] * len(everyone))
+            self._send_gains(gain)
+            self._bus.send(self._goals.packet(goals))
+            unready = self._unprepared(goals, gain)
+            if not unready:
+                break
+        else:
+            raise BackendError(f"{self._names(unready)} did not take goal and gains: torque stays off")
+        self.on = True
+        left = everyone
+        for _ in range(TRIES):
+            self._write(self._torque.address, left, [b"\1"] * len(left))
+            self._write(self._watchdog.address, left, [bytes([WATCHDOG])] * len(left))
+            left = self._unconfirmed(left, b"\1", bytes([WATCHDOG]))
+            if not left:
+                self._watch.expect(True)
+                return
+        names = self._names(left)
+        self.off()
+        raise BackendError(f"{names} did not switch torque on: does it report an error? Switch its power off and on")
+
+    def _goals_here(self) -> list[int]:
+        """Goal ticks at the present position, within a turn and the servo's own limits."""
+        for _ in range(TRIES):
+            if all(self._present.fresh):
+                break
+            self._bus.read_group(self._present)
+        if lost := [i for i, fresh in enumerate(self._present.fresh) if not fresh]:
+            raise BackendError(f"{self._names(lost)} did not say where it is: torque stays off")
+        turned = [int.from_bytes((data or b"")[-4:], "little", signed=True) for data in self._present.data]
+        here = self._units.within_turn(np.array(turned))
+        lower = np.array([servo.get("min_position_limit") for servo in self._found])
+        upper = np.array([servo.get("max_position_limit") for servo in self._found])
+        outside = np.flatnonzero((here < lower - OUTSIDE) | (here > upper + OUTSIDE))
+        if outside.size:
+            raise BackendError(f"{self._names(outside.tolist())} is beyond its servo's limits: move it by hand")
+        goals: list[int] = np.clip(here, lower, upper).tolist()
+        return goals
+
+    def _send_gains(self, gain: Array, *, damped: bool = False) -> None:
+        d = [0] * len(self._ids) if damped else self._default_d
+        i = [0] * len(self._ids) if damped else self._default_i
+        values = [_GAINS.pack(*each) for each in zip(d, i, gain.tolist(), strict=True)]
+        self._write(self._d_gain.address, range(len(self._ids)), values)
+        self._gain = None if damped else gain
+
+    def _write(self, address: int, joints: Sequence[int], values: Sequence[bytes]) -> None:
+        data = {self._ids[i]: value for i, value in zip(joints, values, strict=True)}
+        self._bus.send(codec.sync_write(address, len(values[0]), data))
+
+    def _unprepared(self, goals: list[int], gain: Array) -> list[int]:
+        """Joints whose goal or P gain does not read back."""
+        start = self._d_gain.address
+        group = GroupRead([(id, start, self._goal.end - start) for id in self._ids])
+        self._bus.read_group(group)
+        left = []
+        for i, data in enumerate(group.data):
+            if (
+                data is None
+                or _CHECKED.unpack_from(data)[2] != gain[i]
+                or self._goal.decode(data[self._goal.address - start :]) != goals[i]
+            ):
+                left.append(i)
+        return left
+
+    def _unconfirmed(self, joints: Sequence[int], torque: bytes, watchdog: bytes | None = None) -> list[int]:
+        """Of `joints`, those whose torque enable (and watchdog) does not read back."""
+        start = self._torque.address
+        end = self._watchdog.end if watchdog else self._torque.end
+        group = GroupRead([(self._ids[i], start, end - start) for i in joints])
+        self._bus.read_group(group)
+        return [
+            i
+            for i, data in zip(joints, group.data, strict=True)
+            if data is None or data[:1] != torque or (watchdog is not None and data[-1:] != watchdog)
+        ]
+
+    def _names(self, joints: Sequence[int]) -> str:
+        return ", ".join(f"{self._found[i].joint.name} (ID {self._ids[i]})" for i in joints)

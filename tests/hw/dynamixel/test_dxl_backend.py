@@ -1,0 +1,394 @@
+"""The backend on a scripted bus: what it refuses, that it never moves on its own, and that it names what goes wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scripted import Memory, ScriptedBus
+
+from hw.dynamixel import codec
+from hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
+from hw.dynamixel.codec import Instruction
+from hw.dynamixel.motors import DynamixelMotors
+from hw.dynamixel.survey import as_table
+from hw.faults import REBOOTED, STOP_BUTTON, TORQUE_LOST, WATCHDOG, describe
+from hw.hal import BackendError, Command, Mode, Observation
+from hw.robot import load_robot
+
+ROBOT = load_robot("op3")
+TICK_NS = 20_000_000
+MOVING = {"goal_position", "goal_velocity", "goal_current", "goal_pwm", "torque_enable"}
+
+
+class Robot:
+    """A scripted OP3 as its file describes it, standing at home, and a loop of its own."""
+
+    def __init__(self) -> None:
+        self.servos = []
+        for joint in ROBOT.joints:
+            servo = Memory("xm430-w350", joint.id)
+            servo.put("return_delay_time", 0)
+            servo.put("present_input_voltage", 120)
+            servo.put("present_temperature", 30 + joint.id)
+            servo.put("present_position", 2048 + round(joint.home / (2 * np.pi) * 4096))
+            low, high = (joint.range[end] / (2 * np.pi) * 4096 for end in (0, 1))
+            servo.put("min_position_limit", 2048 + int(np.floor(low)))
+            servo.put("max_position_limit", 2048 + int(np.ceil(high)))
+            self.servos.append(servo)
+        self.board = Memory("opencr", 200)
+        self.line = ScriptedBus([*self.servos, self.board])
+        self.line.before_answer = lambda packet: self.live()
+        self.noise = 0
+
+    def live(self) -> None:
+        """The IMU's noise, and servos that are where they are told."""
+        self.noise += 1
+        self.board.put("acceleration_z", 16384 + self.noise % 7)
+
+    def backend(self, **options: bool) -> DynamixelBackend:
+        return DynamixelBackend(ROBOT, port=self.line, clock=self.line, **options)
+
+    def joint(self, name: str) -> Memory:
+        return self.servos[ROBOT.names.index(name)]
+
+    def moved(self) -> list[tuple[str, int]]:
+        return [write for servo in self.servos for write in servo.writes if write[0] in MOVING]
+
+
+@pytest.fixture
+def robot() -> Robot:
+    return Robot()
+
+
+def active(position: np.ndarray | None = None, gain: float = 1.0) -> Command:
+    return Command(ROBOT.home if position is None else position, np.full(20, gain), Mode.ACTIVE)
+
+
+def run(
+    robot: Robot,
+    sensors: DynamixelSensors,
+    motors: DynamixelMotors,
+    ticks: int,
+    until: Callable[[Observation], bool] = lambda o: False,
+) -> tuple[int, Observation]:
+    """Ticks until a condition holds; how many it took."""
+    for tick in range(ticks):
+        robot.line.sleep_until((robot.line.time // TICK_NS + 1) * TICK_NS)
+        observation = sensors.read()
+        if until(observation):
+            return tick + 1, observation
+        motors.write(active())
+    return ticks, observation
+
+
+# Connecting ----------------------------------------------------------------------------------------------------------
+
+
+def test_connecting_powers_reads_and_moves_nothing(robot: Robot) -> None:
+    sensors, _ = robot.backend().connect()
+    assert robot.board.get("dynamixel_power") == 1
+    assert robot.moved() == []
+    o = sensors.read()
+    np.testing.assert_allclose(o.position, ROBOT.home, atol=0.001)
+    assert (o.velocity == 0).all()
+    assert (o.effort == 0).all()
+    assert (o.age < 0.02).all()
+    assert (o.fault == 0).all()
+    assert np.isnan(o.orientation).all()
+    np.testing.assert_allclose(o.specific_force, [0, 0, 9.81], atol=0.05)
+    assert robot.moved() == []
+
+
+def test_servos_that_start_slowly_are_waited_for(robot: Robot) -> None:
+    for servo in robot.servos:
+        servo.answers = False
+    on = robot.line.time + 400_000_000
+
+    def boot(packet: codec.Packet) -> None:
+        if robot.line.time > on:
+            for servo in robot.servos:
+                servo.answers = True
+
+    robot.line.before_answer = boot
+    robot.backend().connect()
+
+
+def refusal(robot: Robot) -> str:
+    with pytest.raises(BackendError) as error:
+        robot.backend().connect()
+    assert robot.moved() == []
+    assert robot.line.gone, "a port that is of no use is given back"
+    return str(error.value)
+
+
+def test_a_missing_servo_is_named(robot: Robot) -> None:
+    robot.joint("l_knee").answers = False
+    robot.joint("r_el").answers = False
+    assert "no answer from r_el (ID 5), l_knee (ID 14)" in refusal(robot)
+
+
+def test_a_missing_board_is_named(robot: Robot) -> None:
+    robot.board.answers = False
+    assert "the board (ID 200) does not answer at 2000000" in refusal(robot)
+
+
+def test_a_wrong_model_is_refused(robot: Robot) -> None:
+    robot.joint("head_pan").put("model_number", 1060)
+    assert "head_pan (ID 19) is a xl430-w250, but the robot's file says xm430-w350" in refusal(robot)
+
+
+def test_two_servos_with_an_id_are_suspected(robot: Robot) -> None:
+    robot.line.fault = lambda id, data: [(data[:-3] + b"\x55\xaa\x55", 0)] if id == 14 else [(data, 0)]
+    message = refusal(robot)
+    assert "l_knee" in message
+    assert "two servos may have the same ID" in message
+
+
+def test_a_wrong_voltage_is_refused(robot: Robot) -> None:
+    robot.joint("l_el").put("present_input_voltage", 88)
+    assert "l_el (ID 6) has 8.8 V, outside 9.5 to 16 V" in refusal(robot)
+
+
+def test_differences_are_a_table_and_corrected_only_when_told_to(robot: Robot) -> None:
+    robot.joint("l_hip_roll").put("operating_mode", 4)
+    robot.joint("r_el").put("max_position_limit", 2100)
+    robot.joint("l_el").put("return_delay_time", 250)
+    message = refusal(robot)
+    rows = [line.split() for line in message.splitlines()[1:]]
+    assert rows[0] == ["joint", "ID", "register", "found", "wanted"]
+    assert ["l_hip_roll", "10", "operating_mode", "4", "3", "must", "be", "changed"] in rows
+    assert ["r_el", "5", "max_position_limit", "2100", "3073", "must", "be", "changed"] in rows
+    assert ["l_el", "6", "return_delay_time", "250", "0"] in rows
+    assert robot.joint("l_hip_roll").get("operating_mode") == 4
+    robot.line.gone = False
+    backend = robot.backend(fix=True)
+    backend.connect()
+    assert backend.differences == ()
+    assert robot.joint("l_hip_roll").get("operating_mode") == 3
+    assert robot.moved() == []
+
+
+def test_small_differences_are_reported_and_not_refused(robot: Robot) -> None:
+    robot.joint("l_el").put("temperature_limit", 75)
+    backend = robot.backend()
+    backend.connect()
+    assert [(d.joint, d.register, d.found, d.wanted) for d in backend.differences] == [
+        ("l_el", "temperature_limit", 75, 80)
+    ]
+    assert "l_el" in as_table(backend.differences)
+
+
+def test_registers_are_not_corrected_under_torque(robot: Robot) -> None:
+    robot.joint("l_el").put("return_delay_time", 250)
+    robot.joint("l_el").put("torque_enable", 1)
+    with pytest.raises(BackendError, match="l_el has torque on"):
+        robot.backend(fix=True).connect()
+
+
+def test_a_port_must_be_named() -> None:
+    with pytest.raises(BackendError, match="--port"):
+        DynamixelBackend(ROBOT).connect()
+
+
+# Torque --------------------------------------------------------------------------------------------------------------
+
+
+def test_torque_comes_on_where_the_servo_is(robot: Robot) -> None:
+    """Goal, gains and profile first, and the goal is the present position whatever the command says."""
+    knee = robot.joint("l_knee")
+    knee.put("present_position", 4096 + 2600)  # turned by hand while limp: it will say 2600 once torque is on
+    sensors, motors = robot.backend().connect()
+    sensors.read()
+    motors.write(active(gain=0.5))
+    names = [name for name, _ in knee.writes]
+    on = knee.writes.index(("torque_enable", 1))
+    assert names[:on] == [
+        *("bus_watchdog", "profile_acceleration", "profile_velocity"),
+        *("position_d_gain", "position_i_gain", "position_p_gain", "goal_position"),
+    ]
+    assert ("goal_position", 2600) in knee.writes[:on]
+    assert ("position_p_gain", 400) in knee.writes[:on]
+    assert knee.writes[on + 1 :] == [("bus_watchdog", 4), ("goal_position", 2048 + round(0.8524 / 2 / np.pi * 4096))]
+
+
+def test_a_joint_that_cannot_be_reached_stays_limp(robot: Robot) -> None:
+    robot.joint("l_knee").put("present_position", 100)
+    sensors, motors = robot.backend().connect()
+    sensors.read()
+    with pytest.raises(BackendError, match=r"l_knee \(ID 14\) is beyond its servo's limits"):
+        motors.write(active())
+    assert not any(servo.get("torque_enable") for servo in robot.servos)
+
+
+def test_torque_that_does_not_come_on_is_no_robot(robot: Robot) -> None:
+    sensors, motors = robot.backend().connect()
+    sensors.read()
+    ankle = robot.joint("r_ank_roll")
+    put = ankle.put
+    ankle.put = lambda name, value: put(name, 0 if name == "torque_enable" else value)  # type: ignore[method-assign]
+    with pytest.raises(BackendError, match=r"r_ank_roll \(ID 17\) did not switch torque on"):
+        motors.write(active())
+    assert not any(servo.get("torque_enable") for servo in robot.servos), "and the others are let go"
+
+
+def test_goals_and_gains_follow_the_command(robot: Robot) -> None:
+    sensors, motors = robot.backend().connect()
+    run(robot, sensors, motors, 2)
+    target = ROBOT.home + 0.1
+    sent = len(robot.line.sent)
+    motors.write(active(target))
+    assert [p.instruction for p in robot.line.sent[sent:]] == [Instruction.SYNC_WRITE], "one packet a tick"
+    elbow = robot.joint("l_el")
+    assert elbow.get("goal_position") == 2048 + round((-0.5 + 0.1) / 2 / np.pi * 4096)
+    motors.write(active(target, gain=0.25))
+    assert elbow.get("position_p_gain") == 200
+
+
+def test_damping_keeps_torque_with_no_gain_and_off_is_acknowledged(robot: Robot) -> None:
+    sensors, motors = robot.backend().connect()
+    motors.write(Command(ROBOT.home, np.ones(20), Mode.DAMP))
+    assert robot.moved() == [], "a limp robot is not made stiff to be damped"
+    run(robot, sensors, motors, 2)
+    motors.write(Command(ROBOT.home, np.ones(20), Mode.DAMP))
+    assert {(s.get("torque_enable"), s.get("position_p_gain"), s.get("position_d_gain")) for s in robot.servos} == {
+        (1, 0, 0)
+    }
+    deaf = [2]
+
+    def lose(packet: codec.Packet) -> None:
+        """The first packets to switch torque off do not reach the left knee."""
+        off = packet.instruction == Instruction.SYNC_WRITE and packet.params[:2] == b"\x40\x00"
+        robot.joint("l_knee").answers = not (off and deaf[0] > 0)
+        deaf[0] -= off
+
+    robot.line.before_answer = lose
+    motors.write(Command(ROBOT.home, np.ones(20), Mode.OFF))
+    assert deaf[0] < 0
+    assert not any(servo.get("torque_enable") for servo in robot.servos)
+
+
+def test_torque_that_does_not_go_off_is_said(robot: Robot) -> None:
+    backend = robot.backend()
+    sensors, motors = backend.connect()
+    run(robot, sensors, motors, 2)
+    robot.joint("l_knee").answers = False
+    with pytest.raises(BackendError, match=r"l_knee \(ID 14\) did not say that torque is off"):
+        backend.close()
+    assert robot.line.gone, "the port is given back all the same"
+    assert sum(servo.get("torque_enable") for servo in robot.servos) == 1
+
+
+def test_closing_lets_go(robot: Robot) -> None:
+    backend = robot.backend()
+    sensors, motors = backend.connect()
+    run(robot, sensors, motors, 2)
+    backend.close()
+    assert not any(servo.get("torque_enable") for servo in robot.servos)
+    backend.close()
+
+
+# What goes wrong -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("joint", ["head_pan", "l_knee", "r_ank_roll"])
+@pytest.mark.parametrize("fault", ["torque", "reboot", "watchdog", "overload", "quiet overload"])
+def test_what_servos_do_not_say_is_seen_within_a_few_ticks(robot: Robot, joint: str, fault: str) -> None:
+    sensors, motors = robot.backend().connect()
+    run(robot, sensors, motors, 3)
+    servo = robot.joint(joint)
+    expected = {"torque": TORQUE_LOST, "reboot": REBOOTED, "watchdog": WATCHDOG, "overload": 32, "quiet overload": 32}[
+        fault
+    ]
+    if fault == "torque":
+        servo.put("torque_enable", 0)
+    elif fault == "reboot":
+        servo.reboot()
+    elif fault == "watchdog":
+        servo.put("bus_watchdog", 255)
+    elif fault == "overload":
+        servo.put("hardware_error_status", 32)
+    else:  # a firmware that does not raise the alert bit
+        servo.put("hardware_error_status", 32)
+        robot.line.fault = lambda id, data: [(data, 0)]
+    ticks, o = run(robot, sensors, motors, 10, lambda o: bool(o.fault.any()))
+    assert ticks <= (1 if fault == "overload" else 6)
+    assert [ROBOT.names[i] for i in np.flatnonzero(o.fault)] == [joint]
+    assert o.fault.max() & expected
+    assert describe(int(o.fault.max()))
+
+
+def test_an_error_does_not_let_torque_on(robot: Robot) -> None:
+    robot.joint("l_knee").put("hardware_error_status", 4)
+    sensors, motors = robot.backend().connect()
+    assert sensors.read().fault[ROBOT.names.index("l_knee")] == 4
+    with pytest.raises(BackendError, match=r"l_knee \(ID 14\) reports overheating"):
+        motors.write(active())
+    assert not any(servo.get("torque_enable") for servo in robot.servos)
+
+
+def test_every_temperature_and_voltage_comes_round(robot: Robot) -> None:
+    sensors, motors = robot.backend().connect()
+    seen = np.full(20, np.nan)
+    for _ in range(5):
+        _, o = run(robot, sensors, motors, 1)
+        assert np.isfinite(o.temperature).sum() == 4, "what was not read is not invented"
+        seen = np.where(np.isfinite(o.temperature), o.temperature, seen)
+    np.testing.assert_array_equal(seen, [30 + joint.id for joint in ROBOT.joints])
+
+
+def test_a_silent_servo_is_nan_and_ages_and_the_others_stay(robot: Robot) -> None:
+    sensors, motors = robot.backend().connect()
+    run(robot, sensors, motors, 2)
+    knee = ROBOT.names.index("l_knee")
+    robot.servos[knee].answers = False
+    ages = []
+    for _ in range(4):
+        _, o = run(robot, sensors, motors, 1)
+        assert np.flatnonzero(np.isnan(o.position)).tolist() == [knee]
+        ages.append(o.age[knee])
+        assert np.delete(o.age, knee).max() < 0.02
+        assert robot.line.time % TICK_NS < TICK_NS * 0.75, "the tick is not missed"
+    assert np.diff(ages) == pytest.approx([0.02] * 3, abs=0.006)  # the first tick took longer
+
+
+@pytest.mark.parametrize("kind", ["dead", "frozen", "silent"])
+def test_an_imu_that_does_not_live_is_not_believed(robot: Robot, kind: str) -> None:
+    sensors, motors = robot.backend().connect()
+    run(robot, sensors, motors, 2)
+    if kind == "silent":
+        robot.board.answers = False
+    else:
+        robot.line.before_answer = None
+        if kind == "dead":
+            robot.board.put("acceleration_z", 0)
+    ticks, o = run(robot, sensors, motors, 10, lambda o: bool(np.isnan(o.specific_force).all()))
+    assert ticks <= 4
+    _, o = run(robot, sensors, motors, 3)
+    assert o.imu_age > 0.05
+    assert np.isfinite(o.position).all()
+
+
+def test_the_boards_button_stops_the_robot(robot: Robot) -> None:
+    sensors, motors = robot.backend().connect()
+    run(robot, sensors, motors, 2)
+    robot.board.put("button", 1)
+    _, o = run(robot, sensors, motors, 1)
+    assert (o.fault & STOP_BUTTON).all()
+    robot.board.put("button", 0)
+    _, o = run(robot, sensors, motors, 1)
+    assert (o.fault & STOP_BUTTON).all(), "letting go does not start it again"
+
+
+def test_a_port_that_vanishes_is_said(robot: Robot) -> None:
+    backend = robot.backend()
+    sensors, motors = backend.connect()
+    run(robot, sensors, motors, 2)
+    robot.line.gone = True
+    with pytest.raises(BackendError, match="gone"):
+        sensors.read()
+    with pytest.raises(BackendError, match="gone"):
+        motors.write(active())
+    with pytest.raises(BackendError, match="gone"):
+        backend.close()
