@@ -23,6 +23,7 @@ _SAMPLE = 0.001  # s, the firmware's own period, which its I and D gains are per
 AMBIENT = 25.0  # degrees C
 _WINDING_CAPACITY, _CASE_CAPACITY = 8.0, 70.0  # J/K: some 20 g of copper and iron; the rest of 82 g
 _WINDING_TO_CASE, _CASE_TO_AIR = 3.5, 5.5  # K/W
+_NO_RAMP = 1e9  # rad/s2: any speed within a step
 _STALL_SECONDS = 1.0  # full output without motion for so long is an overload
 _STALL_SPEED = 0.05  # of the no-load speed
 
@@ -150,11 +151,11 @@ class Firmware:
             self.reference_speed = np.zeros(self.n)
             return
         left = self.goal_position - self.reference
-        with np.errstate(invalid="ignore"):
-            braking = np.sqrt(2 * self._ramp * np.abs(left))  # the speed from which there is still room to stop
-            wanted = np.sign(left) * np.minimum(np.minimum(self._cruise, braking), np.abs(left) / TIMESTEP)
-            change = np.clip(wanted - self.reference_speed, -self._ramp * TIMESTEP, self._ramp * TIMESTEP)
-        speed = np.where(np.isinf(self._ramp), wanted, self.reference_speed + change)
+        ramp = np.where(np.isinf(self._ramp), _NO_RAMP, self._ramp)
+        braking = np.sqrt(2 * ramp * np.abs(left))  # the speed from which there is still room to stop
+        wanted = np.sign(left) * np.minimum(np.minimum(self._cruise, braking), np.abs(left) / TIMESTEP)
+        change = np.clip(wanted - self.reference_speed, -ramp * TIMESTEP, ramp * TIMESTEP)
+        speed = self.reference_speed + change
         step = speed * TIMESTEP
         arrived = free | (np.abs(left) <= np.abs(step))
         self.reference = np.where(arrived, self.goal_position, self.reference + step)

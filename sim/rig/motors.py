@@ -50,8 +50,8 @@ class Motors:
         self.sag = 0.0  # V below that: a fault
         self.supply = self.open_circuit
         self.current = IDLE_CURRENT * len(self._zero)  # A drawn by all servos
-        self.steps = 0
-        self._sense()
+        self.steps = 0  # samples taken
+        self.sense()
 
     def angle_of(self, joint: Array) -> Array:
         """Servo angles of joint angles, both rad."""
@@ -70,11 +70,11 @@ class Motors:
         draw = firmware.settle(self._direction * plant.torque, self._direction * plant.joint_speed, self.supply)
         self.current = float(draw.sum()) + IDLE_CURRENT * firmware.n
         self.supply = max(self.open_circuit - self.sag - BATTERY_RESISTANCE * float(draw.sum()), 0.0)
-        self.steps += 1
-        self._sense()
+        self.sense()
 
-    def _sense(self) -> None:
-        """Take what the servos can know by now."""
+    def sense(self) -> None:
+        """Take what the servos can know by now. Call it after the body was moved by hand."""
+        self.steps += 1
         angle, speed, torque = self.plant.encoder
         f = self.firmware
         self.angle = self.angle_of(angle)

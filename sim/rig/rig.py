@@ -249,7 +249,12 @@ class Rig:
         joints = self.plant.joints.copy()
         for name, angle in pose.items():
             joints[self.robot.names.index(name)] = angle
-        self.plant.place(joints)
+        self.place(joints)
+
+    def place(self, pose: Array) -> None:
+        """Pick the robot up and hold it at `pose` `(n_joints,)` rad."""
+        self.plant.place(pose)
+        self.motors.sense()
 
     def servo_states(self) -> list[dict[str, Any]]:
         """Each servo's torque, error, watchdog, gain and reachability, in the robot's joint order."""

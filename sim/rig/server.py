@@ -191,7 +191,7 @@ class Server:
         elif self._limp_since is None:
             self._limp_since = rig.now_ns
         elif rig.now_ns - self._limp_since > PICK_UP_SECONDS * 1e9:
-            rig.plant.place(rig.robot.home)
+            rig.place(rig.robot.home)
 
     # Control
 

@@ -1,0 +1,37 @@
+"""A rig in this process, new for every test."""
+
+from __future__ import annotations
+
+import pytest
+from rig_host import Host
+
+from hw.robot import Robot, load_robot
+from sim.rig.faults import Scenario
+from sim.rig.rig import Rig
+
+
+@pytest.fixture(scope="session")
+def robot() -> Robot:
+    return load_robot()
+
+
+@pytest.fixture(scope="session")
+def shared_rig(robot: Robot) -> Rig:
+    return Rig(robot)
+
+
+@pytest.fixture
+def rig(shared_rig: Rig) -> Rig:
+    shared_rig._scenario = Scenario()
+    shared_rig.auto_release = True
+    shared_rig.reset(0)
+    shared_rig.accepted.clear()
+    return shared_rig
+
+
+@pytest.fixture
+def host(rig: Rig, robot: Robot) -> Host:
+    """A host whose servos have power."""
+    host = Host(rig, robot)
+    host.start()
+    return host
