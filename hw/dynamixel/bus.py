@@ -18,7 +18,8 @@ from hw.dynamixel.port import Port, drain
 from hw.dynamixel.tables import Item
 from hw.hal import Clock
 
-MARGIN = 0.0025  # s after the predicted end: a USB adapter's latency timer of 1 ms, and the host's own delays
+MARGIN = 0.0035  # s after the predicted end: a USB adapter's latency timer of 1 ms, and what may hold up host or servo
+GAP_NS = 2_000  # before an answer, at return delay 0
 BITS = 10  # of a byte on the wire
 PING_DATA = 3  # bytes: model number, firmware
 PING_GAP_NS = 3_000_000  # that a servo may take to its turn in a broadcast ping
@@ -93,7 +94,7 @@ class Bus:
     def _exchange_group(self, group: GroupRead, request: Request, before: bytes = b"") -> list[int]:
         self._prepare()
         sampled = self._write(before + request.packet)
-        deadline = sampled + self._wire_ns(request.answer, len(request.ids))
+        deadline = sampled + self._wire_ns(request.answer, len(request.ids), gaps=1 if request.fast else None)
         if request.fast:
             stream = bytearray()
             self._collect(deadline, lambda data: _fast_done(stream, data, request))
@@ -277,8 +278,10 @@ class Bus:
     def _byte_ns(self) -> int:
         return round(BITS * 1e9 / self.port.baud)
 
-    def _wire_ns(self, size: int, answers: int) -> int:
-        return size * self._byte_ns() + round(answers * self.return_delay * 1e9)
+    def _wire_ns(self, size: int, answers: int, gaps: int | None = None) -> int:
+        """How long so many bytes of so many answers take; a fast frame has one gap for all."""
+        delays = round(answers * self.return_delay * 1e9)
+        return size * self._byte_ns() + delays + (answers if gaps is None else gaps) * GAP_NS
 
 
 def _as_ping(status: Status) -> Ping:

@@ -71,6 +71,8 @@ class GroupRead:
 
     def again(self) -> Request | None:
         """A plain request to those that did not answer, or None if there is nobody worth asking again."""
+        if not any(self.fresh) and all(self.misses):
+            return None  # nobody there, again: it is the line
         lost = tuple(i for i in self._order if not self.fresh[i] and self.misses[i] <= PATIENCE)
         return self._request(lost, False) if lost else None
 

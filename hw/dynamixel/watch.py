@@ -38,29 +38,31 @@ class Watch:
         slow, slow_length = self._voltage.address, self._heat.end - self._voltage.address
         self._monitors = [(b, GroupRead([(self._ids[i], start, length) for i in b])) for b in blocks]
         self._slow = [(b, GroupRead([(self._ids[i], slow, slow_length) for i in b])) for b in blocks]
-        self._turn = self._slow_turn = 0
+        self._turn = 0
         self.armed = False  # whether torque is meant to be on
         self.fault: Array = np.array([servo.get("hardware_error_status") for servo in found], dtype=np.int64)
         self.temperature: Array = np.full(n, np.nan)  # degrees C, of the newest look only
         self.voltage: Array = np.full(n, np.nan)  # V
 
     def look(self, alerts: Sequence[bool], *, hurry: bool = False) -> None:
-        """One tick's look. `alerts` `(n_joints,)` are the alert bits of this tick's answers. In a `hurry`, when answers
-        were lost, heat and voltage wait for a better tick."""
+        """One tick's look. `alerts` `(n_joints,)` are the alert bits of this tick's answers. In a `hurry`, when the
+        tick was spent on waiting for a servo that is silent, only alerts are looked into."""
         self.temperature[:], self.voltage[:] = np.nan, np.nan
-        block, group = self._monitors[self._turn % len(self._monitors)]
-        self._turn += 1
+        if not hurry:
+            self._monitor()
+            self._measure()
+        self._explain(alerts)
+
+    def _monitor(self) -> None:
+        block, group = self._monitors[self._turn]
         self._bus.read_group(group, again=False)
         for i, data, fresh in zip(block, group.data, group.fresh, strict=True):
             if fresh and data is not None:
                 self._judge(i, data)
-        self._explain(alerts)
-        if not hurry:
-            self._measure()
 
     def _measure(self) -> None:
-        block, group = self._slow[self._slow_turn % len(self._slow)]
-        self._slow_turn += 1
+        block, group = self._slow[self._turn]
+        self._turn = (self._turn + 1) % len(self._slow)
         self._bus.read_group(group, again=False)
         for i, data, fresh in zip(block, group.data, group.fresh, strict=True):
             if fresh and data is not None:

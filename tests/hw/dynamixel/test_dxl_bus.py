@@ -8,7 +8,7 @@ import pytest
 from scripted import BYTE_NS, Memory, ScriptedBus
 
 from hw.dynamixel import codec
-from hw.dynamixel.bus import Bus
+from hw.dynamixel.bus import GAP_NS, Bus
 from hw.dynamixel.codec import Instruction
 from hw.dynamixel.group import GroupRead
 from hw.hal import BackendError
@@ -41,7 +41,7 @@ def test_a_cycle_is_one_write_and_ends_on_time(fast: bool) -> None:
     assert bus.read_group(group, before) == 0
     assert positions(group) == [1000 + id for id in IDS]
     request, answer = 14 + len(IDS), 8 + 14 * 20 if fast else 21 * 20
-    assert line.time - began == (len(before) + request + answer) * BYTE_NS
+    assert line.time - began == (len(before) + request + answer) * BYTE_NS + GAP_NS * (1 if fast else 20)
     assert [p.instruction for p in line.sent] == [
         Instruction.SYNC_WRITE,
         Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ,
@@ -124,7 +124,7 @@ def test_after_a_fault_the_line_is_drained_before_the_next_packet() -> None:
     line, bus = rig(3)
     group = GroupRead([(i, 126, 10) for i in (1, 2, 3)])
     bus.read_group(group)
-    line.fault = lambda id, data: [(data, 2_600_000)] if len(line.sent) == 2 else [(data, 0)]  # just too late
+    line.fault = lambda id, data: [(data, 3_600_000)] if len(line.sent) == 2 else [(data, 0)]  # just too late
     assert bus.read_group(group) == 0
     assert positions(group) == [1001, 1002, 1003]
     assert line.collisions == 0

@@ -1,0 +1,184 @@
+"""The backend on the virtual rig, byte for byte and in its own time: it stands, and faults are absorbed or named."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+import pytest
+
+from hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
+from hw.dynamixel.motors import DynamixelMotors
+from hw.faults import TORQUE_LOST, WATCHDOG
+from hw.hal import Command, Mode, Observation
+from hw.robot import load_robot
+from sim.rig.faults import Fault
+from sim.rig.rig import Rig
+
+ROBOT = load_robot("op3")
+TICK_NS = 20_000_000
+STALE = 0.06  # s: three ticks, after which the guard damps
+KNEE = ROBOT.names.index("l_knee")
+
+
+class Line:
+    """A rig in the same process as a Port and a Clock."""
+
+    name = "rig"
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig, self._heard = rig, b""
+        rig.wire.host_baud = ROBOT.bus.baud
+
+    @property
+    def baud(self) -> int:
+        return self.rig.wire.host_baud
+
+    def now_ns(self) -> int:
+        return self.rig.now_ns
+
+    def sleep_until(self, time_ns: int) -> None:
+        if time_ns > self.rig.now_ns:
+            self._heard += self.rig.advance(time_ns)
+
+    def set_baud(self, baud: int) -> None:
+        self.rig.wire.host_baud = baud
+
+    def write(self, data: bytes) -> None:
+        self.rig.host_sends(data)
+
+    def read(self) -> bytes:
+        heard, self._heard = self._heard, b""
+        return heard
+
+    def close(self) -> None: ...
+
+
+class Standing:
+    """A rig that stands at home with torque on."""
+
+    def __init__(self) -> None:
+        self.rig = Rig(ROBOT)
+        self.line = Line(self.rig)
+        self.backend = DynamixelBackend(ROBOT, port=self.line, clock=self.line)
+        self.sensors: DynamixelSensors
+        self.motors: DynamixelMotors
+        self.sensors, self.motors = self.backend.connect()
+        self.run(5)
+
+    def run(self, ticks: int) -> list[Observation]:
+        seen = []
+        for _ in range(ticks):
+            self.line.sleep_until((self.line.now_ns() // TICK_NS + 1) * TICK_NS)
+            seen.append(self.sensors.read())
+            self.motors.write(Command(ROBOT.home, np.ones(20), Mode.ACTIVE))
+        return seen
+
+    def torque(self) -> int:
+        return sum(servo.get("torque_enable") for servo in self.rig.servos)
+
+
+@pytest.fixture
+def standing() -> Standing:
+    return Standing()
+
+
+def test_it_connects_as_delivered_stands_and_lets_go(standing: Standing) -> None:
+    assert standing.backend.differences == ()
+    assert standing.torque() == 20
+    o = standing.run(30)[-1]
+    assert np.abs(o.position - ROBOT.home).max() < 0.15
+    np.testing.assert_allclose(np.linalg.norm(o.specific_force), 9.81, atol=1.0)
+    assert o.effort[KNEE] < -0.02 or o.effort[KNEE] > 0.02, "a bent knee that stands carries something"
+    assert (o.fault == 0).all()
+    goals = [a for a in standing.rig.accepted if a.register == "goal_position"]
+    assert len(goals) > 20 * 30
+    limits = [(ROBOT.lower[a.joint] - 0.01 <= a.position <= ROBOT.upper[a.joint] + 0.01) for a in goals]
+    assert all(limits)
+    counters = standing.backend.counters
+    assert counters.bad_crc == counters.unexpected == counters.conflicts == counters.babble == 0
+    standing.backend.close()
+    assert standing.torque() == 0
+
+
+@pytest.mark.parametrize("kind", ["drop", "corrupt", "truncate", "duplicate", "wrong_id", "late", "split", "garbage"])
+def test_what_happens_on_any_bus_is_absorbed(standing: Standing, kind: str) -> None:
+    """At 2 % of all answers no joint is ever without a sample for long, and no value is wrong."""
+    standing.rig.inject(Fault(kind=kind, at=standing.rig.seconds, probability=0.02))  # type: ignore[arg-type]
+    before = standing.run(1)[0].position
+    for o in standing.run(60):
+        assert o.age.max() < STALE
+        assert not o.fault.any()
+        off = np.nanmax(np.abs(o.position - before))
+        assert off < 0.2, "it stands still: another servo's angle would be far off"
+    assert standing.torque() == 20
+
+
+@pytest.mark.parametrize(
+    ("kind", "bits"), [("torque_off", TORQUE_LOST), ("watchdog", WATCHDOG), ("overheating", 4), ("overload", 32)]
+)
+def test_what_a_servo_keeps_to_itself_is_named(standing: Standing, kind: str, bits: int) -> None:
+    standing.rig.inject(Fault(kind=kind, servo="l_knee", at=standing.rig.seconds))  # type: ignore[arg-type]
+    faults = [o.fault for o in standing.run(10)]
+    first = next(i for i, fault in enumerate(faults) if fault.any())
+    assert first <= 7
+    assert np.flatnonzero(faults[first]).tolist() == [KNEE]
+    assert faults[first][KNEE] & bits
+
+
+@pytest.mark.parametrize("kind", ["dead", "baud_mismatch", "reboot"])
+def test_a_servo_that_goes_silent_is_seen_by_its_age_alone(standing: Standing, kind: str) -> None:
+    standing.rig.inject(Fault(kind=kind, servo="l_knee", at=standing.rig.seconds))  # type: ignore[arg-type]
+    o = standing.run(6)[-1]
+    assert np.flatnonzero(o.age > STALE).tolist() == [KNEE]
+    assert np.isnan(o.position[KNEE])
+    assert np.isfinite(np.delete(o.position, KNEE)).all()
+
+
+def test_an_imu_that_dies_is_seen_by_its_age(standing: Standing) -> None:
+    standing.rig.inject(Fault(kind="imu_frozen", at=standing.rig.seconds))
+    o = standing.run(8)[-1]
+    assert o.imu_age > STALE
+    assert np.isnan(o.specific_force).all()
+
+
+def test_a_host_that_stops_is_stopped_by_the_watchdog(standing: Standing) -> None:
+    """Nobody sends anything any more: within 100 ms every servo has stopped by itself."""
+    standing.line.sleep_until(standing.line.now_ns() + 100_000_000)
+    assert all(servo.get("bus_watchdog") == 255 for servo in standing.rig.servos)
+    o = standing.run(7)[-1]
+    assert (o.fault & WATCHDOG).all()
+
+
+def test_two_runs_are_the_same_bit_for_bit() -> None:
+    first, second = (Standing().run(15)[-1] for _ in range(2))
+    np.testing.assert_array_equal(first.position, second.position)
+    np.testing.assert_array_equal(first.specific_force, second.specific_force)
+    assert first.time_ns == second.time_ns
+
+
+@pytest.mark.parametrize("call", range(0, 60, 3))
+def test_an_interrupt_at_any_instant_still_lets_torque_off(standing: Standing, call: int) -> None:
+    """Between any two things that the backend does with its port or clock: the next command must get through."""
+    left = [call]
+
+    def counted(method):  # type: ignore[no-untyped-def]
+        def wrapper(*arguments):  # type: ignore[no-untyped-def]
+            left[0] -= 1
+            if left[0] == 0:
+                raise KeyboardInterrupt
+            return method(*arguments)
+
+        return wrapper
+
+    line = standing.line
+    methods = {name: getattr(line, name) for name in ("read", "write", "sleep_until")}
+    for name, method in methods.items():
+        setattr(line, name, counted(method))
+    with contextlib.suppress(KeyboardInterrupt):
+        standing.run(6)
+    for name, method in methods.items():
+        setattr(line, name, method)
+    standing.motors.write(Command(ROBOT.home, np.ones(20), Mode.DAMP))
+    standing.motors.write(Command(ROBOT.home, np.ones(20), Mode.OFF))
+    assert standing.torque() == 0
