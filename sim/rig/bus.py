@@ -124,7 +124,7 @@ class Bus:
         for i, block in enumerate(blocks):
             end = at + (FAST_HEAD if i == 0 else 0) + FAST_BLOCK + len(block.data)
             piece, at = frame[at:end], end
-            fault = self.dice.strikes(STATUS_KINDS, block.id, now_ns * 1e-9)
+            fault = self.dice.strikes(STATUS_KINDS, block.id, now_ns)
             if fault is None:
                 chunks.append(Chunk(piece))
                 continue
@@ -136,9 +136,9 @@ class Bus:
     def _send(self, status: Status, start_ns: int, baud: int, now_ns: int) -> int:
         """Put a status on the wire; returns when it ends."""
         frame = codec.status(status.id, _error(status), status.data)
-        fault = self.dice.strikes(STATUS_KINDS, status.id, now_ns * 1e-9)
+        fault = self.dice.strikes(STATUS_KINDS, status.id, now_ns)
         chunks = [Chunk(frame)] if fault is None else self.dice.spoil(fault, status, frame)
-        if self.dice.strikes(("garbage",), status.id, now_ns * 1e-9) is not None:
+        if self.dice.strikes(("garbage",), status.id, now_ns) is not None:
             chunks.insert(0, Chunk(self.dice.noise(9)))
         return self._put(chunks, start_ns, baud, now_ns)
 

@@ -130,6 +130,7 @@ class Dice:
 
     robot: Robot
     scenario: Scenario
+    origin_ns: int = 0  # rig time at which the scenario's time begins
     struck: dict[tuple[str, int], int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -150,8 +151,13 @@ class Dice:
                 self.pending.append((fault.until, False, fault, id))
             self.pending.sort(key=lambda entry: entry[0])
 
-    def due(self, seconds: float) -> list[tuple[bool, Fault, int]]:
+    def seconds(self, now_ns: int) -> float:
+        """Time of the scenario."""
+        return (now_ns - self.origin_ns) * 1e-9
+
+    def due(self, now_ns: int) -> list[tuple[bool, Fault, int]]:
         """Faults that begin (True) or end (False) by now."""
+        seconds = self.seconds(now_ns)
         due = [(begins, fault, id) for at, begins, fault, id in self.pending if at <= seconds]
         self.pending = [entry for entry in self.pending if entry[0] > seconds]
         for begins, fault, id in due:
@@ -162,8 +168,9 @@ class Dice:
     def count(self, kind: str, id: int) -> None:
         self.struck[kind, id] = self.struck.get((kind, id), 0) + 1
 
-    def strikes(self, kinds: tuple[str, ...], id: int, seconds: float) -> Fault | None:
+    def strikes(self, kinds: tuple[str, ...], id: int, now_ns: int) -> Fault | None:
         """The first fault of these kinds that strikes servo `id` now, if any; dice are rolled."""
+        seconds = self.seconds(now_ns) if self._faults else 0.0
         for fault, servo in self._faults:
             if fault.kind not in kinds or servo not in (0, id):
                 continue

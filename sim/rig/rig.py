@@ -63,11 +63,10 @@ class Rig:
         baud = getattr(self, "wire", Wire()).host_baud
         self.wire = Wire()
         self.wire.host_baud = baud
-        self.dice = Dice(self.robot, self._scenario)
+        self.dice = Dice(self.robot, self._scenario, self.now_ns)
         self.bus = Bus(self.wire, self.dice)
         self.port_open, self.stalled, self.skew_ns = True, False, 0
         self._echo = self._babbles = self._cut = False
-        self._origin_ns = self.now_ns
         self._next_step_ns = (self.now_ns // STEP_NS + 1) * STEP_NS
         self._held_back: list[tuple[int, bytes]] = []
         self.servos = [
@@ -95,7 +94,7 @@ class Rig:
     @property
     def seconds(self) -> float:
         """Time since the rig began or was reset."""
-        return (self.now_ns - self._origin_ns) * 1e-9
+        return self.dice.seconds(self.now_ns)
 
     # Time
 
@@ -141,7 +140,7 @@ class Rig:
         for servo in self.servos:
             servo.guard(self.now_ns)
         self._supply()
-        for begins_now, fault, id in self.dice.due(self.seconds):
+        for begins_now, fault, id in self.dice.due(self.now_ns):
             self._fault(begins_now, fault, id)
         if self._babbles:
             count = round(_BABBLE * STEP_NS * 1e-9 * self.wire.host_baud / 10)
@@ -165,7 +164,7 @@ class Rig:
         data = self.wire.take_delivery(self.now_ns)
         while self._held_back and self._held_back[0][0] <= self.now_ns:
             data = self._held_back.pop(0)[1] + data
-        if len(data) > 1 and self.dice.strikes(("split",), 0, self.seconds) is not None:
+        if len(data) > 1 and self.dice.strikes(("split",), 0, self.now_ns) is not None:
             middle = len(data) // 2
             self._held_back.append((self.now_ns + 1_000_000, data[middle:]))
             data = data[:middle]

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from hw.dynamixel.codec import StatusError
 from hw.dynamixel.tables import Item, table
 from sim.rig.device import Device
-from sim.rig.firmware import CURRENT_POSITION, EXTENDED, FULL_PWM, POSITION
+from sim.rig.firmware import CURRENT, CURRENT_POSITION, EXTENDED, FULL_PWM, POSITION, PWM
 from sim.rig.motors import Motors
 
 TURN = 4096  # ticks
@@ -150,10 +150,11 @@ class VirtualServo(Device):
         self._default_goals()
 
     def _default_goals(self) -> None:
-        self.put("goal_pwm", self.get("pwm_limit"))
+        """Goals that move nothing: what drives the motor is zero or where it is, what limits it is at its limit."""
+        self.put("goal_pwm", 0 if self.mode == PWM else self.get("pwm_limit"))
         self.put("goal_velocity", 0)
         if self._has_current:
-            self.put("goal_current", self.get("current_limit"))
+            self.put("goal_current", 0 if self.mode == CURRENT else self.get("current_limit"))
         self.put("goal_position", self.ticks_of(float(self.motors.angle[self.index])))
         self._goals_from_registers()
 
