@@ -13,6 +13,8 @@ from sim.rig.wire import FRAME_BITS, Wire, same_baud
 
 TURNAROUND_NS = 2_000  # from the last byte of a request to the first of the reply, at return delay 0
 _SILENCE_NS = 5_000_000  # a packet that stops for so long is given up
+_LONGEST_CHAIN_NS = 500_000_000  # after which the rest of a group has given up
+_LONGEST_FRAME = 4096  # bytes that a servo can count in a fast read
 _STATUS_BYTES = 11  # of a status without data
 _PING_BYTES = 14  # of the answer to a ping
 
@@ -100,6 +102,8 @@ class Bus:
             if answered == end:  # those after a silent one wait for as long as its reply would have taken
                 answered += TURNAROUND_NS + _wire_ns(_STATUS_BYTES + length, self.wire.host_baud)
             end = answered
+            if end - now_ns > _LONGEST_CHAIN_NS:
+                return
 
     def _read_fast(self, parts: Sequence[Part], listening: list[Device], now_ns: int) -> None:
         """One frame to which each adds its block. Whoever does not hear its predecessor stays silent."""
@@ -108,14 +112,13 @@ class Bus:
         for i, (id, address, length) in enumerate(parts):
             devices = [device for device in _called(listening, id) if device.fast()]
             status = _sample(devices[0], address, length, now_ns) if devices else None
-            if status is None:
+            if status is None or len(status.data) != length:
                 break
             if i == 0:
                 start += devices[0].return_delay_ns
                 baud = devices[0].baud
-            data = status.data.ljust(length, b"\0")
-            blocks.append(status._replace(data=data))
-        if not blocks:
+            blocks.append(status)
+        if not blocks or sum(length for _, _, length in parts) > _LONGEST_FRAME:
             return
         silent = [(id, 0, bytes(length)) for id, _, length in parts[len(blocks) :]]
         frame = codec.fast_status([(b.id, _error(b), b.data) for b in blocks] + silent)

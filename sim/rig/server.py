@@ -104,12 +104,16 @@ class Server:
     def serve(self) -> None:
         """Until `stop`, or until nobody has used the rig for the time to linger."""
         try:
-            while self._running:
+            while self._running and not self._abandoned():
                 self._turn()
-                if self._linger is not None and not self._connections:
-                    self._running = time.monotonic() - self._used < self._linger
         finally:
             self.close()
+
+    def _abandoned(self) -> bool:
+        """Whether nobody has used the rig for longer than it lingers."""
+        if self._linger is None or self._connections:
+            return False
+        return time.monotonic() - self._used > self._linger
 
     def close(self) -> None:
         self.terminal.close()

@@ -1,0 +1,216 @@
+"""A rig in a process of its own: its clock, its control socket, and what happens when the controller goes."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import serial
+from rig_host import BOARD, XM430
+
+from hw.dynamixel import codec
+from hw.hal import BackendError
+from hw.robot import load_robot
+from sim.rig.control import Control, LockedClock, RigProcess
+from sim.rig.rig import Rig
+
+MS = 1_000_000
+
+
+class Locked:
+    """A controller on a locked rig: every answer is there when the clock has passed its end."""
+
+    def __init__(self, rig: RigProcess) -> None:
+        self.rig, self.clock = rig, LockedClock(rig.control)
+        self.port = serial.Serial(rig.port, rig.robot.bus.baud, timeout=0)
+        self.ids = [joint.id for joint in rig.robot.joints]
+        self.ask(codec.write(BOARD, 24, b"\1"))
+        self.wait(400)
+
+    def wait(self, ms: float) -> None:
+        self.clock.sleep_until(self.clock.now_ns() + round(ms * MS))
+
+    def ask(self, packet: bytes, ms: float = 4.0) -> bytes:
+        self.port.write(packet)
+        self.wait(ms)
+        return self.port.read(self.port.in_waiting)
+
+
+def walk_about(rig: RigProcess) -> tuple[list[bytes], list[dict[str, object]], list[float]]:
+    """Torque on, arms about: what was heard, accepted, and true at the end."""
+    host = Locked(rig)
+    item = XM430.item("goal_position")
+    home = [2048 + round(float(angle) / item.scale) for angle in rig.robot.home]
+    heard = [host.ask(codec.sync_read(host.ids, 132, 4, fast=True))]
+    for tick in range(30):
+        wave = round(150 * np.sin(tick / 5))
+        goals = {id: item.encode(home[i] + (wave if i in (2, 5) else 0)) for i, id in enumerate(host.ids)}
+        host.port.write(codec.sync_write(116, 4, goals))
+        host.wait(2)
+        if tick == 0:
+            host.ask(codec.sync_write(64, 1, dict.fromkeys(host.ids, b"\1")), 2)
+        heard.append(host.ask(codec.sync_read(host.ids, 126, 10, fast=True), 4))
+        host.wait(14)
+    host.port.close()
+    truth = rig.truth().fetch()
+    return heard, rig.control.accepted(), [*truth.qpos[0], *truth.angular_velocity[0]]
+
+
+def test_two_locked_runs_are_the_same_bit_for_bit() -> None:
+    runs = []
+    for _ in range(2):
+        with RigProcess(seed=3) as rig:
+            runs.append(walk_about(rig))
+    assert runs[0] == runs[1]
+    heard, accepted, _ = runs[0]
+    assert all(len(answer) == 8 + 20 * 14 for answer in heard[1:]), "an answer was not there when the clock said so"
+    assert len(accepted) == 31 * 20
+
+
+def test_a_reset_rig_repeats_itself_and_another_seed_does_not() -> None:
+    with RigProcess() as rig:
+        imu = []
+        for seed in (3, 3, 4):
+            rig.control.reset(seed, randomise=True)
+            host = Locked(rig)
+            imu.append(host.ask(codec.read(BOARD, 32, 12))[9:-2])
+            host.port.close()
+        assert imu[0] == imu[1] != imu[2]
+
+
+def test_time_stands_still_until_the_controller_lets_it_pass() -> None:
+    with RigProcess() as rig:
+        clock = LockedClock(rig.control)
+        before = clock.now_ns()
+        time.sleep(0.1)
+        assert rig.control.call("hello")["now"] == before
+        clock.sleep_until(before + 20 * MS)
+        assert clock.now_ns() == before + 20 * MS
+        clock.sleep_until(before)
+        assert clock.now_ns() == before + 20 * MS
+        observer = Control(rig.control_path)
+        with pytest.raises(BackendError, match="another connection has the clock"):
+            LockedClock(observer)
+        with pytest.raises(BackendError, match="no joint 'l_kne'"):
+            rig.control.inject("dead", servo="l_kne")
+        observer.close()
+
+
+def test_servos_go_on_living_when_the_controller_dies() -> None:
+    """The watchdog stops them: nobody feeds it, and time goes on."""
+    with RigProcess() as rig:
+        host = Locked(rig)
+        watchdog = XM430.item("bus_watchdog")
+        host.ask(codec.sync_write(64, 1, dict.fromkeys(host.ids, b"\1")))
+        host.ask(codec.sync_write(watchdog.address, 1, dict.fromkeys(host.ids, b"\5")))
+        observer = Control(rig.control_path)
+        assert not any(servo["tripped"] for servo in observer.servos())
+        rig.control.close()  # what a killed process leaves
+        deadline = time.monotonic() + 10.0
+        while not all(servo["tripped"] and servo["torque"] for servo in observer.servos()):
+            assert time.monotonic() < deadline, observer.servos()
+            time.sleep(0.02)
+        assert observer.call("hello")["now"] > host.clock.now_ns() + 100 * MS
+        rig.control = observer
+        host.port.close()
+
+
+def test_a_clock_step_and_a_vanishing_port() -> None:
+    with RigProcess() as rig:
+        host = Locked(rig)
+        before = host.clock.now_ns()
+        rig.control.inject("clock_step", value=0.5)
+        host.wait(20)
+        assert host.clock.now_ns() == before + 520 * MS
+        rig.control.inject("stall", until=0.05)
+        host.wait(8)
+        host.port.write_timeout = 0.05
+        with pytest.raises(serial.SerialTimeoutException):
+            host.port.write(codec.ping(1))
+        host.wait(100)
+        host.port.write(codec.ping(1))
+        host.wait(4)
+        assert host.port.in_waiting >= 14
+        rig.control.inject("vanish")
+        host.wait(8)
+        with pytest.raises(OSError, match="Input/output error"):
+            _ = host.port.in_waiting
+
+
+def test_an_unused_rig_ends_by_itself(tmp_path: Path) -> None:
+    control = tmp_path / "control"
+    command = [sys.executable, "-m", "sim.rig.server", "--control", str(control), "--linger", "0.5"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stdout.readline()
+    assert process.wait(10) == 0
+    assert not control.exists()
+    process.stdout.close()
+
+
+def test_the_command_serves_a_linked_port_until_ctrl_c(tmp_path: Path) -> None:
+    link = tmp_path / "rig"
+    code = (
+        "import argparse, sys; from tools import virtual; p = argparse.ArgumentParser(); virtual.add_arguments(p); "
+        "sys.exit(virtual.main(p.parse_args(sys.argv[1:])))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code, "--link", str(link)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert str(link) in process.stdout.readline()
+    with serial.Serial(str(link), 2_000_000, timeout=1.0) as port:
+        port.write(codec.ping(BOARD))
+        assert port.read(14)[4] == BOARD
+    process.send_signal(signal.SIGINT)
+    assert process.wait(10) == 0
+    assert not os.path.lexists(link)
+    process.stdout.close()
+
+
+def test_a_rig_that_cannot_start_says_why(tmp_path: Path) -> None:
+    faults = tmp_path / "faults.yaml"
+    faults.write_text("faults:\n  - {kind: nonsense}")
+    with pytest.raises(BackendError, match=r"faults.yaml:2"):
+        RigProcess(faults=faults)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_bytes_whatever_upset_a_rig(seed: int) -> None:
+    """Random and mutated packets: no exception, no hang, no growth, and the rig still answers."""
+    rng = random.Random(seed)
+    robot = load_robot()
+    rig = Rig(robot)
+    rig.wire.host_baud = robot.bus.baud
+    rig.host_sends(codec.write(BOARD, 24, b"\1"))
+    rig.advance(400 * MS)
+    ids = [joint.id for joint in robot.joints]
+    instructions = [*range(16), 0x20, 0x55, 0x82, 0x83, 0x8A, 0x92, 0x93, 0x9A]
+    keep = {7, 8, 9, 12, 24, 68}  # registers after which silence would be right
+    for _ in range(400):
+        kind = rng.random()
+        if kind < 0.3:
+            data = rng.randbytes(rng.randrange(1, 80))
+        else:
+            id = rng.choice([*ids, BOARD, 254, rng.randrange(253)])
+            params = rng.randbytes(rng.randrange(0, 40))
+            if params and rng.random() < 0.7:
+                params = bytes([rng.randrange(64, 150)]) + b"\0" + params[2:]
+            data = codec.packet(id, rng.choice(instructions), params)
+            if kind > 0.9:
+                data = bytes(b ^ (rng.random() < 0.02) for b in data)
+            addresses = set(range(params[0], params[0] + len(params))) if params else set()
+            if addresses & keep or (params and params[0] < 64) or data[7] in (6, 8):
+                continue
+        rig.host_sends(data)
+        rig.advance(rig.now_ns + 3 * MS)
+    assert len(rig.wire._line) < 1000
+    assert rig.bus._parser.pending < 4096
+    rig.advance(rig.now_ns + 400 * MS)
+    rig.host_sends(codec.ping(BOARD))
+    assert len(rig.advance(rig.now_ns + 20 * MS)) >= 14
