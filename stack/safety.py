@@ -24,6 +24,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from hw.faults import describe
 from hw.hal import Array, Command, Mode, Motors, Observation, State
 from hw.robot import Robot
 from stack.coast import complete, missing
@@ -36,7 +37,6 @@ LOWER_SECONDS = 1.5
 DAMP_SECONDS = 0.5  # braked before torque goes off, so that the robot settles instead of dropping
 HOME_TOLERANCE = 0.35  # rad that a joint may be from home after homing: above any sag under the robot's own weight
 MIN_JERK_PEAK = 1.875  # peak over mean speed of a minimum-jerk motion (Flash and Hogan, 1985)
-SERVO_ERRORS = {0: "input voltage", 2: "overheating", 3: "encoder", 4: "electrical shock", 5: "overload"}
 
 
 class Phase(StrEnum):
@@ -260,8 +260,7 @@ class Guard:
             return
         broken = np.flatnonzero(observation.fault)
         if broken.size:
-            name, bits = names[broken[0]], int(observation.fault[broken[0]])
-            causes = [text for bit, text in SERVO_ERRORS.items() if bits >> bit & 1] or [f"error {bits:#04x}"]
+            name, causes = names[broken[0]], describe(int(observation.fault[broken[0]]))
             self.fault("servo", f"{name} reports {', '.join(causes)}: let it cool, then reboot it", name)
             return
         if tilt > limits.tilt and self.phase is not Phase.HOMING:  # on the way home it may hang from a hand

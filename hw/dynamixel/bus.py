@@ -11,10 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from hw.clock import WallClock
 from hw.dynamixel import codec
 from hw.dynamixel.codec import MAX_ID, OVERHEAD, Packet, Parser, Reset, Status, as_status, parse_fast
 from hw.dynamixel.group import GroupRead, Request
-from hw.dynamixel.port import Port, drain
+from hw.dynamixel.port import Port, SerialPort, drain
 from hw.dynamixel.tables import Item
 from hw.hal import Clock
 
@@ -68,6 +69,8 @@ class Bus:
         self.counters = Counters()
         self.return_delay = return_delay
         self.margin = margin
+        # In real time the line itself says when something comes; by a simulated clock it has to be asked.
+        self._wakes = port if isinstance(port, SerialPort) and isinstance(clock, WallClock) else None
         self._parser = Parser()
         self._dirty = True  # something may still come that must not be taken for an answer
         self._busy_until = 0
@@ -97,19 +100,19 @@ class Bus:
         deadline = sampled + self._wire_ns(request.answer, len(request.ids), gaps=1 if request.fast else None)
         if request.fast:
             stream = bytearray()
-            self._collect(deadline, lambda data: _fast_done(stream, data, request))
+            self._collect(deadline, lambda data: _fast_missing(stream, data, request))
             for status in parse_fast(bytes(stream), request.ids, request.lengths):
                 if status is not None:
                     self._take(group, request, status, sampled, {})
         else:
             seen: dict[int, Status] = {}
 
-            def done(data: bytes) -> bool:
+            def missing(data: bytes) -> int:
                 for status in self._statuses(data):
                     self._take(group, request, status, sampled, seen)
-                return len(seen) == len(request.ids)
+                return (len(request.ids) - len(seen)) * request.answer // len(request.ids)
 
-            self._collect(deadline, done)
+            self._collect(deadline, missing)
         lost = group.end(request)
         self.counters.lost += len(lost)
         self._dirty = bool(lost)
@@ -179,11 +182,11 @@ class Bus:
         end = sent + (MAX_ID + 1) * (PING_GAP_NS + (OVERHEAD + PING_DATA) * byte)
         found: list[Ping] = []
 
-        def done(data: bytes) -> bool:
+        def missing(data: bytes) -> int:
             found.extend(_as_ping(s) for s in self._statuses(data) if len(s.data) == PING_DATA and not s.error)
-            return False
+            return 1  # as far as anyone knows
 
-        self._collect(end, done, first=sent, poll_ns=5_000_000)
+        self._collect(end, missing, first=sent, poll_ns=5_000_000)
         self._dirty = False
         return found
 
@@ -199,16 +202,16 @@ class Bus:
             sent = self._write(packet)
             answer: list[Status] = []
 
-            def done(data: bytes, answer: list[Status] = answer) -> bool:
+            def missing(data: bytes, answer: list[Status] = answer) -> int:
                 for status in self._statuses(data):
                     if status.id == id and (status.error or len(status.data) == length):
                         answer.append(status)
                     else:
                         self.counters.unexpected += 1
-                return bool(answer)
+                return 0 if answer else OVERHEAD + length
 
             predicted = sent + self._wire_ns(OVERHEAD + length, 1)
-            self._collect(predicted, done, extra_ns=round(patience * 1e9))
+            self._collect(predicted, missing, extra_ns=round(patience * 1e9))
             if answer:
                 self._dirty = False
                 self.counters.duplicates += len(answer) - 1
@@ -247,25 +250,29 @@ class Bus:
     def _collect(
         self,
         predicted: int,
-        done: Callable[[bytes], bool],
+        missing: Callable[[bytes], int],
         *,
         extra_ns: int = 0,
         first: int | None = None,
         poll_ns: int = _POLL_NS,
     ) -> None:
-        """Feed what comes to `done` until it is satisfied, or the deadline is over. The first look is when the answer
-        must have ended; it is on time if it came before we look, however late that is."""
+        """Feed what comes to `missing`, which returns how many bytes are, until there are none or the deadline is over.
+        The first look is when the answer must have ended; it is on time if it came before we look, however late."""
         deadline = predicted + round(self.margin * 1e9) + extra_ns
         self.clock.sleep_until(predicted if first is None else first)
         while True:
             data = self.port.read()
             self.counters.bytes_in += len(data)
-            if data and done(data):
+            left = missing(data) if data else 0
+            if data and not left:
                 return
             now = self.clock.now_ns()
             if now >= deadline:
                 return
-            self.clock.sleep_until(min(now + poll_ns, deadline))
+            if self._wakes is not None and not data:
+                self._wakes.wait((deadline - now) * 1e-9)
+            else:
+                self.clock.sleep_until(min(now + max(poll_ns, left * self._byte_ns()), deadline))
 
     def _statuses(self, data: bytes) -> list[Status]:
         parser, counters = self._parser, self.counters
@@ -289,10 +296,10 @@ def _as_ping(status: Status) -> Ping:
     return Ping(status.id, data[0] | data[1] << 8, data[2], status.alert)
 
 
-def _fast_done(stream: bytearray, data: bytes, request: Request) -> bool:
-    """Add `data` to what came of a fast frame; whether that is all of it."""
+def _fast_missing(stream: bytearray, data: bytes, request: Request) -> int:
+    """Add `data` to what came of a fast frame; how many bytes are missing."""
     stream += data
     if len(stream) < request.answer:
-        return False
+        return request.answer - len(stream)
     start = stream.find(request.head)
-    return start >= 0 and len(stream) >= start + request.answer
+    return request.answer if start < 0 else max(0, start + request.answer - len(stream))

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
-from hw.dynamixel.crc import crc16
+from hw.dynamixel.crc import crc16, crc16_after
 
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE
@@ -248,7 +248,7 @@ def parse_fast(stream: bytes, ids: Sequence[int], lengths: Sequence[int]) -> lis
         if crc == received and stream[at + 1] == id:
             error = stream[at]
             blocks[i] = Status(id, error & ~ALERT, bool(error & ALERT), stream[at + 2 : end])
-        crc = crc16(stream[end : end + 2], received)
+        crc = crc16_after(received)
         at = end + 2
     return blocks
 

@@ -43,3 +43,8 @@ def crc16(data: bytes | bytearray | memoryview, crc: int = 0) -> int:
     if len(data) & 1:
         crc = ((crc << 8) & 0xFFFF) ^ _BYTES[(crc >> 8) ^ data[-1]]
     return crc
+
+
+def crc16_after(crc: int) -> int:
+    """Checksum of what has checksum `crc` followed by those two bytes themselves, low byte first."""
+    return _WORDS[crc ^ ((crc & 0xFF) << 8 | crc >> 8)]

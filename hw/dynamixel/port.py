@@ -106,6 +106,13 @@ class SerialPort:
         except (OSError, ValueError, termios.error) as error:
             raise self._gone(error) from error
 
+    def wait(self, seconds: float) -> None:
+        """Sleep until something has come, for at most so long."""
+        try:
+            select.select([self._fd], [], [], seconds)
+        except (OSError, ValueError) as error:
+            raise self._gone(error) from error
+
     def close(self) -> None:
         """Close; a port that is gone already is closed without complaint."""
         if self._fd < 0:
