@@ -23,4 +23,4 @@ NAMES = {
 
 def describe(fault: int) -> list[str]:
     """The faults in words, one for each bit."""
-    return [NAMES.get(bit, f"error bit {bit}") for bit in range(fault.bit_length()) if fault >> bit & 1]
+    return [NAMES.get(bit, f"error {1 << bit:#04x}") for bit in range(fault.bit_length()) if fault >> bit & 1]
