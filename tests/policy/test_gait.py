@@ -59,11 +59,15 @@ def test_the_mirrored_command_gives_the_mirrored_steps() -> None:
     [((0.3, 0.0, 0.0), 1e-3), ((-0.2, 0.1, 0.0), 1e-3), ((0.2, 0.05, 0.5), 0.03), ((0.0, 0.0, -0.8), 0.03)],
 )
 def test_standing_feet_stand_still_in_the_world(velocity: tuple[float, float, float], tolerance: float) -> None:
+    """But for steps that are made longer because soft legs drag: those are tested below."""
     v, dt = np.array(velocity), 1e-4
+    v[1] /= SETTINGS.sideways_gain  # what is asked so that the feet move with `velocity`
+    v[0] /= SETTINGS.backward_gain if v[0] < 0 else 1.0
     step = dt / SETTINGS.cycle
     before, after = soles(PHASES, v), soles((PHASES + step) % 1.0, v)
     contact = pose(PHASES, v)[1] * pose((PHASES + step) % 1.0, v)[1]
     own = (after - before) / dt  # seen from the base, which goes with the twist
+    v = np.array(velocity)
     carried = v[:2] + v[2] * np.stack([-before[..., 1], before[..., 0]], -1)
     slip = np.linalg.norm(own[..., :2] + carried, axis=-1)[contact > 0]
     assert slip.max() < tolerance
