@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -18,7 +18,8 @@ from hw.faults import describe
 from hw.hal import Array, BackendError, Command, Mode
 
 WATCHDOG = 4  # of 20 ms: a servo that hears nothing for so long stops by itself
-TRIES = 4  # to switch torque, before it is an error
+TRIES = 4  # to switch torque, at least, before it is an error
+OFF_SECONDS, ON_SECONDS = 0.25, 0.1  # and for how long: a host or an adapter may be held up meanwhile
 OUTSIDE = 12  # ticks (1 degree) that a joint may be beyond its servo's limits when torque comes on
 _GAINS = struct.Struct("<HHH")  # D, I, P in the order of their registers
 _CHECKED = struct.Struct("<HHH")
@@ -66,7 +67,7 @@ class DynamixelMotors:
     def off(self) -> None:
         """Torque off, asked again of those that do not say that it is. Raises BackendError naming them."""
         left = list(range(len(self._ids)))
-        for _ in range(TRIES):
+        for _ in self._attempts(OFF_SECONDS):
             self._write(self._watchdog.address, left, [b"\0"] * len(left))
             self._write(self._torque.address, left, [b"\0"] * len(left))
             left = self._unconfirmed(left, b"\0")
@@ -87,7 +88,7 @@ class DynamixelMotors:
         goals = self._goals_here()
         self._watch.expect(False)
         self._gain = None
-        for _ in range(TRIES):
+        for _ in self._attempts(ON_SECONDS):
             self._write(self._watchdog.address, everyone, [b"\0"] * len(everyone))  # lifts an expired one, too
             self._write(self._profile, everyone, [bytes(8)] * len(everyone))
             self._send_gains(gain)
@@ -99,7 +100,7 @@ class DynamixelMotors:
             raise BackendError(f"{self._names(unready)} did not take goal and gains: torque stays off")
         self.on = True
         left = everyone
-        for _ in range(TRIES):
+        for _ in self._attempts(ON_SECONDS):
             self._write(self._torque.address, left, [b"\1"] * len(left))
             self._write(self._watchdog.address, left, [bytes([WATCHDOG])] * len(left))
             left = self._unconfirmed(left, b"\1", bytes([WATCHDOG]))
@@ -110,9 +111,18 @@ class DynamixelMotors:
         self.off()
         raise BackendError(f"{names} did not switch torque on: does it report an error? Switch its power off and on")
 
+    def _attempts(self, seconds: float) -> Iterator[int]:
+        """Counts attempts: TRIES at least, and for at least so long."""
+        clock = self._bus.clock
+        end = clock.now_ns() + round(seconds * 1e9)
+        attempt = 0
+        while attempt < TRIES or clock.now_ns() < end:
+            yield attempt
+            attempt += 1
+
     def _goals_here(self) -> list[int]:
         """Goal ticks at the present position, within a turn and the servo's own limits."""
-        for _ in range(TRIES):
+        for _ in self._attempts(ON_SECONDS):
             if all(self._present.fresh):
                 break
             self._bus.read_group(self._present)
