@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scripted import Memory, ScriptedBus
 
+from hw.config import CONFIGS
 from hw.dynamixel import codec
 from hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
 from hw.dynamixel.codec import Instruction
@@ -185,6 +188,42 @@ def test_registers_are_not_corrected_under_torque(robot: Robot) -> None:
     robot.joint("l_el").put("torque_enable", 1)
     with pytest.raises(BackendError, match="l_el has torque on"):
         robot.backend(fix=True).connect()
+
+
+def test_a_robot_may_mix_models(robot: Robot, tmp_path: Path) -> None:
+    """A head of XL430: it moves like the others, has no effort, and firmware that knows no fast frames."""
+    text = (CONFIGS / "servos" / "xm430-w350.yaml").read_text()
+    for old, new in (
+        ("1020", "1060"),
+        ("name: xm430-w350", "name: xl430-w250"),
+        ("max_temperature: 80", "max_temperature: 72"),
+    ):
+        text = text.replace(old, new)
+    (tmp_path / "xl430-w250.yaml").write_text(text)
+    joints = [
+        replace(j, servo=str(tmp_path / "xl430-w250.yaml")) if j.name.startswith("head") else j for j in ROBOT.joints
+    ]
+    mixed = replace(ROBOT, joints=tuple(joints))
+    for i in (0, 1):
+        old, new = robot.servos[i], Memory("xl430-w250", joints[i].id)
+        for name in ("return_delay_time", "min_position_limit", "max_position_limit", "present_position"):
+            new.put(name, old.get(name))
+        new.put("present_input_voltage", 120)
+        new.put("firmware_version", 40)
+        new.put("present_load", 250)
+        robot.servos[i] = robot.line.servos[joints[i].id] = new
+    robot.servos[2].put("present_current", 100)
+    backend = DynamixelBackend(mixed, port=robot.line, clock=robot.line)
+    sensors, motors = backend.connect()
+    assert backend.differences == ()
+    o = sensors.read()
+    assert np.isnan(o.effort[:2]).all()
+    assert o.effort[2] == pytest.approx(100 * 0.00269 * 1.783)
+    np.testing.assert_allclose(o.position, ROBOT.home, atol=0.001)
+    motors.write(active())
+    assert all(servo.get("torque_enable") for servo in robot.servos)
+    assert robot.servos[0].get("position_d_gain") == 4000, "the model's own"
+    assert Instruction.FAST_SYNC_READ not in {p.instruction for p in robot.line.sent}
 
 
 def test_a_port_must_be_named() -> None:
