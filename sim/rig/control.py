@@ -63,7 +63,7 @@ class Control:
         self.call("release")
 
     def hold(self) -> None:
-        """Keep holding the robot when all servos have torque, until `release`."""
+        """Keep holding the robot when all servos have torque, until `release` or a reset."""
         self.call("hold", auto_release=False)
 
     def push(self, velocity: Array) -> None:
@@ -83,8 +83,14 @@ class Control:
         self.call("inject", fault={"kind": kind, **fault})
 
     def accepted(self) -> list[dict[str, Any]]:
-        """Goals, torque and gains that servos took since the last call: time_ns, joint, register, value, position."""
-        return list(self.call("accepted")["accepted"])
+        """Goals, torque and gains that servos took since the last call: time_ns, joint, register, value, position.
+
+        Raises BackendError when it was not asked for too long and some were forgotten.
+        """
+        answer = self.call("accepted")
+        if answer["forgotten"]:
+            raise BackendError(f"virtual rig: {answer['forgotten']} accepted writes were forgotten: ask more often")
+        return list(answer["accepted"])
 
     def servos(self) -> list[dict[str, Any]]:
         """State of each servo, in the robot's joint order."""

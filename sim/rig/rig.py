@@ -27,7 +27,7 @@ from sim.rig.wire import Wire
 
 BROWN_OUT, BOARD_BROWN_OUT = 6.0, 4.5  # V below which a servo and the board lose power
 _LONGEST_BROWN_OUT = 0.05  # s, when the scenario does not say
-_REMEMBERED = 1_000_000  # accepted writes that are kept for whoever asks
+_REMEMBERED = 200_000  # accepted writes that are kept for whoever asks: 200 s of 20 goals 50 times a second
 _BABBLE = 0.8  # share of the line that a babbling device fills
 
 
@@ -48,22 +48,23 @@ class Rig:
     def __init__(
         self, robot: Robot, *, seed: int = 0, randomise: bool = False, scenario: Scenario | None = None
     ) -> None:
-        self.robot, self._scenario = robot, scenario or Scenario()
+        self.robot, self.scenario = robot, scenario or Scenario()
         self.plant = Plant(robot)
         self.motors = Motors(robot, self.plant)
         self.now_ns = 0
-        self.auto_release = True
+        self.wire = Wire()
         self.accepted: deque[Accepted] = deque(maxlen=_REMEMBERED)
+        self.forgotten = 0  # accepted writes that nobody asked for in time
         self.reset(seed, randomise=randomise)
 
     def reset(self, seed: int, *, episode: int = 0, randomise: bool = False, pose: Array | None = None) -> None:
         """A rig as delivered, its power off, held at `pose` (default: home); time goes on, faults begin anew."""
         self.plant.reset(seed, episode=episode, randomise=randomise, pose=pose)
         self.motors.reset()
-        baud = getattr(self, "wire", Wire()).host_baud
-        self.wire = Wire()
+        self.auto_release = True  # onto its feet as soon as all servos have torque
+        baud, self.wire = self.wire.host_baud, Wire()
         self.wire.host_baud = baud
-        self.dice = Dice(self.robot, self._scenario, self.now_ns)
+        self.dice = Dice(self.robot, self.scenario, self.now_ns)
         self.bus = Bus(self.wire, self.dice)
         self.port_open, self.stalled, self.skew_ns = True, False, 0
         self._echo = self._babbles = self._cut = False
@@ -75,7 +76,7 @@ class Rig:
         ]
         codes = self.servos[0].table.bauds
         board = {"id": self.robot.bus.board_id, "baud_rate": codes.index(self.robot.bus.baud)}
-        self.board = Board(self.motors, board, self._switch)
+        self.board = Board(self.motors, board, self._switch, np.array(self.robot.imu.signs))
         self._switch(False)
         self.bus.devices = [*self.servos, self.board]
 
@@ -84,6 +85,7 @@ class Rig:
             angles = np.zeros(len(self.servos))
             angles[joint] = angle
             angle = float(self.motors.joint_of(angles)[joint])
+        self.forgotten += len(self.accepted) == _REMEMBERED
         self.accepted.append(Accepted(now_ns, joint, register, value, angle))
 
     def _switch(self, on: bool) -> None:

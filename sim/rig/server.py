@@ -10,6 +10,8 @@ pace: servos whose controller was killed go on living.
 from __future__ import annotations
 
 import argparse
+import ctypes
+import gc
 import json
 import select
 import signal
@@ -30,6 +32,7 @@ from sim.rig.rig import Rig
 from sim.rig.terminal import Terminal
 
 ClockKind = Literal["real", "locked"]
+_PR_SET_TIMERSLACK = 29
 PICK_UP_SECONDS = 3.0  # without torque anywhere, before somebody picks a free-running robot up
 _FARTHEST_BEHIND = 200_000_000  # ns that a rig hurries to catch up; of longer pauses the rest never happened
 
@@ -103,6 +106,9 @@ class Server:
 
     def serve(self) -> None:
         """Until `stop`, or until nobody has used the rig for the time to linger."""
+        gc.collect()
+        gc.freeze()
+        _wake_sharply()
         try:
             while self._running and not self._abandoned():
                 self._turn()
@@ -288,7 +294,7 @@ class Server:
         return {**values, "held": plant.held}
 
     def _op_accepted(self) -> dict[str, Any]:
-        return {"accepted": self.rig.take_accepted()}
+        return {"accepted": self.rig.take_accepted(), "forgotten": self.rig.forgotten}
 
     def _op_servos(self) -> dict[str, Any]:
         return {"servos": self.rig.servo_states()}
@@ -297,6 +303,13 @@ class Server:
         struck = [{"kind": kind, "id": id, "count": n} for (kind, id), n in self.rig.dice.struck.items()]
         rig = self.rig
         return {"struck": struck, "collisions": rig.wire.collisions, "instructions": rig.bus.instructions}
+
+
+def _wake_sharply() -> None:
+    """Let sleeps end within a microsecond instead of Linux's usual 50: a reply of 20 servos takes 800."""
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "prctl"):
+        libc.prctl(_PR_SET_TIMERSLACK, 1000)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -22,8 +22,7 @@ def shared_rig(robot: Robot) -> Rig:
 
 @pytest.fixture
 def rig(shared_rig: Rig) -> Rig:
-    shared_rig._scenario = Scenario()
-    shared_rig.auto_release = True
+    shared_rig.scenario = Scenario()
     shared_rig.reset(0)
     shared_rig.accepted.clear()
     return shared_rig

@@ -12,6 +12,7 @@ from hw.dynamixel import codec
 from hw.dynamixel.tables import table
 from hw.hal import Array, Command, Mode
 from hw.robot import Robot
+from sim.rig.board import Board
 from sim.rig.rig import Rig
 from sim.worlds import Worlds
 
@@ -224,6 +225,14 @@ def test_the_board_measures_what_the_body_does(host: Host, rig: Rig) -> None:
     assert max(samples) > 0.3
     rig.board.buttons = 2
     assert read("button") == 2
+
+
+def test_an_imu_is_read_in_the_axes_of_its_mounting(rig: Rig) -> None:
+    turned = Board(rig.motors, {}, lambda on: None, np.array([-1.0, -1.0, 1.0]))
+    for board in (rig.board, turned):
+        board.refresh(0)
+    for axis, sign in zip("xyz", (-1, -1, 1), strict=True):
+        assert turned.get(f"acceleration_{axis}") == sign * rig.board.get(f"acceleration_{axis}") != 0
 
 
 def test_a_frozen_imu_repeats_itself_and_a_living_one_never_does(host: Host, rig: Rig) -> None:
