@@ -6,7 +6,8 @@ import struct
 from collections.abc import Iterator, Sequence
 
 from hw.dynamixel import codec
-from hw.dynamixel.codec import FAST_BLOCK, FAST_HEAD, Instruction, Packet, Parser, Status
+from hw.dynamixel.codec import Instruction, Packet, Parser, Status
+from hw.dynamixel.crc import crc16
 from sim.rig.device import Device
 from sim.rig.faults import STATUS_KINDS, Chunk, Dice
 from sim.rig.wire import FRAME_BITS, Wire, same_baud
@@ -88,7 +89,8 @@ class Bus:
     def _read_group(self, parts: Sequence[Part], listening: list[Device], fast: bool, now_ns: int) -> None:
         """Sync and bulk reads. All sample now; each transmits when the one before it has."""
         if fast:
-            self._read_fast(parts, listening, now_ns)
+            if parts:
+                self._read_fast(parts, listening, now_ns)
             return
         end = now_ns
         for id, address, length in parts:
@@ -96,7 +98,7 @@ class Bus:
             answered = end
             for device in devices:
                 start = end + TURNAROUND_NS + device.return_delay_ns
-                status = _sample(device, address, length, now_ns)
+                status = device.sample(address, length, now_ns)
                 if status is not None:
                     answered = max(answered, self._send(status, start, device.baud, now_ns))
             if answered == end:  # those after a silent one wait for as long as its reply would have taken
@@ -107,34 +109,33 @@ class Bus:
 
     def _read_fast(self, parts: Sequence[Part], listening: list[Device], now_ns: int) -> None:
         """One frame to which each adds its block. Whoever does not hear its predecessor stays silent."""
-        blocks: list[Status] = []
-        start, baud = now_ns + TURNAROUND_NS, self.wire.host_baud
-        for i, (id, address, length) in enumerate(parts):
-            devices = [device for device in _called(listening, id) if device.fast()]
-            status = _sample(devices[0], address, length, now_ns) if devices else None
+        lengths = [length for _, _, length in parts]
+        if sum(lengths) > _LONGEST_FRAME:
+            return
+        by_id = {device.id: device for device in reversed(listening) if device.fast()}
+        first = by_id.get(parts[0][0])
+        if first is None:
+            return
+        chunks: list[Chunk] = []
+        head = codec.fast_head(lengths)
+        crc = crc16(head)
+        for id, address, length in parts:
+            device = by_id.get(id)
+            status = None if device is None else device.sample(address, length, now_ns)
             if status is None or len(status.data) != length:
                 break
-            if i == 0:
-                start += devices[0].return_delay_ns
-                baud = devices[0].baud
-            blocks.append(status)
-        if not blocks or sum(length for _, _, length in parts) > _LONGEST_FRAME:
-            return
-        silent = [(id, 0, bytes(length)) for id, _, length in parts[len(blocks) :]]
-        frame = codec.fast_status([(b.id, _error(b), b.data) for b in blocks] + silent)
-        chunks: list[Chunk] = []
-        at = 0
-        for i, block in enumerate(blocks):
-            end = at + (FAST_HEAD if i == 0 else 0) + FAST_BLOCK + len(block.data)
-            piece, at = frame[at:end], end
-            fault = self.dice.strikes(STATUS_KINDS, block.id, now_ns)
+            body = bytes([_error(status), id]) + status.data
+            checksum = crc16(body, crc).to_bytes(2, "little")
+            crc = crc16(body + checksum, crc)
+            block, head = head + body + checksum, b""
+            fault = self.dice.strikes(STATUS_KINDS, id, now_ns)
             if fault is None:
-                chunks.append(Chunk(piece))
+                chunks.append(Chunk(block))
                 continue
-            chunks += self.dice.spoil(fault, block, piece, block=True)
+            chunks += self.dice.spoil(fault, status, block, block=True)
             if fault.kind in ("drop", "truncate"):
                 break
-        self._put(chunks, start, baud, now_ns)
+        self._put(chunks, now_ns + TURNAROUND_NS + first.return_delay_ns, first.baud, now_ns)
 
     def _send(self, status: Status, start_ns: int, baud: int, now_ns: int) -> int:
         """Put a status on the wire; returns when it ends."""
@@ -155,11 +156,6 @@ class Bus:
                 at, joined = at + round(chunk.wait * 1e9), bytearray()
             joined += chunk.data
         return self.wire.device_sends(bytes(joined), at, baud, now_ns).end_ns if joined else at
-
-
-def _sample(device: Device, address: int, length: int, now_ns: int) -> Status | None:
-    params = struct.pack("<HH", address, length)
-    return device.execute(Instruction.READ, params, now_ns)
 
 
 def _called(devices: list[Device], id: int) -> list[Device]:

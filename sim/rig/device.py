@@ -118,6 +118,12 @@ class Device:
             wanted = 2
         return self.status(error, data) if level >= wanted else None
 
+    def sample(self, address: int, length: int, now_ns: int) -> Status | None:
+        """The answer to a read within a group, if the status level wants one."""
+        if "status_return_level" in self._places and not self.get("status_return_level"):
+            return None
+        return self.status(*self.read(address, length, now_ns))
+
     def status(self, error: int, data: bytes = b"") -> Status:
         return Status(self.id, int(error), self.alert(), data)
 
