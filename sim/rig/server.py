@@ -19,6 +19,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any, Literal
@@ -27,7 +28,9 @@ import numpy as np
 
 from hw.config import ConfigError
 from hw.robot import load_robot
-from sim.rig.faults import Fault, Scenario, load_scenario
+from sim.rig import operations
+from sim.rig.faults import Scenario, load_scenario
+from sim.rig.operations import Connection
 from sim.rig.rig import Rig
 from sim.rig.terminal import Terminal
 
@@ -35,33 +38,6 @@ ClockKind = Literal["real", "locked"]
 _PR_SET_TIMERSLACK = 29
 PICK_UP_SECONDS = 3.0  # without torque anywhere, before somebody picks a free-running robot up
 _FARTHEST_BEHIND = 200_000_000  # ns that a rig hurries to catch up; of longer pauses the rest never happened
-
-
-class Connection:
-    """A control connection: requests and answers are JSON objects, one a line."""
-
-    def __init__(self, stream: socket.socket) -> None:
-        self.stream = stream
-        self._buffer = b""
-
-    def lines(self) -> list[bytes] | None:
-        """Requests that have come; None when the other side is gone."""
-        try:
-            data = self.stream.recv(1 << 20)
-        except ConnectionError:
-            return None
-        if not data:
-            return None
-        *lines, self._buffer = (self._buffer + data).split(b"\n")
-        return lines
-
-    def answer(self, values: dict[str, Any]) -> bool:
-        """Send an answer; False when the other side is gone."""
-        try:
-            self.stream.sendall(json.dumps(values).encode() + b"\n")
-        except OSError:
-            return False
-        return True
 
 
 class Server:
@@ -78,16 +54,17 @@ class Server:
     ) -> None:
         """Raises OSError when the link or the socket cannot be made."""
         self.rig = rig
-        self.terminal = Terminal(link)
+        self._listener = None if control is None else _listen(control)
+        try:
+            self.terminal = Terminal(link)
+        except OSError:
+            if self._listener is not None and control is not None:
+                self._listener.close()
+                control.unlink()
+            raise
         self._locked = clock == "locked"
         self._linger = linger
         self._control_path = control
-        self._listener: socket.socket | None = None
-        if control is not None:
-            control.unlink(missing_ok=True)
-            self._listener = socket.socket(socket.AF_UNIX)
-            self._listener.bind(str(control))
-            self._listener.listen()
         self._connections: dict[int, Connection] = {}
         self._driver: int | None = None
         self._stalled = False
@@ -225,84 +202,62 @@ class Server:
         self._wall_ns, self._rig_ns = time.monotonic_ns(), self.rig.now_ns
 
     def _request(self, number: int, line: bytes) -> dict[str, Any]:
+        own: dict[str, Callable[..., dict[str, Any]]] = {
+            "hello": self._hello,
+            "lock": partial(self._lock, number),
+            "advance": self._advance,
+            "reset": self._reset,
+        }
         try:
             request = json.loads(line)
-            operation: Callable[..., dict[str, Any]] = getattr(self, f"_op_{request.pop('op')}")
-            if operation.__name__ in ("_op_lock",):
-                request["number"] = number
+            name = request.pop("op")
+            operation = own[name] if name in own else operations.find(name, self.rig)
             return {"now": self.rig.now_ns, **operation(**request)}
         except (ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
             return {"error": f"{type(error).__name__}: {error}"}
 
-    def _op_hello(self) -> dict[str, Any]:
+    def _hello(self) -> dict[str, Any]:
         return {"robot": self.rig.robot.name, "port": self.port, "locked": self._locked}
 
-    def _op_lock(self, number: int) -> dict[str, Any]:
+    def _lock(self, number: int) -> dict[str, Any]:
         """From here on only this connection advances time."""
         if self._driver not in (None, number):
             raise ValueError("another connection has the clock")
         self._driver, self._locked = number, True
         return {}
 
-    def _op_advance(self, to: int) -> dict[str, Any]:
+    def _advance(self, to: int) -> dict[str, Any]:
         if not self._locked:
             raise ValueError("the clock is not locked")
         heard = self._exchange(max(to, self.rig.now_ns), visible=True)
         return {"now": self.rig.now_ns, "heard": heard}
 
-    def _op_reset(
+    def _reset(
         self, seed: int, episode: int = 0, randomise: bool = False, pose: list[float] | None = None
     ) -> dict[str, Any]:
-        self.terminal.read() if self.terminal.is_open else None
+        if self.terminal.is_open:
+            self.terminal.flush()
         array = None if pose is None else np.asarray(pose, float)
         self.rig.reset(seed, episode=episode, randomise=randomise, pose=array)
         self._plug()
         return {}
 
-    def _op_release(self) -> dict[str, Any]:
-        self.rig.plant.release()
-        return {}
 
-    def _op_hold(self, auto_release: bool) -> dict[str, Any]:
-        """Whether the robot is let go as soon as all servos have torque, or only by `release`."""
-        self.rig.auto_release = auto_release
-        return {}
-
-    def _op_push(self, velocity: list[float]) -> dict[str, Any]:
-        self.rig.plant.push(np.asarray(velocity, float))
-        return {}
-
-    def _op_move(self, pose: dict[str, float]) -> dict[str, Any]:
-        self.rig.move(pose)
-        return {}
-
-    def _op_press(self, buttons: int) -> dict[str, Any]:
-        self.rig.board.buttons = int(buttons)
-        return {}
-
-    def _op_inject(self, fault: dict[str, Any]) -> dict[str, Any]:
-        """A fault whose times count from now."""
-        seconds = self.rig.seconds
-        until = fault.get("until")
-        fault = {**fault, "at": seconds + fault.get("at", 0.0), "until": None if until is None else seconds + until}
-        self.rig.inject(Fault(**fault))
-        return {}
-
-    def _op_truth(self) -> dict[str, Any]:
-        plant = self.rig.plant
-        values = {name: getattr(plant.data, name).tolist() for name in ("qpos", "qvel", "sensordata")}
-        return {**values, "held": plant.held}
-
-    def _op_accepted(self) -> dict[str, Any]:
-        return {"accepted": self.rig.take_accepted(), "forgotten": self.rig.forgotten}
-
-    def _op_servos(self) -> dict[str, Any]:
-        return {"servos": self.rig.servo_states()}
-
-    def _op_statistics(self) -> dict[str, Any]:
-        struck = [{"kind": kind, "id": id, "count": n} for (kind, id), n in self.rig.dice.struck.items()]
-        rig = self.rig
-        return {"struck": struck, "collisions": rig.wire.collisions, "instructions": rig.bus.instructions}
+def _listen(path: Path) -> socket.socket:
+    """A control socket at `path`; one that a rig left behind is replaced. Raises OSError if another rig has it."""
+    if path.is_socket():
+        with socket.socket(socket.AF_UNIX) as other:
+            if other.connect_ex(str(path)) == 0:
+                raise OSError(f"{path}: another virtual rig is running there")
+        path.unlink()
+    listener = socket.socket(socket.AF_UNIX)
+    try:
+        listener.bind(str(path))
+    except OSError as error:
+        listener.close()
+        raise OSError(f"{path}: {error.strerror or error}") from error
+    listener.listen()
+    return listener
 
 
 def _wake_sharply() -> None:

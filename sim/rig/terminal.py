@@ -67,6 +67,12 @@ class Terminal:
                 return bytes(data)
             data += piece
 
+    def flush(self) -> None:
+        """Forget what either side has not read yet."""
+        self._backlog.clear()
+        self.read()
+        termios.tcflush(self.slave, termios.TCIFLUSH)
+
     def write(self, data: bytes, *, visible: bool = False) -> None:
         """Hand bytes to the host. With `visible`, return only when it can read them."""
         self._backlog += data

@@ -17,9 +17,10 @@ from rig_host import BOARD, XM430
 
 from hw.dynamixel import codec
 from hw.hal import BackendError
-from hw.robot import load_robot
+from hw.robot import Robot, load_robot
 from sim.rig.control import Control, LockedClock, RigProcess
 from sim.rig.rig import Rig
+from sim.rig.server import Server
 
 MS = 1_000_000
 
@@ -100,6 +101,8 @@ def test_time_stands_still_until_the_controller_lets_it_pass() -> None:
             LockedClock(observer)
         with pytest.raises(BackendError, match="no joint 'l_kne'"):
             rig.control.inject("dead", servo="l_kne")
+        with pytest.raises(BackendError, match=r"unknown operation 'truht'.*truth"):
+            observer.call("truht")
         observer.close()
 
 
@@ -171,6 +174,18 @@ def test_the_command_serves_a_linked_port_until_ctrl_c(tmp_path: Path) -> None:
     assert process.wait(10) == 0
     assert not os.path.lexists(link)
     process.stdout.close()
+
+
+def test_two_rigs_do_not_share_a_control_socket_but_a_leftover_is_replaced(tmp_path: Path, robot: Robot) -> None:
+    path = tmp_path / "control"
+    rig = Rig(robot)
+    first = Server(rig, control=path)
+    with pytest.raises(OSError, match="another virtual rig"):
+        Server(rig, control=path)
+    first._listener.close()  # as a killed one leaves it
+    second = Server(rig, control=path)
+    second.close()
+    first.terminal.close()
 
 
 def test_a_rig_that_cannot_start_says_why(tmp_path: Path) -> None:
