@@ -43,7 +43,10 @@ class Accepted:
 
 
 class Rig:
-    """The rig of `robot`. Time begins at 0; the robot is held in its home pose until all servos have torque."""
+    """The rig of `robot`. Time begins at 0; the robot is held in its home pose until all servos have torque.
+
+    Raises ConfigError for a servo that is no known Dynamixel, and for a fault of an unknown servo.
+    """
 
     def __init__(
         self, robot: Robot, *, seed: int = 0, randomise: bool = False, scenario: Scenario | None = None
@@ -71,7 +74,7 @@ class Rig:
         self._next_step_ns = (self.now_ns // STEP_NS + 1) * STEP_NS
         self._held_back: list[tuple[int, bytes]] = []
         self.servos = [
-            VirtualServo(self.motors, i, servo.name, eeprom, self._record)
+            VirtualServo(self.motors, i, servo.model_number, eeprom, self._record)
             for i, (servo, eeprom) in enumerate(zip(self.robot.servos, delivered(self.robot), strict=True))
         ]
         codes = self.servos[0].table.bauds
@@ -290,7 +293,7 @@ def delivered(robot: Robot) -> list[dict[str, int]]:
         values.append(
             {
                 "id": joint.id,
-                "baud_rate": table(servo.name).bauds.index(robot.bus.baud),
+                "baud_rate": table(servo.model_number).bauds.index(robot.bus.baud),
                 "return_delay_time": 0,
                 "min_position_limit": max(math.floor(min(ends)), 0),
                 "max_position_limit": min(math.ceil(max(ends)), servo.ticks_per_turn - 1),

@@ -14,7 +14,7 @@ from sim.rig.motors import Motors
 
 TURN = 4096  # ticks
 CENTRE = 2048  # tick of angle 0
-FIRMWARE = 48  # of the X430; the newest that the tables know elsewhere
+FIRMWARE = 52  # the newest that changed anything in the tables
 _HOMING_RANGE = 1024  # ticks that count in position mode
 _TURNS_RANGE = 1_048_575  # ticks of the modes that count turns
 _REVERSE, _TIME_BASED, _TORQUE_BY_GOAL = 1, 4, 8  # bits of the drive mode
@@ -37,7 +37,7 @@ class VirtualServo(Device):
     """Servo `index` of the rig's motors."""
 
     def __init__(
-        self, motors: Motors, index: int, model: str, eeprom: dict[str, int], accepted: Accepted | None = None
+        self, motors: Motors, index: int, model: int | str, eeprom: dict[str, int], accepted: Accepted | None = None
     ) -> None:
         """`accepted` is told of every write to a goal, the torque or the P gain that the servo took."""
         self.motors, self.index, self._accepted = motors, index, accepted

@@ -9,8 +9,10 @@ from rig_host import BOARD, XM430, Host
 
 from hw.dynamixel import codec
 from hw.dynamixel.codec import Reset, StatusError
+from hw.dynamixel.tables import models
 from hw.robot import Robot
 from sim.rig.rig import Rig
+from sim.rig.servo import VirtualServo
 
 
 def test_servos_are_silent_until_the_board_gives_them_power(rig: Rig, robot: Robot) -> None:
@@ -248,3 +250,19 @@ def test_older_firmware_stays_silent_on_fast_reads(host: Host) -> None:
     ids = [host.rig.servos[0].id, host.rig.servos[1].id]
     assert host.ask(codec.sync_read(ids, 126, 10, fast=True)) == []
     assert len(host.ask(codec.sync_read(ids, 126, 10))) == 2
+
+
+@pytest.mark.parametrize("model", [name for name in models() if name != "opencr"])
+def test_every_model_is_emulated_with_its_own_registers(rig: Rig, model: str) -> None:
+    servo = VirtualServo(rig.motors, 0, model, {"id": 42})
+    known = servo.table
+    assert servo.execute(codec.Instruction.PING, b"", 0) == (42, 0, False, known.number.to_bytes(2, "little") + b"\x34")
+    position = known.item("present_position")
+    error, data = servo.read(position.address, position.width, 0)
+    assert (error, position.decode(data)) == (StatusError.NONE, 2048)
+    assert ("present_current" in known) is (0 in known.modes), "a servo without current has no current mode"
+    for mode in known.modes:
+        assert servo.write(11, bytes([mode]), 0) is StatusError.NONE
+    for block in known.indirect:
+        assert servo.write(block.address, position.address.to_bytes(2, "little"), 0) is StatusError.NONE
+        assert servo.read(block.data, 1, 0) == (StatusError.NONE, data[:1])

@@ -74,7 +74,7 @@ def test_a_host_at_another_baud_neither_speaks_nor_hears(host: Host) -> None:
     host.rig.wire.host_baud = 1_000_000
     heard = host.wait(0.02)
     assert heard
-    assert codec.status(1, 0, (1020).to_bytes(2, "little") + b"\x30") not in heard
+    assert codec.status(1, 0, (1020).to_bytes(2, "little") + b"\x34") not in heard
 
 
 def test_a_silent_servo_costs_a_sync_read_one_answer_and_a_fast_one_the_rest(host: Host) -> None:
