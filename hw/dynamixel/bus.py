@@ -101,13 +101,16 @@ class Bus:
         if request.fast:
             stream = bytearray()
             self._collect(deadline, lambda data: _fast_missing(stream, data, request))
-            for status in parse_fast(bytes(stream), request.ids, request.lengths):
-                if status is not None:
-                    self._take(group, request, status, sampled, {})
+            if not group.accept_all(request, bytes(stream), sampled):
+                for status in parse_fast(bytes(stream), request.ids, request.lengths):
+                    if status is not None:
+                        self._take(group, request, status, sampled, {})
         else:
             seen: dict[int, Status] = {}
 
             def missing(data: bytes) -> int:
+                if len(data) == request.answer and not seen and group.accept_all(request, data, sampled):
+                    return 0
                 for status in self._statuses(data):
                     self._take(group, request, status, sampled, seen)
                 return (len(request.ids) - len(seen)) * request.answer // len(request.ids)

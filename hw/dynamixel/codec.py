@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
-from hw.dynamixel.crc import crc16, crc16_after
+from hw.dynamixel.crc import blocks_are_right, crc16, crc16_after
 
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE
@@ -251,6 +251,42 @@ def parse_fast(stream: bytes, ids: Sequence[int], lengths: Sequence[int]) -> lis
         crc = crc16_after(received)
         at = end + 2
     return blocks
+
+
+def whole_fast(frame: bytes, head: bytes, ids: bytes, length: int) -> list[bytes] | None:
+    """The data of each block if `frame` is the whole answer to a fast read of `length` bytes from `ids`: nothing before
+    or after, no error, every CRC right. Else None, and `parse_fast`, which is slower, may tell what is good in it."""
+    block = FAST_BLOCK + length
+    if (
+        block & 1
+        or len(frame) != FAST_HEAD + block * len(ids)
+        or not frame.startswith(head)
+        or frame[FAST_HEAD + 1 :: block] != ids
+        or any(frame[FAST_HEAD::block])
+        or not blocks_are_right(frame, FAST_HEAD, block)
+    ):
+        return None
+    return [frame[at : at + length] for at in range(FAST_HEAD + 2, len(frame), block)]
+
+
+def whole_sync(stream: bytes, heads: Sequence[bytes], length: int) -> list[bytes] | None:
+    """The same of the answers to a plain read, each of which must begin as in `heads` and hold nothing stuffed."""
+    frame = OVERHEAD + length
+    if len(stream) != frame * len(heads) or _STUFFED in stream:
+        return None
+    data, at = [], 0
+    for head in heads:
+        end = at + frame
+        if not stream.startswith(head, at) or crc16(stream[at : end - 2]) != stream[end - 2] | stream[end - 1] << 8:
+            return None
+        data.append(stream[at + 9 : end - 2])
+        at = end
+    return data
+
+
+def status_head(id: int, length: int) -> bytes:
+    """How the answer of a servo begins that has no error, no alert, and `length` bytes of data without stuffing."""
+    return _HEAD.pack(HEADER, id, length + 4, Instruction.STATUS) + b"\0"
 
 
 class Parser:

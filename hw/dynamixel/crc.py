@@ -48,3 +48,19 @@ def crc16(data: bytes | bytearray | memoryview, crc: int = 0) -> int:
 def crc16_after(crc: int) -> int:
     """Checksum of what has checksum `crc` followed by those two bytes themselves, low byte first."""
     return _WORDS[crc ^ ((crc & 0xFF) << 8 | crc >> 8)]
+
+
+def blocks_are_right(frame: bytes, first: int, block: int) -> bool:
+    """Whether every block of `block` bytes from `first` on ends with the checksum of all that is before it in `frame`.
+    Both numbers must be even: two bytes are taken at a time."""
+    words = struct.unpack(f">{len(frame) >> 1}H", frame)
+    table, crc, step = _WORDS, 0, block >> 1
+    for word in words[: first >> 1]:
+        crc = table[crc ^ word]
+    for at in range((first >> 1) + step - 1, len(words), step):
+        for word in words[at - step + 1 : at]:
+            crc = table[crc ^ word]
+        if words[at] != (crc & 0xFF) << 8 | crc >> 8:
+            return False
+        crc = table[crc ^ words[at]]
+    return True

@@ -22,6 +22,7 @@ class Memory:
         self.table: ControlTable = table(model)
         self.bytes = bytearray(700)
         self.answers = True
+        self.quiet = False  # firmware that does not raise the alert bit
         for item in self.table.items.values():
             if item.default is not None:
                 self.put(item.name, item.default)
@@ -39,6 +40,8 @@ class Memory:
 
     @property
     def alert(self) -> int:
+        if self.quiet:
+            return 0
         return codec.ALERT if "hardware_error_status" in self.table and self.get("hardware_error_status") else 0
 
     def write(self, address: int, data: bytes) -> int:

@@ -1,89 +1,26 @@
-"""The backend on a scripted bus: what it refuses, that it never moves on its own, and that it names what goes wrong."""
+"""The backend on a scripted bus: what it refuses, that it never moves on its own, and how torque comes and goes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scripted import Memory, ScriptedBus
+from scripted import Memory
+from scripted_op3 import ROBOT, Robot, active, run
 
 from hw.config import CONFIGS
 from hw.dynamixel import codec
-from hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
+from hw.dynamixel.backend import DynamixelBackend
 from hw.dynamixel.codec import Instruction
-from hw.dynamixel.motors import DynamixelMotors
 from hw.dynamixel.survey import as_table
-from hw.faults import REBOOTED, STOP_BUTTON, TORQUE_LOST, WATCHDOG, describe
-from hw.hal import BackendError, Command, Mode, Observation
-from hw.robot import load_robot
-
-ROBOT = load_robot("op3")
-TICK_NS = 20_000_000
-MOVING = {"goal_position", "goal_velocity", "goal_current", "goal_pwm", "torque_enable"}
-
-
-class Robot:
-    """A scripted OP3 as its file describes it, standing at home, and a loop of its own."""
-
-    def __init__(self) -> None:
-        self.servos = []
-        for joint in ROBOT.joints:
-            servo = Memory("xm430-w350", joint.id)
-            servo.put("return_delay_time", 0)
-            servo.put("present_input_voltage", 120)
-            servo.put("present_temperature", 30 + joint.id)
-            servo.put("present_position", 2048 + round(joint.home / (2 * np.pi) * 4096))
-            low, high = (joint.range[end] / (2 * np.pi) * 4096 for end in (0, 1))
-            servo.put("min_position_limit", 2048 + int(np.floor(low)))
-            servo.put("max_position_limit", 2048 + int(np.ceil(high)))
-            self.servos.append(servo)
-        self.board = Memory("opencr", 200)
-        self.line = ScriptedBus([*self.servos, self.board])
-        self.line.before_answer = lambda packet: self.live()
-        self.noise = 0
-
-    def live(self) -> None:
-        """The IMU's noise, and servos that are where they are told."""
-        self.noise += 1
-        self.board.put("acceleration_z", 16384 + self.noise % 7)
-
-    def backend(self, **options: bool) -> DynamixelBackend:
-        return DynamixelBackend(ROBOT, port=self.line, clock=self.line, **options)
-
-    def joint(self, name: str) -> Memory:
-        return self.servos[ROBOT.names.index(name)]
-
-    def moved(self) -> list[tuple[str, int]]:
-        return [write for servo in self.servos for write in servo.writes if write[0] in MOVING]
+from hw.hal import BackendError, Command, Mode
 
 
 @pytest.fixture
 def robot() -> Robot:
     return Robot()
-
-
-def active(position: np.ndarray | None = None, gain: float = 1.0) -> Command:
-    return Command(ROBOT.home if position is None else position, np.full(20, gain), Mode.ACTIVE)
-
-
-def run(
-    robot: Robot,
-    sensors: DynamixelSensors,
-    motors: DynamixelMotors,
-    ticks: int,
-    until: Callable[[Observation], bool] = lambda o: False,
-) -> tuple[int, Observation]:
-    """Ticks until a condition holds; how many it took."""
-    for tick in range(ticks):
-        robot.line.sleep_until((robot.line.time // TICK_NS + 1) * TICK_NS)
-        observation = sensors.read()
-        if until(observation):
-            return tick + 1, observation
-        motors.write(active())
-    return ticks, observation
 
 
 # Connecting ----------------------------------------------------------------------------------------------------------
@@ -326,108 +263,3 @@ def test_closing_lets_go(robot: Robot) -> None:
     backend.close()
     assert not any(servo.get("torque_enable") for servo in robot.servos)
     backend.close()
-
-
-# What goes wrong -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("joint", ["head_pan", "l_knee", "r_ank_roll"])
-@pytest.mark.parametrize("fault", ["torque", "reboot", "watchdog", "overload", "quiet overload"])
-def test_what_servos_do_not_say_is_seen_within_a_few_ticks(robot: Robot, joint: str, fault: str) -> None:
-    sensors, motors = robot.backend().connect()
-    run(robot, sensors, motors, 3)
-    servo = robot.joint(joint)
-    expected = {"torque": TORQUE_LOST, "reboot": REBOOTED, "watchdog": WATCHDOG, "overload": 32, "quiet overload": 32}[
-        fault
-    ]
-    if fault == "torque":
-        servo.put("torque_enable", 0)
-    elif fault == "reboot":
-        servo.reboot()
-    elif fault == "watchdog":
-        servo.put("bus_watchdog", 255)
-    elif fault == "overload":
-        servo.put("hardware_error_status", 32)
-    else:  # a firmware that does not raise the alert bit
-        servo.put("hardware_error_status", 32)
-        robot.line.fault = lambda id, data: [(data, 0)]
-    ticks, o = run(robot, sensors, motors, 10, lambda o: bool(o.fault.any()))
-    assert ticks <= (1 if fault == "overload" else 6)
-    assert [ROBOT.names[i] for i in np.flatnonzero(o.fault)] == [joint]
-    assert o.fault.max() & expected
-    assert describe(int(o.fault.max()))
-
-
-def test_an_error_does_not_let_torque_on(robot: Robot) -> None:
-    robot.joint("l_knee").put("hardware_error_status", 4)
-    sensors, motors = robot.backend().connect()
-    assert sensors.read().fault[ROBOT.names.index("l_knee")] == 4
-    with pytest.raises(BackendError, match=r"l_knee \(ID 14\) reports overheating"):
-        motors.write(active())
-    assert not any(servo.get("torque_enable") for servo in robot.servos)
-
-
-def test_every_temperature_and_voltage_comes_round(robot: Robot) -> None:
-    sensors, motors = robot.backend().connect()
-    seen = np.full(20, np.nan)
-    for _ in range(5):
-        _, o = run(robot, sensors, motors, 1)
-        assert np.isfinite(o.temperature).sum() == 4, "what was not read is not invented"
-        seen = np.where(np.isfinite(o.temperature), o.temperature, seen)
-    np.testing.assert_array_equal(seen, [30 + joint.id for joint in ROBOT.joints])
-
-
-def test_a_silent_servo_is_nan_and_ages_and_the_others_stay(robot: Robot) -> None:
-    sensors, motors = robot.backend().connect()
-    run(robot, sensors, motors, 2)
-    knee = ROBOT.names.index("l_knee")
-    robot.servos[knee].answers = False
-    ages = []
-    for _ in range(4):
-        _, o = run(robot, sensors, motors, 1)
-        assert np.flatnonzero(np.isnan(o.position)).tolist() == [knee]
-        ages.append(o.age[knee])
-        assert np.delete(o.age, knee).max() < 0.02
-        assert robot.line.time % TICK_NS < TICK_NS * 0.75, "the tick is not missed"
-    assert np.diff(ages) == pytest.approx([0.02] * 3, abs=0.006)  # the first tick took longer
-
-
-@pytest.mark.parametrize("kind", ["dead", "frozen", "silent"])
-def test_an_imu_that_does_not_live_is_not_believed(robot: Robot, kind: str) -> None:
-    sensors, motors = robot.backend().connect()
-    run(robot, sensors, motors, 2)
-    if kind == "silent":
-        robot.board.answers = False
-    else:
-        robot.line.before_answer = None
-        if kind == "dead":
-            robot.board.put("acceleration_z", 0)
-    ticks, o = run(robot, sensors, motors, 10, lambda o: bool(np.isnan(o.specific_force).all()))
-    assert ticks <= 4
-    _, o = run(robot, sensors, motors, 3)
-    assert o.imu_age > 0.05
-    assert np.isfinite(o.position).all()
-
-
-def test_the_boards_button_stops_the_robot(robot: Robot) -> None:
-    sensors, motors = robot.backend().connect()
-    run(robot, sensors, motors, 2)
-    robot.board.put("button", 1)
-    _, o = run(robot, sensors, motors, 1)
-    assert (o.fault & STOP_BUTTON).all()
-    robot.board.put("button", 0)
-    _, o = run(robot, sensors, motors, 1)
-    assert (o.fault & STOP_BUTTON).all(), "letting go does not start it again"
-
-
-def test_a_port_that_vanishes_is_said(robot: Robot) -> None:
-    backend = robot.backend()
-    sensors, motors = backend.connect()
-    run(robot, sensors, motors, 2)
-    robot.line.gone = True
-    with pytest.raises(BackendError, match="gone"):
-        sensors.read()
-    with pytest.raises(BackendError, match="gone"):
-        motors.write(active())
-    with pytest.raises(BackendError, match="gone"):
-        backend.close()

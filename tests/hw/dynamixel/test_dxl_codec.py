@@ -268,6 +268,38 @@ def test_garbage_is_no_fast_frame(garbage: bytes) -> None:
     )
 
 
+@given(st.integers(0, 287), st.integers(0, 255), st.integers(1, 5))
+def test_the_quick_way_through_a_fast_frame_agrees_with_the_careful_one(place: int, change: int, seed: int) -> None:
+    """It takes a frame only when there is nothing to say against any block."""
+    rng = random.Random(seed)
+    frame = codec.fast_status([(id, 0, rng.randbytes(10)) for id in FAST_IDS])
+    damaged = bytearray(frame)
+    damaged[place] ^= change
+    got = codec.whole_fast(bytes(damaged), codec.fast_head(LENGTHS), bytes(FAST_IDS), 10)
+    careful = codec.parse_fast(bytes(damaged), FAST_IDS, LENGTHS)
+    assert got == (None if change else [s.data for s in careful if s])
+    assert codec.whole_fast(frame + b"x", codec.fast_head(LENGTHS), bytes(FAST_IDS), 10) is None
+    assert codec.whole_fast(frame, codec.fast_head(LENGTHS), bytes(reversed(FAST_IDS)), 10) is None
+
+
+@given(st.integers(0, 62), st.integers(0, 255), st.lists(PARAMS.filter(lambda p: len(p) >= 10), min_size=3, max_size=3))
+def test_the_quick_way_through_plain_answers_agrees_with_the_careful_one(
+    place: int, change: int, payloads: list[bytes]
+) -> None:
+    stream = bytearray(b"".join(codec.status(i + 1, 0, data[:10]) for i, data in enumerate(payloads)))
+    stream[place] ^= change
+    got = codec.whole_sync(bytes(stream), [codec.status_head(i, 10) for i in (1, 2, 3)], 10)
+    if got is not None:
+        assert [p.params[1:] for p in parse(bytes(stream))] == got
+    elif not change:
+        assert any(HEADER[:3] in data[:10] for data in payloads), "only stuffing needs care here"
+
+
+def test_an_alert_takes_the_careful_way() -> None:
+    frame, _ = fast_frame()
+    assert codec.whole_fast(frame, codec.fast_head(LENGTHS), bytes(FAST_IDS), 10) is None
+
+
 # What is refused before it is sent -----------------------------------------------------------------------------------
 
 
