@@ -128,8 +128,8 @@ def fall(s: Step) -> Array:
 TERMS: Mapping[str, Callable[[Step], Array]] = {
     term.__name__: term
     for term in (
-        velocity, progress, yaw_rate, pose, contact, clearance, upright, height, sway_rate, slip, level_feet, impact, target_rate,
-        target_acceleration, effort, fall,
+        velocity, progress, yaw_rate, pose, contact, clearance, upright, height, sway_rate, slip, level_feet, impact,
+        target_rate, target_acceleration, effort, fall,
     )
 }  # fmt: skip
 

@@ -19,8 +19,8 @@ class Weights:
 
     velocity: float = 1.0  # per (m/s)^2
     yaw_rate: float = 0.1  # per (rad/s)^2
-    displacement: float = 10.0  # per m^2
-    yaw: float = 1.0  # per rad^2
+    displacement: float = 1.0  # per m^2
+    yaw: float = 0.1  # per rad^2
 
     def __post_init__(self) -> None:
         for key in ("velocity", "yaw_rate", "displacement", "yaw"):

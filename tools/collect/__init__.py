@@ -182,7 +182,7 @@ def _provenance(
 
     from policy.checkpoint import git_commit
     from tools.collect.recorder import FALL_SECONDS, SHORTEST_SECONDS
-    from tools.collect.skills import SEGMENT_SECONDS, SKILLS
+    from tools.collect.skills import SKILLS
 
     def plain(values: Mapping[str, Any]) -> dict[str, Any]:
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
@@ -199,7 +199,7 @@ def _provenance(
         "mirroring": MIRRORING,
         "episodes": {"ticks": recorder.ticks, "dropped_before_fall": FALL_SECONDS, "shortest": SHORTEST_SECONDS},
         "commands": {
-            "segment_seconds": list(SEGMENT_SECONDS),
+            "segment_seconds": {skill.name: list(skill.seconds) for skill in SKILLS},
             "skills": [
                 {"name": s.name, "weight": s.weight, "boxes": [plain(asdict(box)) for box in s.boxes]} for s in SKILLS
             ],

@@ -28,6 +28,7 @@ class Skill:
     text: str
     boxes: tuple[Box, ...]
     weight: float = 1.0
+    seconds: Range = (2.0, 6.0)  # that a command lasts
 
     def draw(self, rng: np.random.Generator) -> Array:
         """A command `(3,)`."""
@@ -37,9 +38,10 @@ class Skill:
 
 
 # Their numbers are the dataset's task indices. Turning and walking mixed weigh more: they are most of what steering
-# to a goal asks for. Creeping covers the slow end, where a robot arrives.
+# to a goal asks for. Creeping covers the slow end, where a robot arrives. Standing is short and frequent: a model that
+# has seen long standing alone plans to start later, for ever.
 SKILLS: tuple[Skill, ...] = (
-    Skill("stand", "stand still", (Box(),)),
+    Skill("stand", "stand still", (Box(),), 4.0, (0.3, 1.2)),
     Skill("forward", "walk forward", (Box(forward=(0.05, 0.4)),), 2.0),
     Skill("backward", "walk backward", (Box(forward=(-0.12, -0.03)),)),
     Skill("side", "step sideways", (Box(left=(0.04, 0.12)), Box(left=(-0.12, -0.04)))),
@@ -48,7 +50,6 @@ SKILLS: tuple[Skill, ...] = (
     Skill("any", "walk and turn in any direction", (Box((-0.12, 0.3), (-0.1, 0.1), (-0.8, 0.8)),), 2.0),
     Skill("creep", "creep slowly in any direction", (Box((-0.06, 0.06), (-0.06, 0.06), (-0.2, 0.2)),)),
 )
-SEGMENT_SECONDS: Range = (2.0, 6.0)  # that a command lasts
 
 _SHARES = np.cumsum([skill.weight for skill in SKILLS]) / sum(skill.weight for skill in SKILLS)
 
@@ -72,5 +73,5 @@ class Commands:
             rng = rngs[i]
             self.skill[i] = int(np.searchsorted(_SHARES, rng.random(), side="right"))
             self.velocity[i] = SKILLS[self.skill[i]].draw(rng)
-            self._left[i] = round(rng.uniform(*SEGMENT_SECONDS) * self._rate)
+            self._left[i] = round(rng.uniform(*SKILLS[self.skill[i]].seconds) * self._rate)
         self._left -= 1

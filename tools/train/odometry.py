@@ -54,7 +54,7 @@ def main(args: argparse.Namespace) -> int:
         "odometry",
         robot,
         config={"hidden": [len(bias) for _, bias in network.layers[:-1]]},
-        data=f"{args.worlds} randomised worlds of {args.seconds:g} s walked by gait and {args.policy}, seed {args.seed}",
+        data=f"{args.worlds} randomised worlds, {args.seconds:g} s of gait and {args.policy}, seed {args.seed}",
         licence="Apache-2.0",
         results={"drift_p90": round(after.p90, 4), "drift_p90_legs_alone": round(before.p90, 4)},
     )
