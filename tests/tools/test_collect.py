@@ -172,8 +172,10 @@ def test_command_and_task_go_together_and_last(table: pa.Table) -> None:
     at = np.flatnonzero(changes & same_episode)
     assert len(at) > 0
     episode = table["episode_index"].to_numpy()
-    gaps = np.diff(at)[episode[at[1:]] == episode[at[:-1]]]
-    assert (gaps >= 100).all()
+    whole = episode[at[1:]] == episode[at[:-1]]
+    gaps, skill_of = np.diff(at)[whole], task[at[1:]][whole]  # the command that ends at a change began at the last
+    shortest = np.array([round(skill.seconds[0] * 50) for skill in SKILLS])
+    assert (gaps >= shortest[skill_of]).all()
 
 
 def test_same_options_same_files(collected: Path, tmp_path: Path) -> None:
