@@ -38,10 +38,10 @@ class Skill:
 
 
 # Their numbers are the dataset's task indices. Turning and walking mixed weigh more: they are most of what steering
-# to a goal asks for. Creeping covers the slow end, where a robot arrives. Standing is short and frequent: a model that
-# has seen long standing alone plans to start later, for ever.
+# to a goal asks for. Creeping covers the slow end, where a robot arrives. Standing lasts little longer than coming to
+# rest does: a model that has mostly seen rest go on plans to start later, for ever.
 SKILLS: tuple[Skill, ...] = (
-    Skill("stand", "stand still", (Box(),), 4.0, (0.3, 1.2)),
+    Skill("stand", "stand still", (Box(),), 3.0, (1.0, 1.8)),
     Skill("forward", "walk forward", (Box(forward=(0.05, 0.4)),), 2.0),
     Skill("backward", "walk backward", (Box(forward=(-0.12, -0.03)),)),
     Skill("side", "step sideways", (Box(left=(0.04, 0.12)), Box(left=(-0.12, -0.04)))),
@@ -50,6 +50,7 @@ SKILLS: tuple[Skill, ...] = (
     Skill("any", "walk and turn in any direction", (Box((-0.12, 0.3), (-0.1, 0.1), (-0.8, 0.8)),), 2.0),
     Skill("creep", "creep slowly in any direction", (Box((-0.06, 0.06), (-0.06, 0.06), (-0.2, 0.2)),)),
 )
+FIRST_SECONDS: Range = (0.1, 0.6)  # of standing that an episode begins with: a run starts from rest
 
 _SHARES = np.cumsum([skill.weight for skill in SKILLS]) / sum(skill.weight for skill in SKILLS)
 
@@ -62,16 +63,19 @@ class Commands:
         self.velocity = np.zeros((n, 3))  # what is asked: m/s forward, m/s left, rad/s
         self.skill = np.zeros(n, int)  # number in SKILLS
         self._left = np.zeros(n, int)  # ticks until the next change
+        self._first = np.ones(n, bool)
 
     def reset(self, ids: Array) -> None:
         """A new command is due in the worlds `ids`."""
-        self._left[ids] = 0
+        self._left[ids], self._first[ids] = 0, True
 
     def advance(self, rngs: list[np.random.Generator]) -> None:
         """Draw the commands that are due; call it once a tick, before reading `velocity`."""
         for i in np.flatnonzero(self._left == 0):
             rng = rngs[i]
-            self.skill[i] = int(np.searchsorted(_SHARES, rng.random(), side="right"))
-            self.velocity[i] = SKILLS[self.skill[i]].draw(rng)
-            self._left[i] = round(rng.uniform(*SKILLS[self.skill[i]].seconds) * self._rate)
+            self.skill[i] = 0 if self._first[i] else int(np.searchsorted(_SHARES, rng.random(), side="right"))
+            skill = SKILLS[self.skill[i]]
+            self.velocity[i] = skill.draw(rng)
+            self._left[i] = round(rng.uniform(*(FIRST_SECONDS if self._first[i] else skill.seconds)) * self._rate)
+            self._first[i] = False
         self._left -= 1

@@ -54,6 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", default="op3", help="robot name or file (default op3)")
     parser.add_argument("--minutes", type=float, default=d.minutes, help="training time; evaluations come on top")
     parser.add_argument("--resume", action=argparse.BooleanOptionalAction, default=True, help="continue in --out")
+    parser.add_argument("--init", type=Path, help="checkpoint to begin from; its normalisation is kept")
     parser.add_argument("--batch", type=int, default=d.batch)
     parser.add_argument("--learning-rate", type=float, default=d.learning_rate)
     parser.add_argument("--layers", type=int, default=2)
@@ -96,8 +97,8 @@ def main(args: argparse.Namespace) -> int:
     windows = Windows(recording, robot, config)
     source = f"{args.data.resolve().name}: {len(recording.spans)} episodes, {len(recording.raw)} ticks"
     trainer = Trainer(windows, robot, config, settings, args.out, source, args.licence, survival)
-    if args.resume:
-        trainer.resume()
+    if not (args.resume and trainer.resume()) and args.init is not None:
+        trainer.begin_from(args.init)
     trainer.run()
     return 0
 
@@ -156,6 +157,17 @@ class Trainer:
         self.evaluated = 0.0  # training time at the last evaluation
         self.best: tuple[float, float] | None = None  # survival, minus the validation loss
         out.mkdir(parents=True, exist_ok=True)
+
+    def begin_from(self, path: Path) -> None:
+        """Take weights and normalisation of a checkpoint, to go on with other data. Raises ConfigError."""
+        from policy.diffusion.checkpoint import load
+
+        model = load(path, self.robot)
+        if model.config != self.config:
+            raise ConfigError(f"{path}: another network than the options ask for: {model.config}")
+        self.network.load_state_dict(model.denoiser.state_dict())
+        self.average.weights = {name: p.detach().clone() for name, p in self.network.named_parameters()}
+        self.windows.states, self.windows.actions = model.states, model.actions
 
     # -- a run -----------------------------------------------------------------------------------------------------
 
