@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from hw.config import ConfigError, load_marked, resolve
 from hw.hal import Array
@@ -186,4 +187,9 @@ def load_robot(name: str | Path = "op3") -> Robot:
     return robot
 
 
-__all__ = ["ConfigError", "Joint", "Robot", "Servo", "load_robot", "load_servo"]
+def save_robot(robot: Robot, path: Path) -> None:
+    """Write a file that `load_robot` reads as the same robot, on this machine: its paths are absolute."""
+    path.write_text(yaml.safe_dump(asdict(robot), sort_keys=False))
+
+
+__all__ = ["ConfigError", "Joint", "Robot", "Servo", "load_robot", "load_servo", "save_robot"]

@@ -19,7 +19,10 @@ class Kind:
     simulated: bool
 
 
-BACKENDS = {"sim": Kind("sim.backend", "SimBackend", simulated=True)}
+BACKENDS = {
+    "sim": Kind("sim.backend", "SimBackend", simulated=True),
+    "virtual": Kind("sim.rig.backend", "VirtualBackend", simulated=True),
+}
 
 
 def backend_kind(name: str) -> Kind:

@@ -31,6 +31,7 @@ VERBS: dict[str, Verb] = {
     "doctor": Verb("check whether this machine is ready", "tools.doctor"),
     "run": Verb("run a task on a robot", "tools.run"),
     "rollout": Verb("run a task many times in simulation and measure it", "tools.rollout"),
+    "virtual": Verb("serve a virtual rig on a serial port", "tools.virtual"),
     "collect": Verb("record demonstrations of the expert as a dataset", "tools.collect"),
     "train": Verb(
         "train a network",

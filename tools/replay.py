@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hw.config import ConfigError
+from stack.backends import BACKENDS
 from stack.event import Event
 from stack.flightlog import FlightLog, read_log
 from stack.logformat import MACHINE_DEPENDENT, messages, plain
@@ -65,8 +66,11 @@ def main(args: argparse.Namespace) -> int:
 def replay(log: FlightLog) -> tuple[int, Difference | None]:
     """Repeat a log's run: how many ticks were compared, and the first difference. Raises ConfigError."""
     settings = _settings(log)
-    if log.header["backend"] != "sim":
-        raise ConfigError(f"{log.path}: recorded on '{log.header['backend']}': only simulated runs can be repeated")
+    body = log.header["backend"]
+    if body not in BACKENDS or not BACKENDS[body].simulated:
+        raise ConfigError(f"{log.path}: recorded on '{body}': only simulated runs can be repeated")
+    if body != settings.backend:
+        raise ConfigError(f"{log.path}: recorded with a program's own backend: only that program can repeat it")
     if log.header["policy"]["name"] != settings.policy:
         raise ConfigError(f"{log.path}: recorded with a program's own policy: only that program can repeat it")
     stops = [Event(**event) for event in log.messages["/event"] if event["kind"] in ("interrupt", "record")]

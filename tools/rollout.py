@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", help="see `servoid tasks`")
     parser.add_argument("--episodes", type=int, default=50, help="(default: %(default)s)")
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one a core)")
-    parser.add_argument("--backend", default="sim", help="(default: %(default)s)")
+    parser.add_argument("--backend", default="sim", help="sim or virtual (default: %(default)s)")
     parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
     parser.add_argument("--policy", default="diffusion", help="diffusion, expert or gait (default: %(default)s)")
     parser.add_argument("--randomise", action="store_true", help="draw the robot anew for each episode")

@@ -38,7 +38,7 @@ WORDS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", help="what to do (servoid tasks)")
-    parser.add_argument("--backend", default="sim", help="body to run on (default: sim)")
+    parser.add_argument("--backend", default="sim", help="body to run on: sim (default) or virtual")
     parser.add_argument("--port", metavar="PATH", help="serial port of the robot")
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     parser.add_argument("--policy", default="diffusion", help="controller: diffusion (default), expert or gait")
@@ -59,6 +59,7 @@ def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         if args.video is not None:
             _prepare_video(args.video)
+        from stack.backends import backend_kind
         from stack.session import Settings, run
         from tools.live import LiveLine
 
@@ -74,7 +75,7 @@ def main(args: argparse.Namespace) -> int:
             set=settings(args),
             start=args.start,
             record=args.record or _default_log(args.task),
-            realtime=(watched and not args.fast) if args.backend == "sim" else None,
+            realtime=(watched and not args.fast) if backend_kind(args.backend).simulated else None,
             port=args.port,
         )
         live = LiveLine(sys.stderr if args.json else sys.stdout)

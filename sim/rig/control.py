@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hw.hal import Array, BackendError
-from hw.robot import Robot, load_robot
+from hw.robot import Robot, load_robot, save_robot
 from sim.model import build
 from sim.truth import Truth
 
@@ -143,7 +143,7 @@ class RigProcess:
 
     def __init__(
         self,
-        robot: str | Path = "op3",
+        robot: str | Path | Robot = "op3",
         *,
         clock: Literal["real", "locked"] = "locked",
         seed: int = 0,
@@ -151,10 +151,13 @@ class RigProcess:
         faults: str | Path | None = None,
         linger: float = 10.0,
     ) -> None:
-        """Raises BackendError with the reason when the rig does not start."""
-        self.robot = load_robot(robot)
+        """`robot` is a name, a file, or a robot as it is. Raises BackendError with the reason if it does not start."""
+        self.robot = robot if isinstance(robot, Robot) else load_robot(robot)
         self._folder = tempfile.TemporaryDirectory(prefix="servoid-rig-")
         control = str(Path(self._folder.name) / "control")
+        if isinstance(robot, Robot):
+            robot = Path(self._folder.name) / "robot.yaml"
+            save_robot(self.robot, robot)
         command = [
             sys.executable,
             "-m",
@@ -171,15 +174,24 @@ class RigProcess:
         command += ["--faults", str(faults)] if faults else []
         # A session of its own: Ctrl-C in the terminal is meant for the controller.
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True)
+        try:
+            started = self._first_line()
+            if "error" in started:
+                raise BackendError(f"the virtual rig did not start: {started['error']}")
+            self.port: str = started["port"]
+            self.control_path: str = started["control"]
+            self.control = Control(self.control_path)
+        except BaseException:  # Ctrl-C among them: nobody else knows of the process yet
+            self._end()
+            raise
+
+    def _first_line(self) -> dict[str, Any]:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
-        started = json.loads(line) if line else {"error": f"ended with code {self.process.wait(_START_SECONDS)}"}
-        if "error" in started:
-            self._folder.cleanup()
-            raise BackendError(f"the virtual rig did not start: {started['error']}")
-        self.port: str = started["port"]
-        self.control_path: str = started["control"]
-        self.control = Control(self.control_path)
+        if not line:
+            return {"error": f"ended with code {self.process.wait(_START_SECONDS)}"}
+        started: dict[str, Any] = json.loads(line)
+        return started
 
     def truth(self) -> RigTruth:
         return RigTruth(self.control, self.robot)
@@ -187,6 +199,9 @@ class RigProcess:
     def close(self) -> None:
         """End the rig."""
         self.control.close()
+        self._end()
+
+    def _end(self) -> None:
         self.process.terminate()
         try:
             self.process.wait(5.0)

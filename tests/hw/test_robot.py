@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hw.config import CONFIGS, ConfigError
-from hw.robot import load_robot, load_servo
+from hw.robot import load_robot, load_servo, save_robot
 
 PI = np.pi
 
@@ -169,3 +170,28 @@ def test_a_robot_may_bring_its_own_servo_and_model(tmp_path: Path, monkeypatch: 
     monkeypatch.chdir("/")
     assert [servo.stall_torque for servo in robot.servos[2:5]] == [2.95, 5.0, 2.95]
     assert robot.mjcf == str(tmp_path / "op3.xml")
+
+
+def test_a_saved_robot_is_the_same_robot_wherever_it_lies(tmp_path: Path) -> None:
+    """Another process emulates the robot that this one holds, changes to it included."""
+    robot = load_robot()
+    bus = replace(robot.bus, baud=1_000_000)
+    imu = replace(robot.imu, gyro_noise=1e-5, signs=(-1.0, 1.0, -1.0))
+    joints = (replace(robot.joints[0], zero=0.1), *robot.joints[1:])
+    for each in (robot, replace(robot, bus=bus, imu=imu, joints=joints)):
+        save_robot(each, tmp_path / "saved.yaml")
+        assert load_robot(tmp_path / "saved.yaml") == each
+
+
+def test_a_saved_robot_finds_its_own_servo_file(tmp_path: Path) -> None:
+    (tmp_path / "design").mkdir()
+    text = (CONFIGS / "robots" / "op3.yaml").read_text().replace("xm430-w350", "mine.yaml")
+    (tmp_path / "design" / "robot.yaml").write_text(text)
+    for name, source in (
+        ("mine.yaml", CONFIGS / "servos" / "xm430-w350.yaml"),
+        ("op3.xml", CONFIGS / "robots" / "op3.xml"),
+    ):
+        (tmp_path / "design" / name).write_bytes(source.read_bytes())
+    robot = load_robot(tmp_path / "design" / "robot.yaml")
+    save_robot(robot, tmp_path / "saved.yaml")
+    assert load_robot(tmp_path / "saved.yaml").servos == robot.servos

@@ -115,6 +115,7 @@ def test_what_only_a_program_can_repeat_is_refused(capsys):
 
     for key, value, message in (
         ("backend", "dynamixel", "only simulated"),
+        ("backend", "virtual", "own backend"),
         ("policy", {"name": "MyPolicy"}, "own policy"),
     ):
         log = read_log("a.mcap")

@@ -1,0 +1,168 @@
+"""The virtual rig as a body: the hardware backend itself, opened on the serial port of a rig in a process of its own.
+
+Between the loop and physics are real bytes, at the speed of a real line; only time is the rig's, which stands still
+while the controller thinks, so that a run comes out the same every time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
+from hw.dynamixel.motors import DynamixelMotors
+from hw.hal import Array, BackendError, Clock, Truth
+from hw.robot import Robot
+from sim.rig.control import LockedClock, RigProcess, RigTruth
+
+
+class VirtualBackend:
+    """A robot of emulated servos, the same draw as `sim.backend.SimBackend` makes of a seed.
+
+    `truth` and `push` are for evaluation alone; they go over the rig's control socket and never over its bus.
+    """
+
+    name = "virtual"
+    clock: Clock
+
+    def __init__(self, robot: Robot, *, seed: int = 0, randomise: bool = False) -> None:
+        self.clock = self._clock = VirtualClock()
+        self.truth: Truth = VirtualTruth(self)
+        self._robot, self._seed, self._randomise = robot, seed, randomise
+        self._rig: RigProcess | None = None
+        self._rig_truth: RigTruth | None = None
+        self._body: DynamixelBackend | None = None
+
+    @property
+    def rig(self) -> RigProcess:
+        """The rig. Raises BackendError when not connected."""
+        if self._rig is None:
+            raise BackendError("the virtual rig is not connected")
+        return self._rig
+
+    def connect(self) -> tuple[DynamixelSensors, DynamixelMotors]:
+        """Start the rig and find its servos. The robot is held just above the floor until all servos have torque.
+
+        Raises BackendError when the rig does not start or is not as the robot's file says; nothing is left behind.
+        """
+        if self._rig is not None:
+            raise BackendError("the virtual rig is connected already")
+        try:
+            rig = self._rig = RigProcess(self._robot, seed=self._seed, randomise=self._randomise)
+            self._rig_truth = rig.truth()
+            self._clock.attach(rig)
+            self._body = DynamixelBackend(self._robot, port=rig.port, clock=self.clock, name=self.name)
+            handles = self._body.connect()
+        except BaseException:
+            self.close()
+            raise
+        # Ticks begin on a step of physics, as in simulation: a goal then acts from the same step on.
+        period = round(self._robot.dt * 1e9)
+        self.clock.sleep_until(-(-self.clock.now_ns() // period) * period)
+        return handles
+
+    def push(self, velocity: Array) -> None:
+        """Change the base's velocity by `(2,)` m/s, world frame, before time goes on."""
+        self._clock.pushes.append(np.array(velocity, dtype=float))
+
+    def close(self) -> None:
+        """Torque off, acknowledged, then the end of the rig. Raises BackendError when torque may still be on."""
+        rig, body = self._rig, self._body
+        self._rig = self._body = self._rig_truth = None
+        try:
+            if body is not None:
+                body.close()
+        finally:
+            self._clock.detach()
+            if rig is not None:
+                rig.close()
+
+    def _fetch(self) -> Truth:
+        if self._rig_truth is None:
+            raise BackendError("the virtual rig is not connected: it has no truth")
+        self._clock.deliver()
+        return self._rig_truth.fetch()
+
+
+class VirtualClock:
+    """The locked time of a rig [ns]; 0 before it is attached, and standing still once it is detached.
+
+    Pushes wait here until time goes on: whoever asks for one may be broken off by a second Ctrl-C, which must not cut
+    a request to the rig in half.
+    """
+
+    def __init__(self) -> None:
+        self.pushes: list[Array] = []
+        self._rig: RigProcess | None = None
+        self._locked: LockedClock | None = None
+        self._last = 0
+
+    def attach(self, rig: RigProcess) -> None:
+        self._rig, self._locked = rig, LockedClock(rig.control)
+
+    def detach(self) -> None:
+        self._last = self.now_ns()
+        self._rig = self._locked = None
+        self.pushes.clear()
+
+    def now_ns(self) -> int:
+        return self._last if self._locked is None else self._locked.now_ns()
+
+    def sleep_until(self, time_ns: int) -> None:
+        """Let the rig live until then. Raises BackendError when the rig is gone."""
+        if self._locked is None:
+            raise BackendError("the virtual rig is not connected: its time stands still")
+        self.deliver()
+        self._locked.sleep_until(time_ns)
+
+    def deliver(self) -> None:
+        """Send the pushes that wait."""
+        while self.pushes and self._rig is not None:
+            self._rig.control.push(self.pushes.pop(0))
+
+
+class VirtualTruth:
+    """A live view of the truth about a rig's robot, fetched once for each instant that somebody looks.
+
+    Raises BackendError when the rig is not connected.
+    """
+
+    def __init__(self, backend: VirtualBackend) -> None:
+        self._backend = backend
+        self._time: int | None = None
+        self._truth: Truth | None = None
+
+    def _now(self) -> Truth:
+        clock = self._backend._clock
+        if self._truth is None or self._time != clock.now_ns() or clock.pushes:
+            self._truth, self._time = self._backend._fetch(), clock.now_ns()
+        return self._truth
+
+    @property
+    def position(self) -> Array:
+        """Base position `(1, 3)` m."""
+        return self._now().position
+
+    @property
+    def yaw(self) -> Array:
+        """Heading `(1,)` rad in -pi..pi."""
+        return self._now().yaw
+
+    @property
+    def gravity(self) -> Array:
+        """Unit vector along gravity in the base frame `(1, 3)`."""
+        return self._now().gravity
+
+    @property
+    def velocity(self) -> Array:
+        """Base velocity `(1, 3)` m/s in the heading frame."""
+        return self._now().velocity
+
+    @property
+    def angular_velocity(self) -> Array:
+        """Base angular velocity `(1, 3)` rad/s in the base frame."""
+        return self._now().angular_velocity
+
+    @property
+    def fallen(self) -> Array:
+        """Whether the robot has fallen `(1,)`."""
+        return self._now().fallen
