@@ -12,7 +12,7 @@ from policy.diffusion.schedule import ddim_levels
 class GuidanceSettings:
     """Loss guidance: see `policy.diffusion.sampler.Guidance`. A weight of 0 turns it off."""
 
-    weight: float = 200.0
+    weight: float = 1500.0
     clip: float = 6.0
     gradient: str = "analytic"
 
@@ -28,9 +28,9 @@ class DiffusionSettings:
     """Settings of the diffusion policy; ticks are those of the control loop."""
 
     checkpoint: str = "diffusion"  # a shipped one, or the path of a .safetensors file
-    steps: int = 5  # network calls a plan
+    steps: int = 10  # network calls a plan
     lead: int = 1  # extra calls by which the states are finished before the actions
-    replan: int = 4  # ticks between requests
+    replan: int = 12  # ticks between requests
     delay: int = 2  # ticks from a request to the adoption of its plan
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
 

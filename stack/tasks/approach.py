@@ -13,14 +13,14 @@ from hw.hal import Array
 @dataclass(frozen=True)
 class Approach:
     speed: float = 0.25  # m/s forward, far from the goal
-    creep: float = 0.06  # m/s that a walking robot keeps to until it stops: slower steps hardly move it
+    creep: float = 0.12  # m/s that a walking robot keeps to until it stops: slower steps hardly move it
     reverse: float = 0.08  # m/s backward at most, near the goal
     lateral: float = 0.08  # m/s to either side at most, near the goal
     yaw_rate: float = 0.8  # rad/s at most
     turn_gain: float = 1.5  # rad/s per rad of bearing
     turn_first: float = 1.0  # rad of bearing from which the robot turns on the spot
     brake: float = 0.4  # m from the goal at which to slow down
-    near: float = 0.2  # m from the goal within which steps go in any direction
+    near: float = 0.0  # m from the goal within which steps go in any direction
 
     def __post_init__(self) -> None:
         for key in ("speed", "creep", "yaw_rate", "turn_gain", "turn_first", "brake"):

@@ -24,8 +24,8 @@ class GoalSettings(Settings):
     x: Annotated[float | None, "m ahead of the start: fixes the goal (y is 0 unless given)"] = None
     y: Annotated[float | None, "m to the left of the start: fixes the goal (x is 0 unless given)"] = None
     radius: Annotated[float, "m from the goal that count as reached"] = 0.1
-    arrive: Annotated[float, "m from the goal at which to stop"] = 0.04
-    leave: Annotated[float, "m from the goal at which to start again"] = 0.07
+    arrive: Annotated[float, "m from the goal at which to stop"] = 0.09
+    leave: Annotated[float, "m from the goal at which to start again"] = 0.13
     approach: Annotated[Approach, "speed profile"] = field(default_factory=Approach)
 
     def __post_init__(self) -> None:

@@ -13,6 +13,9 @@ import numpy as np
 from hw.hal import Array
 
 
+_STANDING = 1e-3  # m/s and rad/s: an instructed twist below it means to stand
+
+
 @dataclass(frozen=True)
 class Weights:
     """Weights of squared errors."""
@@ -21,9 +24,10 @@ class Weights:
     yaw_rate: float = 0.1  # per (rad/s)^2
     displacement: float = 1.0  # per m^2
     yaw: float = 0.1  # per rad^2
+    stand: float = 10.0  # per (m/s)^2 of each tick's velocity, where nothing but standing is asked
 
     def __post_init__(self) -> None:
-        for key in ("velocity", "yaw_rate", "displacement", "yaw"):
+        for key in ("velocity", "yaw_rate", "displacement", "yaw", "stand"):
             if getattr(self, key) < 0.0:
                 raise ValueError(f"{key}: a weight must not be negative")
 
@@ -68,4 +72,7 @@ def twist_cost(trajectory: Trajectory, velocity: Array, weights: Weights) -> Any
     cost = cost + weights.yaw_rate * (trajectory.yaw_rate.mean(-1) - twist[..., 2]) ** 2
     short = trajectory.displacement[..., -1, :] - as_tensor(place[..., 0, :])
     cost = cost + weights.displacement * (short**2).sum(-1)
-    return cost + weights.yaw * (trajectory.yaw[..., -1] - as_tensor(yaw[..., 0])) ** 2
+    cost = cost + weights.yaw * (trajectory.yaw[..., -1] - as_tensor(yaw[..., 0])) ** 2
+    # Stepping on the spot has no mean velocity either: who is told to stand shall not sway.
+    stand = as_tensor((np.abs(np.asarray(velocity, dtype=float)).max(-1) < _STANDING).astype(float))
+    return cost + stand * weights.stand * (trajectory.velocity**2).sum(-1).mean(-1)

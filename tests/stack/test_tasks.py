@@ -245,7 +245,7 @@ def test_goal_is_drawn_at_every_bearing_and_told_in_the_heading_frame() -> None:
 
 def test_goal_stops_with_hysteresis() -> None:
     """Without it an estimate that wanders by a millimetre would start and stop the robot at every tick."""
-    task = load_task("goal", {"x": "1"}, DT)
+    task = load_task("goal", {"x": "1", "arrive": "0.04", "leave": "0.07"}, DT)
     task.reset(np.random.default_rng(0))
     moving = []
     for tick, x in enumerate([0.95, 0.97, 0.94, 0.935, 0.92, 0.94]):
