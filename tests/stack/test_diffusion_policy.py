@@ -140,7 +140,7 @@ def settings(tmp_path: Path) -> DiffusionSettings:
     actions = Normaliser(torch.tensor(ROBOT.home, dtype=torch.float32), torch.full((20,), 0.1))
     facts: dict[str, Any] = {"data": "none", "licence": "none", "results": {}, "training": {}}
     checkpoint.save(path, Denoiser(config).state_dict(), config, states, actions, ROBOT, **facts)
-    return DiffusionSettings(checkpoint=str(path), delay=2)
+    return DiffusionSettings(checkpoint=str(path), steps=5, replan=4, delay=2)
 
 
 def trace(policy: DiffusionPolicy, seed: int, wait: bool) -> Array:

@@ -6,6 +6,7 @@ import json
 import pytest
 
 from hw.config import ConfigError
+from policy.diffusion.settings import load_settings
 from tools.bench import policy
 
 
@@ -26,7 +27,7 @@ def test_it_prints_one_row_for_each_kind_of_guidance(capfd: pytest.CaptureFixtur
     ]
     for row in rows:
         assert row["tokens"] == 39
-        assert row["calls_per_plan"] == 6
+        assert row["calls_per_plan"] == load_settings().steps + load_settings().lead
         assert 0 < row["call_median_ms"] <= row["call_p99_ms"]
         # A plan is at least its network calls.
         assert row["plan_median_ms"] > 3 * row["call_median_ms"]
