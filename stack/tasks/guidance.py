@@ -12,7 +12,6 @@ import numpy as np
 
 from hw.hal import Array
 
-
 _STANDING = 1e-3  # m/s and rad/s: an instructed twist below it means to stand
 
 
