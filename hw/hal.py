@@ -218,6 +218,7 @@ class Instruction:
 
     velocity: Array  # (..., 3) m/s forward, m/s left, rad/s: base, heading frame
     goal: Array | None = None  # (..., 2) m in the heading frame, from the base
+    text: str | None = None  # a sentence that says what to do; None for policies to go by the velocity
 
 
 class Policy(Protocol):
