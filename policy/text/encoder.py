@@ -1,0 +1,111 @@
+"""Text to numbers: what a network that follows instructions is conditioned on."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from hw.config import ConfigError, nearest
+from hw.hal import Array
+from policy.text.lexicon import FLAGS, flags, words
+
+
+class TextEncoder(Protocol):
+    """Turns texts into codes. The same text gives the same code, whatever is encoded beside it."""
+
+    @property
+    def name(self) -> str:
+        """What `load_encoder` knows it by; a checkpoint stores it."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """Numbers in a code."""
+        ...
+
+    def encode(self, texts: Sequence[str]) -> Array:
+        """Codes `(n, size)` float32. Raises ConfigError for a text without a word."""
+        ...
+
+
+class WordEncoder:
+    """The mean of WordLlama's word vectors beside the lexicon's flags, both blind to the order of words.
+
+    A code is `SCALE * [unit sentence vector, FLAG_WEIGHT * flags]`: one flag changes it by 0.7 of what a wholly
+    different sentence does, whatever the scale. The scale makes features of order one, as a network's input should
+    be: the 64 of the sentence have a root mean square of 0.5, a flag that is set is 2.8.
+    """
+
+    name = "words"
+    WORD_SIZE = 64  # of WordLlama's 256; they are trained to be cut short
+    FLAG_WEIGHT = 0.7
+    SCALE = 4.0
+
+    def __init__(self) -> None:
+        """Load the weights that the wheel brings. Raises ConfigError where it is missing or incomplete."""
+        self._model = _load_wordllama(self.WORD_SIZE)
+
+    @property
+    def size(self) -> int:
+        return self.WORD_SIZE + len(FLAGS)
+
+    def encode(self, texts: Sequence[str]) -> Array:
+        return np.stack([self._encode(text) for text in texts]) if texts else np.zeros((0, self.size), np.float32)
+
+    def _encode(self, text: str) -> Array:
+        found = words(text)
+        if not found:
+            raise ConfigError(f"the instruction '{text}' has no word in it; write one such as 'walk forward'")
+        # One text at a time: padding would let the last bits depend on the neighbours.
+        sentence = self._model.embed([" ".join(found)])[0]
+        norm = max(float(np.linalg.norm(sentence)), 1e-6)
+        marked = flags(text)
+        flagged = np.array([flag in marked for flag in FLAGS], dtype=np.float32)
+        return (self.SCALE * np.concatenate([sentence / norm, self.FLAG_WEIGHT * flagged])).astype(np.float32)
+
+
+_ENCODERS: dict[str, Callable[[], TextEncoder]] = {WordEncoder.name: WordEncoder}
+
+
+def load_encoder(name: str = WordEncoder.name) -> TextEncoder:
+    """The encoder of that name. Raises ConfigError for an unknown one, or when what it needs is not installed."""
+    if name not in _ENCODERS:
+        raise ConfigError(f"unknown text encoder '{name}'; {nearest(name, _ENCODERS)}")
+    return _ENCODERS[name]()
+
+
+def _load_wordllama(size: int) -> Any:
+    """WordLlama with the weights inside its wheel. Nothing is downloaded."""
+    with _root_logger_as_it_is():
+        try:
+            import wordllama
+        except ImportError as error:
+            raise ConfigError(
+                f"text instructions need the package wordllama, which cannot be imported ({error}); "
+                "install it with `pip install wordllama`"
+            ) from error
+        folder = Path(wordllama.__file__).parent
+        try:
+            return wordllama.WordLlama.load(cache_dir=folder, trunc_dim=size, disable_download=True)
+        except (OSError, ValueError) as error:
+            raise ConfigError(
+                f"{folder}: wordllama's own weights cannot be loaded ({error}); "
+                "install it again with `pip install --force-reinstall wordllama`"
+            ) from error
+
+
+@contextmanager
+def _root_logger_as_it_is() -> Iterator[None]:
+    """wordllama configures the root logger when it is imported, which would change what a whole program prints."""
+    root = logging.getLogger()
+    level, handlers = root.level, root.handlers[:]
+    try:
+        yield
+    finally:
+        root.setLevel(level)
+        root.handlers[:] = handlers
