@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
+from typing import Any
 
 from hw.config import ConfigError, nearest
 from hw.hal import Backend
@@ -12,16 +14,19 @@ from hw.robot import Robot
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of body. A simulated one takes a seed and has a clock that a run drives as fast as it can."""
+    """A kind of body. A simulated one takes a seed and has a clock that a run drives as fast as it can; another one is
+    reached by a port. `options` are for its constructor."""
 
     module: str
     attribute: str
     simulated: bool
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 BACKENDS = {
     "sim": Kind("sim.backend", "SimBackend", simulated=True),
     "virtual": Kind("sim.rig.backend", "VirtualBackend", simulated=True),
+    "dynamixel": Kind("hw.dynamixel.backend", "DynamixelBackend", simulated=False, options={"exact": True}),
 }
 
 
@@ -36,9 +41,12 @@ def make_backend(name: str, robot: Robot, *, seed: int, randomise: bool, port: s
     """A body, not yet connected. Raises ConfigError for an unknown name or a setting that it does not take."""
     kind = backend_kind(name)
     if kind.simulated and port is not None:
-        raise ConfigError(f"backend '{name}' has no port: drop --port, or name a backend that is reached by one")
+        raise ConfigError(f"backend '{name}' has no port: drop --port, or choose --backend dynamixel")
+    if not kind.simulated and port is None:
+        raise ConfigError(f"backend '{name}' needs a port: give --port PATH (`servoid bringup find-port` finds it)")
     if not kind.simulated and randomise:
         raise ConfigError(f"backend '{name}' is a robot that is what it is: drop --randomise")
     make = getattr(import_module(kind.module), kind.attribute)
-    backend: Backend = make(robot, seed=seed, randomise=randomise) if kind.simulated else make(robot, port=port)
+    chosen = {"seed": seed, "randomise": randomise} if kind.simulated else {"port": port}
+    backend: Backend = make(robot, **chosen, **kind.options)
     return backend

@@ -106,15 +106,15 @@ def run(
         raise ConfigError(
             "nothing moves by itself on a real robot: give start=True (--start), or confirm at the prompt"
         )
+    body = backend or make_backend(
+        settings.backend, robot, seed=settings.seed, randomise=settings.randomise, port=settings.port
+    )
     with ExitStack() as stack:
         pilot = make_policy(settings.policy, robot, task, realtime) if policy is None else policy
         if script.plans is not None and hasattr(pilot, "only"):
             pilot.only = script.plans
         if hasattr(pilot, "close"):
             stack.callback(pilot.close)
-        body = backend or make_backend(
-            settings.backend, robot, seed=settings.seed, randomise=settings.randomise, port=settings.port
-        )
         stack.callback(body.close)
         push = getattr(body, "push", None)
         if push is None and _pushes(task):

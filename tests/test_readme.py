@@ -79,7 +79,7 @@ def test_every_command_line_parses(page: str) -> None:
 
 def test_a_wrong_command_line_is_seen() -> None:
     """A check that passes everything would pass for ever."""
-    wrong = ("rnu goal", "run gaol", "run goal --sped 2", "run walk --set vxx=1", "run goal --backend dynamixel")
+    wrong = ("rnu goal", "run gaol", "run goal --sped 2", "run walk --set vxx=1", "run goal --backend dynamixl")
     for line in wrong:
         with pytest.raises((SystemExit, AssertionError, ConfigError)):
             check(line.split())

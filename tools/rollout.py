@@ -39,6 +39,10 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError(f"--episodes: {args.episodes} is not a number of episodes; give 1 or more")
     if args.workers < 0:
         raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
+    from stack.backends import backend_kind
+
+    if not backend_kind(args.backend).simulated:
+        raise ConfigError(f"backend '{args.backend}' has no truth to judge by: use a simulated one, or `servoid run`")
     with reporting(args.json) as report:
         begun = time.monotonic()
         values = settings(args)

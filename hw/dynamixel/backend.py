@@ -7,6 +7,7 @@ present values in one cycle and the board's IMU, and looks at a few servos' sile
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from hw.clock import WallClock
 from hw.dynamixel.bus import Bus, Counters
 from hw.dynamixel.group import GroupRead
 from hw.dynamixel.imu import BoardImu
+from hw.dynamixel.lifeline import Lifeline
 from hw.dynamixel.motors import DynamixelMotors
 from hw.dynamixel.port import Port, SerialPort
 from hw.dynamixel.survey import Difference, Found, as_table, compare, correct, find_board, find_servos
@@ -27,7 +29,11 @@ _PRESENT = np.dtype([("current", "<i2"), ("velocity", "<i4"), ("position", "<i4"
 
 
 class DynamixelBackend:
-    """`port` is a path, or an open port. `fix` lets connect correct registers that differ from the robot's file."""
+    """`port` is a path, or an open port. `fix` lets connect correct registers that differ from the robot's file;
+    `exact` refuses a robot with any such difference, and not only with a grave one.
+
+    On a real port a guardian process stands by from connect to close, for the case that this process is killed.
+    """
 
     def __init__(
         self,
@@ -36,16 +42,18 @@ class DynamixelBackend:
         port: str | Port | None = None,
         clock: Clock | None = None,
         fix: bool = False,
+        exact: bool = False,
         name: str = "dynamixel",
         opener: Callable[[str, int], Port] = SerialPort,
     ) -> None:
         self.name = name
         self.clock: Clock = clock or WallClock()
         self.differences: tuple[Difference, ...] = ()
-        self._robot, self._given, self._fix, self._open = robot, port, fix, opener
+        self._robot, self._given, self._fix, self._exact, self._open = robot, port, fix, exact, opener
         self._port: Port | None = None
         self._bus: Bus | None = None
         self._motors: DynamixelMotors | None = None
+        self._lifeline: Lifeline | None = None
 
     @property
     def counters(self) -> Counters:
@@ -63,8 +71,7 @@ class DynamixelBackend:
         try:
             return self._connect(Bus(port, self.clock))
         except BaseException:
-            self._port = None
-            port.close()
+            self.close()
             raise
 
     def _connect(self, bus: Bus) -> tuple[DynamixelSensors, DynamixelMotors]:
@@ -77,29 +84,36 @@ class DynamixelBackend:
             found = find_servos(bus, self._robot)
             differences = compare(self._robot, found)
         self.differences = tuple(differences)
-        if any(difference.grave for difference in differences):
-            raise BackendError(
-                f"the servos are not set up as {self._robot.name} needs them; let `servoid bringup check --fix` "
-                f"correct them:\n{as_table(differences)}"
+        if any(difference.grave or self._exact for difference in differences):
+            error = BackendError(
+                f"{len(differences)} registers are not as {self._robot.name} needs them, the first of "
+                f"{differences[0].joint}: let `servoid bringup check --fix` correct them"
             )
+            error.add_note(as_table(differences))
+            raise error
         bus.return_delay = max(servo.get("return_delay_time") for servo in found) * 2e-6
         units = Units(self._robot, [servo.table for servo in found])
         watch = Watch(bus, found, units)
         present = GroupRead([_present(servo) for servo in found], fast=all(map(_fast, found)))
-        self._motors = DynamixelMotors(bus, found, units, watch, present)
+        ids = [servo.joint.id for servo in found]
+        if isinstance(bus.port, SerialPort):
+            self._lifeline = Lifeline(bus.port, ids, found[0].table, bus.return_delay)
+        self._motors = DynamixelMotors(bus, found, units, watch, present, self._lifeline)
         self._bus = bus
         return DynamixelSensors(bus, self._robot, units, watch, present), self._motors
 
     def close(self) -> None:
-        """Torque off, acknowledged, and the port given back. Raises BackendError when torque may still be on."""
-        port, motors = self._port, self._motors
-        self._port = self._motors = None
-        try:
+        """Torque off, acknowledged, and the port given back. Raises BackendError when torque may still be on: the
+        guardian has tried, too, by then."""
+        port, motors, lifeline = self._port, self._motors, self._lifeline
+        self._port = self._motors = self._lifeline = None
+        with ExitStack() as stack:  # each step, whatever the one before it raises
+            if port is not None:
+                stack.callback(port.close)
+            if lifeline is not None:
+                stack.callback(lifeline.close)
             if motors is not None and motors.on:
                 motors.off()
-        finally:
-            if port is not None:
-                port.close()
 
 
 class DynamixelSensors:

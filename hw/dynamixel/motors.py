@@ -11,6 +11,7 @@ from hw.dynamixel import codec
 from hw.dynamixel.bus import Bus
 from hw.dynamixel.codec import SyncWriter
 from hw.dynamixel.group import GroupRead
+from hw.dynamixel.lifeline import Lifeline
 from hw.dynamixel.survey import Found
 from hw.dynamixel.units import Units
 from hw.dynamixel.watch import Watch
@@ -28,10 +29,20 @@ _CHECKED = struct.Struct("<HHH")
 class DynamixelMotors:
     """The writing half of the backend."""
 
-    def __init__(self, bus: Bus, found: Sequence[Found], units: Units, watch: Watch, present: GroupRead) -> None:
-        """`present` is the group of the control cycle, whose newest positions torque comes on at."""
+    def __init__(
+        self,
+        bus: Bus,
+        found: Sequence[Found],
+        units: Units,
+        watch: Watch,
+        present: GroupRead,
+        lifeline: Lifeline | None = None,
+    ) -> None:
+        """`present` is the group of the control cycle, whose newest positions torque comes on at. `lifeline` is told
+        of torque; without one nothing but the servos' watchdog stops them when this process is killed."""
         table = found[0].table
         self._bus, self._found, self._units, self._watch, self._present = bus, found, units, watch, present
+        self._lifeline = lifeline
         self._ids = [servo.joint.id for servo in found]
         self._goal = table.item("goal_position")
         self._torque, self._watchdog = table.item("torque_enable"), table.item("bus_watchdog")
@@ -42,6 +53,8 @@ class DynamixelMotors:
         self._default_i = [servo.table.item("position_i_gain").default or 0 for servo in found]
         self._gain: Array | None = None  # P gains that were sent last
         self.on = any(servo.get("torque_enable") for servo in found)  # torque may be on
+        if self.on and lifeline is not None:
+            lifeline.hold()
 
     @property
     def armed(self) -> bool:
@@ -59,6 +72,8 @@ class DynamixelMotors:
             gain = self._units.gain(command.gain)
             if not self.armed:
                 self._arm(gain)
+            elif self._lifeline is not None:
+                self._lifeline.check()
             goals = self._units.goal(command.position)
             if self._gain is None or not np.array_equal(gain, self._gain):
                 self._send_gains(gain)
@@ -74,6 +89,8 @@ class DynamixelMotors:
             if not left:
                 self.on, self._gain = False, None
                 self._watch.expect(False)
+                if self._lifeline is not None:
+                    self._lifeline.let_go()
                 return
         raise BackendError(
             f"{self._names(left)} did not say that torque is off: hold the robot and switch its power off"
@@ -98,6 +115,8 @@ class DynamixelMotors:
                 break
         else:
             raise BackendError(f"{self._names(unready)} did not take goal and gains: torque stays off")
+        if self._lifeline is not None:
+            self._lifeline.hold()
         self.on = True
         left = everyone
         for _ in self._attempts(ON_SECONDS):

@@ -95,8 +95,10 @@ def test_differences_are_a_table_and_corrected_only_when_told_to(robot: Robot) -
     robot.joint("l_hip_roll").put("operating_mode", 4)
     robot.joint("r_el").put("max_position_limit", 2100)
     robot.joint("l_el").put("return_delay_time", 250)
-    message = refusal(robot)
-    rows = [line.split() for line in message.splitlines()[1:]]
+    with pytest.raises(BackendError, match=r"3 registers .* `servoid bringup check --fix`") as error:
+        robot.backend().connect()
+    (note,) = error.value.__notes__
+    rows = [line.split() for line in note.splitlines()]
     assert rows[0] == ["joint", "ID", "register", "found", "wanted"]
     assert ["l_hip_roll", "10", "operating_mode", "4", "3", "must", "be", "changed"] in rows
     assert ["r_el", "5", "max_position_limit", "2100", "3073", "must", "be", "changed"] in rows
@@ -118,6 +120,15 @@ def test_small_differences_are_reported_and_not_refused(robot: Robot) -> None:
         ("l_el", "temperature_limit", 75, 80)
     ]
     assert "l_el" in as_table(backend.differences)
+
+
+def test_who_asks_for_a_robot_exactly_as_its_file_gets_no_other(robot: Robot) -> None:
+    """What `servoid run` asks for: a servo that answers 0.5 ms late, or gets hotter than it should, is no small thing
+    with torque on."""
+    robot.joint("l_el").put("temperature_limit", 75)
+    with pytest.raises(BackendError, match="1 registers are not as op3 needs them, the first of l_el"):
+        robot.backend(exact=True).connect()
+    assert robot.line.gone
 
 
 def test_registers_are_not_corrected_under_torque(robot: Robot) -> None:
