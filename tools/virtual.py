@@ -8,6 +8,7 @@ from pathlib import Path
 from types import FrameType
 
 from hw.config import ConfigError
+from sim.rig.delivery import add_delivery_arguments
 from tools import exit_codes
 from tools.output import add_json_argument, reporting
 
@@ -25,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--control", type=Path, metavar="PATH", help="control socket (default: beside --link)")
     parser.add_argument("--seed", type=int, default=0, help="of the sensors' errors")
     parser.add_argument("--randomise", action="store_true", help="another robot within the ranges of training")
+    add_delivery_arguments(parser)
     add_json_argument(parser)
 
 

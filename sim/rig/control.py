@@ -15,6 +15,7 @@ import numpy as np
 from hw.hal import Array, BackendError
 from hw.robot import Robot, load_robot, save_robot
 from sim.model import build
+from sim.rig.delivery import Delivery
 from sim.truth import Truth
 
 _START_SECONDS = 60.0
@@ -149,6 +150,7 @@ class RigProcess:
         seed: int = 0,
         randomise: bool = False,
         faults: str | Path | None = None,
+        delivery: Delivery | None = None,
         linger: float = 10.0,
     ) -> None:
         """`robot` is a name, a file, or a robot as it is. Raises BackendError with the reason if it does not start."""
@@ -172,6 +174,7 @@ class RigProcess:
         command += ["--seed", str(seed), "--linger", str(linger)]
         command += ["--randomise"] if randomise else []
         command += ["--faults", str(faults)] if faults else []
+        command += [] if delivery is None else delivery.arguments()
         # A session of its own: Ctrl-C in the terminal is meant for the controller.
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True)
         try:

@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from hw.dynamixel.tables import table
 from hw.hal import Array
 from hw.robot import Robot
 from sim.rig.board import Board
 from sim.rig.bus import Bus
+from sim.rig.delivery import Delivery
 from sim.rig.faults import ALERTS, Dice, Fault, Scenario
 from sim.rig.motors import STEP_NS, Motors
 from sim.rig.plant import Plant
-from sim.rig.servo import CENTRE, VirtualServo
+from sim.rig.servo import VirtualServo
 from sim.rig.wire import Wire
 
 BROWN_OUT, BOARD_BROWN_OUT = 6.0, 4.5  # V below which a servo and the board lose power
@@ -45,13 +45,21 @@ class Accepted:
 class Rig:
     """The rig of `robot`. Time begins at 0; the robot is held in its home pose until all servos have torque.
 
-    Raises ConfigError for a servo that is no known Dynamixel, and for a fault of an unknown servo.
+    Raises ConfigError for a servo that is no known Dynamixel, and for a fault or delivery of an unknown one.
     """
 
     def __init__(
-        self, robot: Robot, *, seed: int = 0, randomise: bool = False, scenario: Scenario | None = None
+        self,
+        robot: Robot,
+        *,
+        seed: int = 0,
+        randomise: bool = False,
+        scenario: Scenario | None = None,
+        delivery: Delivery | None = None,
     ) -> None:
-        self.robot, self.scenario = robot, scenario or Scenario()
+        self.delivery, self.scenario = delivery or Delivery(), scenario or Scenario()
+        self.delivery.check(robot)
+        robot = self.robot = self.delivery.assembled(robot, seed)
         self.plant = Plant(robot)
         self.motors = Motors(robot, self.plant)
         self.now_ns = 0
@@ -75,8 +83,11 @@ class Rig:
         self._held_back: list[tuple[int, bytes]] = []
         self.servos = [
             VirtualServo(self.motors, i, servo.model_number, eeprom, self._record)
-            for i, (servo, eeprom) in enumerate(zip(self.robot.servos, delivered(self.robot), strict=True))
+            for i, (servo, eeprom) in enumerate(zip(self.robot.servos, self.delivery.eeprom(self.robot), strict=True))
         ]
+        unplugged = self.delivery.unplugged(self.robot.names)
+        for servo, name in zip(self.servos, self.robot.names, strict=True):
+            servo.dead = name in unplugged
         codes = self.servos[0].table.bauds
         board = {"id": self.robot.bus.board_id, "baud_rate": codes.index(self.robot.bus.baud)}
         self.board = Board(self.motors, board, self._switch, np.array(self.robot.imu.signs))
@@ -282,21 +293,3 @@ class Rig:
         taken = [asdict(entry) for entry in self.accepted]
         self.accepted.clear()
         return taken
-
-
-def delivered(robot: Robot) -> list[dict[str, int]]:
-    """EEPROM of each servo as the rig is delivered: set up for the robot, limits at the joints' ranges."""
-    values = []
-    for joint, servo in zip(robot.joints, robot.servos, strict=True):
-        tick = 2 * math.pi / servo.ticks_per_turn
-        ends = [CENTRE + joint.direction * (end - joint.zero) / tick for end in joint.range]
-        values.append(
-            {
-                "id": joint.id,
-                "baud_rate": table(servo.model_number).bauds.index(robot.bus.baud),
-                "return_delay_time": 0,
-                "min_position_limit": max(math.floor(min(ends)), 0),
-                "max_position_limit": min(math.ceil(max(ends)), servo.ticks_per_turn - 1),
-            }
-        )
-    return values

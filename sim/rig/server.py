@@ -29,6 +29,7 @@ import numpy as np
 from hw.config import ConfigError
 from hw.robot import load_robot
 from sim.rig import operations
+from sim.rig.delivery import Delivery, add_delivery_arguments
 from sim.rig.faults import Scenario, load_scenario
 from sim.rig.operations import Connection
 from sim.rig.rig import Rig
@@ -273,12 +274,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--faults", type=Path, help="fault scenario (YAML)")
     parser.add_argument("--clock", choices=("real", "locked"), default="real")
     parser.add_argument("--control", type=Path, help="control socket")
+    add_delivery_arguments(parser)
 
 
 def build(args: argparse.Namespace, *, linger: float | None = None) -> Server:
     """A server as the arguments say. Raises ConfigError, and OSError for a link or socket that cannot be made."""
     scenario = load_scenario(args.faults) if args.faults else Scenario()
-    rig = Rig(load_robot(args.robot), seed=args.seed, randomise=args.randomise, scenario=scenario)
+    delivery = Delivery(tuple(args.fresh), tuple(args.only), args.assembly)
+    rig = Rig(load_robot(args.robot), seed=args.seed, randomise=args.randomise, scenario=scenario, delivery=delivery)
     return Server(rig, clock=args.clock, link=args.link, control=args.control, linger=linger)
 
 
