@@ -7,8 +7,9 @@ can be left at any moment by an exception (Ctrl-C): the next call finds the mark
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 from hw.clock import WallClock
@@ -26,6 +27,8 @@ PING_DATA = 3  # bytes: model number, firmware
 PING_GAP_NS = 3_000_000  # that a servo may take to its turn in a broadcast ping
 EEPROM_SECONDS = 0.02  # that a servo may take to write its EEPROM before it answers
 _POLL_NS = 100_000
+_AIM_NS, _AIM_STEP_NS = 100_000, 2_000  # the most that is learned of late sleeps and late answers, and a step back
+_LOOK_NS = 40_000  # in which an answer that is not there yet is looked for without sleeping
 _QUIET_NS = 300_000  # of silence that end a drain: several bytes at any baud in use
 _DRAIN_NS = 3_000_000  # that a drain may take within a tick
 _SETTLE_NS = 25_000_000  # of silence after a lost single answer: above the latency of an untuned adapter
@@ -75,6 +78,7 @@ class Bus:
         self._dirty = True  # something may still come that must not be taken for an answer
         self._busy_until = 0
         self._quiet_ns = _QUIET_NS
+        self._aim_ns = 0  # from the predicted end of an answer to when to wake for it
 
     # The control cycle -----------------------------------------------------------------------------------------------
 
@@ -87,38 +91,94 @@ class Bus:
     def read_group(self, group: GroupRead, before: bytes = b"", *, again: bool = True) -> int:
         """Read a group; those that are lost are asked once more, by a plain read, unless `again` is False. `before`
         goes out ahead, in the same write: a packet that nobody answers. Returns how many did not answer."""
-        first = self._exchange_group(group, group.begin(), before)
-        if first and again and (request := group.again()) is not None:
-            still = self._exchange_group(group, request)
-            self.counters.recovered += len(request.ids) - len(still)
-        group.settle()
-        return len(group.ids) - sum(group.fresh)
+        return self.read_groups((group,), before, again=again)
 
-    def _exchange_group(self, group: GroupRead, request: Request, before: bytes = b"") -> list[int]:
-        self._prepare()
+    def read_groups(self, groups: Sequence[GroupRead], before: bytes = b"", *, again: bool = True) -> int:
+        """Read groups one after the other, as `read_group` does; those that are lost are asked once more at the end.
+        What came whole is looked into while the next answer is on its way."""
+        later: Callable[[], None] | None = None
+        for group in groups:
+            later = self._exchange_group(group, group.begin(), before, later)
+            before = b""
+        if later is not None:
+            later()
+        lost = 0
+        for group in groups:
+            came = sum(group.fresh)
+            if came < len(group.ids) and again and (request := group.again()) is not None:
+                later = self._exchange_group(group, request)
+                if later is not None:
+                    later()
+                self.counters.recovered += sum(group.fresh) - came
+            group.settle()
+            lost += len(group.ids) - sum(group.fresh)
+        return lost
+
+    def _exchange_group(
+        self,
+        group: GroupRead,
+        request: Request,
+        before: bytes = b"",
+        meanwhile: Callable[[], None] | None = None,
+    ) -> Callable[[], None] | None:
+        """One request. Returns what is left to do with an answer that came whole: the line is silent by then, and the
+        next packet may go out first. `meanwhile` is what the exchange before this one returned."""
+        if meanwhile is None:
+            self._prepare()
         sampled = self._write(before + request.packet)
-        deadline = sampled + self._wire_ns(request.answer, len(request.ids), gaps=1 if request.fast else None)
+        if meanwhile is not None:
+            meanwhile()
+        gaps = 1 if request.fast else len(request.ids)
+        predicted = sampled + self._wire_ns(request.answer, len(request.ids), gaps)
+        stream = self._look(predicted)
+        if request.looks_whole(stream):
+            self.counters.bytes_in += len(stream)
+            self._dirty = False
+            return partial(self._take_whole, group, request, stream, sampled)
+        self._take_pieces(group, request, stream, sampled, predicted)
+        return None
+
+    def _take_whole(self, group: GroupRead, request: Request, stream: bytes, sampled: int) -> None:
+        if not group.accept_all(request, stream, sampled):
+            seen: dict[int, Status] = {}
+            self._parser.reset()  # nothing of the exchange that goes on is in it yet
+            for status in self._answers(request, stream):
+                self._take(group, request, status, sampled, seen)
+            self.counters.garbage += self._parser.pending
+            self._parser.reset()
+        self._close(group, request)
+
+    def _take_pieces(self, group: GroupRead, request: Request, first: bytes, sampled: int, predicted: int) -> None:
+        """An answer of which only `first` has come by its predicted end."""
+        seen: dict[int, Status] = {}
         if request.fast:
             stream = bytearray()
-            self._collect(deadline, lambda data: _fast_missing(stream, data, request))
+            self._collect(predicted, lambda data: _fast_missing(stream, data, request), came=first)
             if not group.accept_all(request, bytes(stream), sampled):
-                for status in parse_fast(bytes(stream), request.ids, request.lengths):
-                    if status is not None:
-                        self._take(group, request, status, sampled, {})
+                for status in self._answers(request, bytes(stream)):
+                    self._take(group, request, status, sampled, seen)
         else:
-            seen: dict[int, Status] = {}
 
             def missing(data: bytes) -> int:
                 if len(data) == request.answer and not seen and group.accept_all(request, data, sampled):
                     return 0
-                for status in self._statuses(data):
+                for status in self._answers(request, data):
                     self._take(group, request, status, sampled, seen)
                 return (len(request.ids) - len(seen)) * request.answer // len(request.ids)
 
-            self._collect(deadline, missing)
-        lost = group.end(request)
-        self.counters.lost += len(lost)
-        self._dirty = bool(lost)
+            self._collect(predicted, missing, came=first)
+        self._dirty = self._close(group, request) > 0
+
+    def _answers(self, request: Request, data: bytes) -> list[Status]:
+        """The good answers in bytes of which not all are."""
+        if not request.fast:
+            return self._statuses(data)
+        return [status for status in parse_fast(data, request.ids, request.lengths) if status is not None]
+
+    def _close(self, group: GroupRead, request: Request) -> int:
+        """Count on how many a request was lost."""
+        lost = len(group.end(request))
+        self.counters.lost += lost
         return lost
 
     def _take(self, group: GroupRead, request: Request, status: Status, sampled: int, seen: dict[int, Status]) -> None:
@@ -213,7 +273,7 @@ class Bus:
                         self.counters.unexpected += 1
                 return 0 if answer else OVERHEAD + length
 
-            predicted = sent + self._wire_ns(OVERHEAD + length, 1)
+            predicted = sent + self._wire_ns(OVERHEAD + length, 1, 1)
             self._collect(predicted, missing, extra_ns=round(patience * 1e9))
             if answer:
                 self._dirty = False
@@ -250,6 +310,24 @@ class Bus:
         self.counters.bytes_out += len(packet)
         return end
 
+    def _look(self, predicted: int) -> bytes:
+        """What has come by the predicted end of an answer. Sleeps end late, and so do answers: when to wake is learned
+        from both, so that half of the answers are there at the first look and the others microseconds later."""
+        clock, port = self.clock, self.port
+        if self._wakes is None:
+            clock.sleep_until(predicted)
+            return port.read()
+        wanted = predicted + self._aim_ns
+        clock.sleep_until(wanted)
+        if data := port.read():
+            self._aim_ns = max(self._aim_ns - _AIM_STEP_NS, -_AIM_NS)
+            return data
+        looked = now = clock.now_ns()
+        while not data and now < looked + _LOOK_NS:
+            data, now = port.read(), clock.now_ns()
+        self._aim_ns = min(self._aim_ns + (now - looked) // 4, _AIM_NS)
+        return data
+
     def _collect(
         self,
         predicted: int,
@@ -258,13 +336,17 @@ class Bus:
         extra_ns: int = 0,
         first: int | None = None,
         poll_ns: int = _POLL_NS,
+        came: bytes | None = None,
     ) -> None:
         """Feed what comes to `missing`, which returns how many bytes are, until there are none or the deadline is over.
-        The first look is when the answer must have ended; it is on time if it came before we look, however late."""
+        The first look is when the answer must have ended, unless it gave `came`; it is on time if it came before we look,
+        however late."""
         deadline = predicted + round(self.margin * 1e9) + extra_ns
-        self.clock.sleep_until(predicted if first is None else first)
+        if came is None:
+            self.clock.sleep_until(predicted if first is None else first)
+            came = self.port.read()
+        data = came
         while True:
-            data = self.port.read()
             self.counters.bytes_in += len(data)
             left = missing(data) if data else 0
             if data and not left:
@@ -276,6 +358,7 @@ class Bus:
                 self._wakes.wait((deadline - now) * 1e-9)
             else:
                 self.clock.sleep_until(min(now + max(poll_ns, left * self._byte_ns()), deadline))
+            data = self.port.read()
 
     def _statuses(self, data: bytes) -> list[Status]:
         parser, counters = self._parser, self.counters
@@ -288,10 +371,9 @@ class Bus:
     def _byte_ns(self) -> int:
         return round(BITS * 1e9 / self.port.baud)
 
-    def _wire_ns(self, size: int, answers: int, gaps: int | None = None) -> int:
+    def _wire_ns(self, size: int, answers: int, gaps: int) -> int:
         """How long so many bytes of so many answers take; a fast frame has one gap for all."""
-        delays = round(answers * self.return_delay * 1e9)
-        return size * self._byte_ns() + delays + (answers if gaps is None else gaps) * GAP_NS
+        return size * self._byte_ns() + round(answers * self.return_delay * 1e9) + gaps * GAP_NS
 
 
 def _as_ping(status: Status) -> Ping:

@@ -25,7 +25,7 @@ FAST_HEAD, FAST_BLOCK = 8, 4  # bytes of a fast frame before its first block, an
 
 _HEAD = struct.Struct("<4sBHB")
 _RUNS_ON = b"\xff\xff\xfd"
-_STUFFED = b"\xff\xff\xfd\xfd"
+STUFFED = b"\xff\xff\xfd\xfd"
 
 
 class Instruction(IntEnum):
@@ -89,12 +89,12 @@ class Status(NamedTuple):
 
 def stuff(body: bytes) -> bytes:
     """The body of a packet (instruction and parameters) in which no header can appear."""
-    return body.replace(_RUNS_ON, _STUFFED)
+    return body.replace(_RUNS_ON, STUFFED)
 
 
 def unstuff(body: bytes) -> bytes:
     """The inverse of `stuff`."""
-    return body.replace(_STUFFED, _RUNS_ON)
+    return body.replace(STUFFED, _RUNS_ON)
 
 
 def packet(id: int, instruction: int, params: bytes = b"") -> bytes:
@@ -272,7 +272,7 @@ def whole_fast(frame: bytes, head: bytes, ids: bytes, length: int) -> list[bytes
 def whole_sync(stream: bytes, heads: Sequence[bytes], length: int) -> list[bytes] | None:
     """The same of the answers to a plain read, each of which must begin as in `heads` and hold nothing stuffed."""
     frame = OVERHEAD + length
-    if len(stream) != frame * len(heads) or _STUFFED in stream:
+    if len(stream) != frame * len(heads) or STUFFED in stream:
         return None
     data, at = [], 0
     for head in heads:
@@ -361,7 +361,7 @@ class Parser:
         if crc16(frame[:-2]) != frame[-2] | frame[-1] << 8:
             return None, end
         params = frame[8:-2]
-        if _STUFFED in params and not (id == BROADCAST and frame[7] == Instruction.STATUS):
+        if STUFFED in params and not (id == BROADCAST and frame[7] == Instruction.STATUS):
             params = unstuff(params)
         return Packet(id, frame[7], params), end
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hw.dynamixel import codec
-from hw.dynamixel.codec import FAST_BLOCK, FAST_HEAD, OVERHEAD, Status
+from hw.dynamixel.codec import FAST_BLOCK, FAST_HEAD, OVERHEAD, STUFFED, Status
 
 SHAPES = 8  # lengths that requests rotate through after a loss: more than are sent in the time an answer may be late
 PATIENCE = 3  # reads in a row that a servo may miss before it is no longer asked twice in a tick
@@ -37,6 +37,18 @@ class Request:
             self.answer = FAST_HEAD + FAST_BLOCK * len(padded) + sum(self.lengths)
         else:
             self.answer = OVERHEAD * len(padded) + sum(self.lengths)
+        self._last = OVERHEAD + self.lengths[-1]  # bytes of the last status
+
+    def looks_whole(self, stream: bytes) -> bool:
+        """Whether an answer has come to its end, as far as a glance can tell: nothing more is on its way, though what came
+        may be damaged."""
+        if len(stream) != self.answer:
+            return False
+        if self.fast:
+            return stream.startswith(self.head)
+        if not self.same:
+            return False
+        return stream.startswith(self.heads[-1], -self._last) and STUFFED not in stream[-self._last :]
 
 
 class GroupRead:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import fcntl
 import os
 import select
-import struct
 import termios
 import time
 from pathlib import Path
@@ -21,7 +20,8 @@ from hw.hal import BackendError, Clock
 
 WRITE_SECONDS = 0.02  # that an adapter may take to accept a packet: 40 times what the longest needs at 2 Mbit/s
 _POLL_NS = 50_000  # between looks while a line is drained
-_COUNT = struct.Struct("I")
+_CHUNK = 4096  # bytes of a read: above any answer, and what a terminal holds
+_NO_COUNT = bytes(4)
 
 
 class Port(Protocol):
@@ -98,9 +98,11 @@ class SerialPort:
 
     def read(self) -> bytes:
         try:
-            # Reading cannot tell silence from a port that is gone: both give nothing. Asking how much there is can.
-            (count,) = _COUNT.unpack(fcntl.ioctl(self._fd, termios.TIOCINQ, b"\0\0\0\0"))
-            return os.read(self._fd, count) if count else b""
+            data = os.read(self._fd, _CHUNK)
+            if not data:
+                # Reading cannot tell silence from a port that is gone: both give nothing. Asking how much there is can.
+                fcntl.ioctl(self._fd, termios.TIOCINQ, _NO_COUNT)
+            return data
         except BlockingIOError:
             return b""
         except (OSError, ValueError, termios.error) as error:

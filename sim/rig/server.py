@@ -10,7 +10,6 @@ pace: servos whose controller was killed go on living.
 from __future__ import annotations
 
 import argparse
-import ctypes
 import gc
 import json
 import select
@@ -26,6 +25,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hw.clock import wake_sharply
 from hw.config import ConfigError
 from hw.robot import load_robot
 from sim.rig import operations
@@ -36,7 +36,6 @@ from sim.rig.rig import Rig
 from sim.rig.terminal import Terminal
 
 ClockKind = Literal["real", "locked"]
-_PR_SET_TIMERSLACK = 29
 PICK_UP_SECONDS = 3.0  # without torque anywhere, before somebody picks a free-running robot up
 _FARTHEST_BEHIND = 200_000_000  # ns that a rig hurries to catch up; of longer pauses the rest never happened
 
@@ -86,7 +85,7 @@ class Server:
         """Until `stop`, or until nobody has used the rig for the time to linger."""
         gc.collect()
         gc.freeze()
-        _wake_sharply()
+        wake_sharply()
         try:
             while self._running and not self._abandoned():
                 self._turn()
@@ -259,13 +258,6 @@ def _listen(path: Path) -> socket.socket:
         raise OSError(f"{path}: {error.strerror or error}") from error
     listener.listen()
     return listener
-
-
-def _wake_sharply() -> None:
-    """Let sleeps end within a microsecond instead of Linux's usual 50: a reply of 20 servos takes 800."""
-    libc = ctypes.CDLL(None)
-    if hasattr(libc, "prctl"):
-        libc.prctl(_PR_SET_TIMERSLACK, 1000)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
