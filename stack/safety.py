@@ -12,7 +12,8 @@ tests/stack/test_safety.py:
 4. A target that is not finite is never sent: the last goal holds, and after PATIENCE in a row the robot is damped.
 5. DAMPED and FAULT are final: DAMP, then OFF, and never ACTIVE again.
 6. Samples older than `stale` ticks, or that never came, end in FAULT; so do tilt beyond `tilt` and a servo's error.
-7. A stop that leaves time for it (Ctrl-C, heat, a full disk, the end of a task) lowers a standing robot first.
+7. A stop that leaves time for it (Ctrl-C, heat, a full disk, the end of a task) lowers a standing robot first. One that
+   was not brought home, but holds the pose that it was found in, is not lowered: it hangs or lies.
 
 Homing is the guard's own: from the pose that the robot is in, slowly, to the home pose.
 """
@@ -86,6 +87,7 @@ class Guard:
         self._events: list[Event] = []
         self._command = self._make(Mode.OFF)
         self._motion: Motion | None = None
+        self._stands = True  # so that it can be lowered
         self._rejected = 0
         self._damped_ticks = 0
         self._tick = 0  # of the newest decision
@@ -97,17 +99,18 @@ class Guard:
 
     def home(self, observation: Observation) -> None:
         """Begin to move to the home pose from where the robot is. Raises RuntimeError unless LIMP."""
-        self._expect(Phase.LIMP)
-        lacking = missing(observation, self.robot.names)
-        if lacking:
-            self.fault("stale", f"no valid sample from {', '.join(lacking)}: check the cable and the power", lacking[0])
+        if not self._take(observation):
             return
-        self.applied = np.array(observation.position, dtype=float)
-        self._accepted = self._tick
         distance = float(np.abs(self.robot.home - self.applied).max())
         seconds = MIN_JERK_PEAK * distance / self.robot.limits.homing_speed
         self._motion = Motion(self.applied, self.robot.home, math.ceil(seconds * self.robot.rate))
         self._enter(Phase.HOMING, f"homing, {seconds:.1f} s")
+
+    def hold(self, observation: Observation) -> None:
+        """Torque on in the pose that the robot is in, without going home. Raises RuntimeError unless LIMP."""
+        if self._take(observation):
+            self._stands = False
+            self._enter(Phase.READY, "holding")
 
     def start(self) -> None:
         """Follow targets from now on. Raises RuntimeError unless READY."""
@@ -120,10 +123,10 @@ class Guard:
             return
         self.cause = self.cause or kind
         self.note(kind, text, joint)
-        if self.phase in {Phase.READY, Phase.RUNNING}:
+        if self.phase in {Phase.READY, Phase.RUNNING} and self._stands:
             self._motion = Motion(self.applied, self.lowest, round(LOWER_SECONDS * self.robot.rate))
             self._enter(Phase.LOWERING, "lowering")
-        else:  # limp or on the way home: the robot may hang or lie, and a crouch would be one more motion
+        else:  # limp, held or on the way home: the robot may hang or lie, and a crouch would be one more motion
             self._enter(Phase.DAMPED, "damped")
 
     def fault(self, kind: str, text: str, joint: str | None = None) -> None:
@@ -204,6 +207,17 @@ class Guard:
         self._events.append(Event(self._tick, self._time, kind, joint, text))
 
     # How -------------------------------------------------------------------------------------------------------------
+
+    def _take(self, observation: Observation) -> bool:
+        """Begin from the pose that the robot is in; False, and a fault, where that is not known."""
+        self._expect(Phase.LIMP)
+        lacking = missing(observation, self.robot.names)
+        if lacking:
+            self.fault("stale", f"no valid sample from {', '.join(lacking)}: check the cable and the power", lacking[0])
+            return False
+        self.applied = np.array(observation.position, dtype=float)
+        self._accepted = self._tick
+        return True
 
     def _accept(self, target: Array) -> None:
         proposal = np.asarray(target, dtype=float)
