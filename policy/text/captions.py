@@ -85,6 +85,7 @@ MOTIONS: tuple[Motion, ...] = (
             "step forward",
             "keep walking straight on",
             "advance",
+            "go on",
             "go forward at a normal pace",
         ),
         ("please walk straight ahead", "proceed forward", "march onward", "head straight on"),
@@ -125,6 +126,7 @@ MOTIONS: tuple[Motion, ...] = (
         (
             "side-step to the {}",
             "step {}",
+            "walk {}",
             "walk sideways to the {}",
             "move to the {}",
             "strafe {}",
@@ -164,6 +166,7 @@ MOTIONS: tuple[Motion, ...] = (
             "follow a bend to the {}",
             "turn {} as you walk ahead",
             "steer {} while walking",
+            "walk and turn {}",
         ),
         ("walk in a curve to the {}", "move forward turning {}", "swerve {}", "circle {} as you go ahead"),
     ),
@@ -179,6 +182,7 @@ MOTIONS: tuple[Motion, ...] = (
             "sidestep {} while walking forward",
             "walk forward and sideways to the {}",
             "diagonal steps to the {}",
+            "go forward and {}",
         ),
         (
             "move diagonally to the {}",

@@ -29,22 +29,23 @@ class TextEncoder(Protocol):
         ...
 
     def encode(self, texts: Sequence[str]) -> Array:
-        """Codes `(n, size)` float32. Raises ConfigError for a text without a word."""
+        """Codes `(n, size)` float32. Raises ConfigError for a text without a word that it could know."""
         ...
 
 
 class WordEncoder:
     """The mean of WordLlama's word vectors beside the lexicon's flags, both blind to the order of words.
 
-    A code is `SCALE * [unit sentence vector, FLAG_WEIGHT * flags]`: one flag changes it by 0.7 of what a wholly
-    different sentence does, whatever the scale. The scale makes features of order one, as a network's input should
-    be: the 64 of the sentence have a root mean square of 0.5, a flag that is set is 2.8.
+    A code is `SCALE * [unit sentence vector, FLAG_WEIGHT * flags]`. The weight was chosen on the training phrasings,
+    each read by its nearest other one: 0.20 of them right without flags, 0.83 at 0.7, 0.95 at 1. The scale makes
+    features of order one, as a network's input should be: the 64 of the sentence have a root mean square of 0.375, a
+    flag that is set is 3.
     """
 
     name = "words"
     WORD_SIZE = 64  # of WordLlama's 256; they are trained to be cut short
-    FLAG_WEIGHT = 0.7
-    SCALE = 4.0
+    FLAG_WEIGHT = 1.0
+    SCALE = 3.0
 
     def __init__(self) -> None:
         """Load the weights that the wheel brings. Raises ConfigError where it is missing or incomplete."""
@@ -60,7 +61,8 @@ class WordEncoder:
     def _encode(self, text: str) -> Array:
         found = words(text)
         if not found:
-            raise ConfigError(f"the instruction '{text}' has no word in it; write one such as 'walk forward'")
+            wrong = f"'{text}' has no English word in it" if text.strip() else "is empty"
+            raise ConfigError(f"the instruction {wrong}; write one such as 'walk forward' or 'turn left on the spot'")
         # One text at a time: padding would let the last bits depend on the neighbours.
         sentence = self._model.embed([" ".join(found)])[0]
         norm = max(float(np.linalg.norm(sentence)), 1e-6)
