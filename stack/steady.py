@@ -7,6 +7,8 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from hw.clock import wake_sharply
+
 PRIORITY = 50  # of SCHED_FIFO: above ordinary processes, below the kernel's own threads
 
 
@@ -19,6 +21,7 @@ def steady(first_in_line: bool, note: Callable[[str], None]) -> Iterator[None]:
     """
     gc.collect()
     gc.freeze()
+    wake_sharply()
     before: tuple[int, os.sched_param] | None = None
     if first_in_line:
         policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)

@@ -339,8 +339,8 @@ class Bus:
         came: bytes | None = None,
     ) -> None:
         """Feed what comes to `missing`, which returns how many bytes are, until there are none or the deadline is over.
-        The first look is when the answer must have ended, unless it gave `came`; it is on time if it came before we look,
-        however late."""
+        The first look is when the answer must have ended, unless `came` is what it gave; whatever came before we look
+        is on time, however late."""
         deadline = predicted + round(self.margin * 1e9) + extra_ns
         if came is None:
             self.clock.sleep_until(predicted if first is None else first)

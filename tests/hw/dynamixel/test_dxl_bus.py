@@ -49,6 +49,34 @@ def test_a_cycle_is_one_write_and_ends_on_time(fast: bool) -> None:
     assert bus.counters.lost == bus.counters.stray == 0
 
 
+def test_groups_follow_each_other_without_a_pause() -> None:
+    """What came whole is looked into while the next answer is on its way; what is damaged is asked for again, last."""
+    line = ScriptedBus([*(Memory("xm430-w350", id) for id in IDS), Memory("opencr", 200)])
+    bus = Bus(line, line)
+    groups = GroupRead(PRESENT, fast=True), GroupRead([(200, 30, 20)])
+    bus.send(b"")
+    began = line.time
+    count = sum(len(group.begin().packet) + group.begin().answer for group in groups)
+    assert bus.read_groups(groups) == 0
+    assert line.time - began == count * BYTE_NS + 2 * GAP_NS
+
+    def corrupt(id: int, data: bytes) -> list[tuple[bytes, int]]:
+        return [(data[:70] + bytes([data[70] ^ 1]) + data[71:] if id == codec.BROADCAST else data, 0)]
+
+    line.fault = corrupt
+    line.sent.clear()
+    assert bus.read_groups(groups) == 0
+    assert [p.id for p in line.sent] == [codec.BROADCAST, 200, 5], "the damaged one is asked again, last"
+    assert groups[0].data[4] == bytes(line.servos[5].bytes[126:136])
+    assert (bus.counters.lost, bus.counters.recovered, line.collisions) == (1, 1, 0)
+    line.fault = lambda id, data: [] if id == codec.BROADCAST else [(data, 0)]
+    line.sent.clear()
+    assert bus.read_groups(groups) == 0
+    asked = [p.instruction for p in line.sent]
+    assert asked == [Instruction.FAST_SYNC_READ, Instruction.READ, Instruction.SYNC_READ]
+    assert line.collisions == 0
+
+
 def test_who_was_lost_in_a_fast_read_is_asked_again_in_the_same_tick() -> None:
     line, bus = rig()
     group = GroupRead(PRESENT, fast=True)

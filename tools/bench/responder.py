@@ -1,0 +1,118 @@
+"""Servos for timing a client: answers on a pty when the last byte of an answer would have come over a wire.
+
+    python -m tools.bench.responder
+
+The first line of standard output is the port. It knows sync writes of goals, the plain and the fast sync read, and the
+read of one device: as little as a control cycle needs, so that what is timed is the client. A goal that was written is
+the position that is read next, so that a client can tell whether a cycle did what it should. It ends when standard
+input closes.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import select
+import struct
+import sys
+import time
+
+from hw.dynamixel import codec
+from hw.dynamixel.bus import BITS
+from hw.dynamixel.codec import Instruction
+from sim.rig.terminal import Terminal
+from stack.steady import steady
+
+CURRENT, VELOCITY = 7, -11  # raw values that every servo reports
+ALERT_SECONDS = 0.02  # after a packet, in which the next is watched for and not slept for
+_SPIN_NS = 150_000  # before an answer is due, in which the responder no longer sleeps
+_HEAD = struct.Struct("<4sBHB")
+
+
+class Responder:
+    """Keeps the wire's time: bytes take what they take at the port's speed, one packet after the other."""
+
+    def __init__(self) -> None:
+        self.terminal = Terminal()
+        self._goals: dict[int, int] = {}
+        self._free_ns = 0  # when the line is free again
+        self._buffer = bytearray()
+
+    def serve(self) -> None:
+        """Until standard input closes."""
+        poll = select.poll()
+        poll.register(self.terminal.master, select.POLLIN)
+        stdin = sys.stdin.fileno()
+        both = select.poll()
+        both.register(self.terminal.master, select.POLLIN)
+        both.register(stdin, select.POLLIN | select.POLLHUP)
+        gc.disable()
+        with steady(True, lambda text: None):  # servos are punctual, however busy the host is
+            self._serve(both, poll, stdin)
+
+    def _serve(self, both: select.poll, poll: select.poll, stdin: int) -> None:
+        while True:
+            if any(ready == stdin for ready, _ in both.poll()):
+                return
+            last = time.monotonic_ns()
+            while time.monotonic_ns() - last < ALERT_SECONDS * 1e9:
+                if poll.poll(0):
+                    last = self._hear()
+
+    def _hear(self) -> int:
+        """Take what the host wrote; returns when it was seen."""
+        now = time.monotonic_ns()
+        self._buffer += self.terminal.read()
+        while len(self._buffer) >= 7:
+            size = 7 + int.from_bytes(self._buffer[5:7], "little")
+            if len(self._buffer) < size:
+                break
+            packet = bytes(self._buffer[:size])
+            del self._buffer[:size]
+            self._execute(packet, now)
+        return now
+
+    def _execute(self, packet: bytes, now: int) -> None:
+        byte_ns = BITS * 1e9 / self.terminal.baud
+        _, id, _, instruction = _HEAD.unpack_from(packet)
+        params = packet[8:-2]
+        self._free_ns = max(self._free_ns, now) + round(len(packet) * byte_ns)
+        if instruction == Instruction.SYNC_WRITE:
+            for at in range(4, len(params), 5):
+                self._goals[params[at]] = int.from_bytes(params[at + 1 : at + 5], "little", signed=True)
+            return
+        if instruction == Instruction.READ:
+            answer = codec.status(id, 0, bytes(int.from_bytes(params[2:4], "little")))
+        elif instruction == Instruction.SYNC_READ:
+            answer = b"".join(codec.status(id, 0, self._present(id)) for id in params[4:])
+        else:
+            answer = codec.fast_status([(id, 0, self._present(id)) for id in params[4:]])
+        self._free_ns += round(len(answer) * byte_ns)
+        self._send(answer)
+
+    def _present(self, id: int) -> bytes:
+        return struct.pack("<hii", CURRENT, VELOCITY, self._goals.get(id, 0))
+
+    def _send(self, answer: bytes) -> None:
+        """Hand an answer over at the instant that its last byte has come."""
+        left = self._free_ns - time.monotonic_ns() - _SPIN_NS
+        if left > 0:
+            time.sleep(left * 1e-9)
+        while time.monotonic_ns() < self._free_ns:
+            pass
+        os.write(self.terminal.master, answer)
+        select.select([self.terminal.slave], [], [], 0)  # the kernel moves the bytes over at the latest when asked
+
+
+def main() -> int:
+    responder = Responder()
+    print(responder.terminal.port, flush=True)
+    try:
+        responder.serve()
+    finally:
+        responder.terminal.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
