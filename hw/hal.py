@@ -88,6 +88,26 @@ class Percept:
     robots: Array | None = None  # (n, 3): x, y m and heading rad
 
 
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What a task puts into a simulated world, on its floor, in the frame that the robot starts in: x ahead.
+
+    In a percept, obstacles are the pillars followed by the spheres.
+    """
+
+    pillars: Array  # (n, 3) m: x, y, radius; they stand where they are
+    spheres: Array  # (m, 4): x, y, radius m and speed m/s; they roll straight toward the robot
+    goal: Array | None = None  # (2,) m, a mark on the floor that the robot sees
+
+
+class Surroundings(Protocol):
+    """The scene of a simulated world as a camera on the robot shows it, without what lies outside the scene."""
+
+    def look(self, state: State) -> Percept:
+        """What is around the base, in the odometry frame of `state`. At each call, what moves goes on by a tick."""
+        ...
+
+
 class Sensors(Protocol):
     """The reading half of a backend."""
 
@@ -167,6 +187,16 @@ class Truth(Protocol):
         """Whether each body has fallen `(n,)`."""
         ...
 
+    @property
+    def joints(self) -> Array:
+        """Joint positions `(n, n_joints)` rad."""
+        ...
+
+    @property
+    def touching(self) -> Array:
+        """Whether each body touches an obstacle of the scene, or another robot `(n,)`."""
+        ...
+
 
 class World(Protocol):
     """Many simulated bodies. An episode draws from its own random stream, so it does not depend on its neighbours."""
@@ -213,12 +243,23 @@ class Reference(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class Keyframes:
+    """States to be in at given times. A planner takes them as known: inpainted at zero noise."""
+
+    ticks: Array  # (k,) int, ahead of now, at least 1 and rising
+    states: Array  # (k, state features): rows like those of `PlanRequest.states`, in the odometry frame
+
+
+@dataclass(frozen=True, slots=True)
 class Instruction:
     """What a task asks of a policy at a tick."""
 
     velocity: Array  # (..., 3) m/s forward, m/s left, rad/s: base, heading frame
     goal: Array | None = None  # (..., 2) m in the heading frame, from the base
     text: str | None = None  # a sentence that says what to do; None for policies to go by the velocity
+    path: Array | None = None  # (n, 2) m in the heading frame: where to be at the next n ticks
+    obstacles: Array | None = None  # (n, 5) in the heading frame: x, y, radius m, velocity m/s; to be kept clear of
+    keyframes: Keyframes | None = None
 
 
 class Policy(Protocol):
@@ -263,6 +304,10 @@ class Trace:
     yaw_rate: Array  # (ticks,) rad/s
     command: Array  # (ticks, 3) instructed velocity
     fallen: bool
+    joints: Array | None = None  # (ticks, n_joints) rad
+    obstacles: Array | None = None  # (ticks, n, 3) m: x, y, radius
+    robots: Array | None = None  # (ticks, n, 3) the others: x, y m and heading rad
+    touched: bool | None = None  # whether the robot touched an obstacle or another robot; None: it cannot know
 
 
 class Task(Protocol):
@@ -275,8 +320,12 @@ class Task(Protocol):
         """Draw the episode's goal, commands and disturbances."""
         ...
 
+    def scene(self) -> Scene | None:
+        """What a simulated world holds in this episode beside the robot; None for nothing."""
+        ...
+
     def percept(self, state: State) -> Percept:
-        """What the task itself tells the robot about its surroundings."""
+        """What the task itself tells the robot about its surroundings, where nobody sees them."""
         ...
 
     def disturbance(self, tick: int) -> Array | None:

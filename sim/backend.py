@@ -4,23 +4,31 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.hal import Array, Command, Mode, Observation
+from hw.hal import Array, Command, Mode, Observation, Percept, Scene, State
 from hw.robot import Robot
+from sim.model import build
+from sim.scene import Stage
 from sim.truth import Truth
 from sim.worlds import Worlds
 
 
 class SimBackend:
-    """A robot in MuJoCo. `truth` is for evaluation alone; nothing that the loop holds leads to it."""
+    """A robot in MuJoCo. `truth` and `stage` are for evaluation; of them, the loop is only shown what `look` sees.
+
+    `stage` is the scene in play, None without one.
+    """
 
     name = "sim"
 
-    def __init__(self, robot: Robot, *, seed: int = 0, randomise: bool = False) -> None:
+    def __init__(self, robot: Robot, *, seed: int = 0, randomise: bool = False, scene: Scene | None = None) -> None:
         self._robot = robot
-        self._worlds = Worlds(robot, 1, threads=1, randomise=float(randomise))
+        self._worlds = Worlds(robot, 1, threads=1, randomise=float(randomise), model=build(robot, scene))
         self._worlds.reset(np.array([0]), [np.random.default_rng([seed, 0])])
         self._command = Command(robot.home[None], np.zeros((1, len(robot.joints))), Mode.OFF)
         self.clock = SimClock(self)
+        self.stage: Stage | None = None
+        if scene is not None:
+            self.stage = Stage(scene, self.truth, robot.dt, lambda places: self._worlds.move(0, places))
 
     @property
     def truth(self) -> Truth:
@@ -39,6 +47,11 @@ class SimBackend:
     def push(self, velocity: Array) -> None:
         """Change the base's velocity by `(2,)` m/s, world frame."""
         self._worlds.push(np.asarray(velocity)[None])
+
+    def look(self, state: State) -> Percept:
+        """What the robot sees of the scene (see `hw.hal.Surroundings`)."""
+        assert self.stage is not None, "there is no scene"
+        return self.stage.look(state)
 
     def close(self) -> None:
         self._command = Command(self._command.position, self._command.gain, Mode.OFF)

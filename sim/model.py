@@ -8,18 +8,23 @@ from pathlib import Path
 import mujoco
 
 from hw.config import ConfigError
+from hw.hal import Scene
 from hw.robot import Robot, Servo
+from sim.scene import add_scene
 
 TIMESTEP = 0.004  # s
 _FOUND, _FORCE, _NET = 1, 2, 3  # data bits and reduction of MuJoCo's contact sensor
 
 
-def build(robot: Robot) -> mujoco.MjModel:
-    """Compile the model of `robot` on a floor. Actuator i drives joint i of the robot's file.
+def build(robot: Robot, scene: Scene | None = None) -> mujoco.MjModel:
+    """Compile the model of `robot` on a floor, with a scene. Actuator i drives joint i of the robot's file.
 
     The MJCF's own actuators, sensors and keyframes are replaced. Raises ConfigError naming what the MJCF lacks.
     """
-    return spec(robot).compile()
+    result = spec(robot)
+    if scene is not None:
+        add_scene(result, scene)
+    return result.compile()
 
 
 def spec(robot: Robot) -> mujoco.MjSpec:

@@ -7,6 +7,7 @@ import numpy as np
 
 from hw.hal import Array
 from hw.robot import Robot
+from sim.scene import scene_sensors
 
 FALL_HEIGHT = 0.6  # of the standing height
 FALL_TILT = np.deg2rad(60.0)
@@ -21,6 +22,7 @@ class Truth:
         self._robot, self._qpos, self._qvel, self._sensors = robot, qpos, qvel, sensors
         self._at = {model.sensor(i).name: slice(int(a := model.sensor(i).adr[0]), int(a + model.sensor(i).dim[0]))
                     for i in range(model.nsensor)}  # fmt: skip
+        self._scene = scene_sensors(model)
         joints = [model.joint(name) for name in robot.names]
         self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._joint_dof = np.array([int(joint.dofadr[0]) for joint in joints])
@@ -109,3 +111,8 @@ class Truth:
         all_contacts = self._sensors[:, self._at["floor"]][:, 0]
         foot_contacts = self._feet("contact")[..., 0].sum(-1)
         return low | (self.tilt > FALL_TILT) | (all_contacts > foot_contacts)
+
+    @property
+    def touching(self) -> Array:
+        """Whether each body touches an obstacle of the scene `(n,)`."""
+        return np.any(self._sensors[:, self._scene] > 0, axis=-1)

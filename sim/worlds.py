@@ -18,6 +18,7 @@ from hw.legs import Legs
 from hw.robot import Robot
 from sim.model import TIMESTEP, build
 from sim.randomise import COMMAND_DELAY, LATENCY, Body, draw
+from sim.scene import robot_bodies
 from sim.truth import Truth
 
 _NOISE_ROWS = 64  # ticks of sensor noise drawn at a time
@@ -43,6 +44,7 @@ class Worlds:
             raise ConfigError(f"{robot.name}: rate: {robot.rate} does not divide the physics' {whole} steps a second")
         self.batch = Batch(self.model, n, threads)
         self._legs = Legs(robot)
+        self._bodies = robot_bodies(self.model)
         joints = [self.model.joint(name) for name in robot.names]
         self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
@@ -66,6 +68,8 @@ class Worlds:
         self._state_qpos, self._state_qvel = b.bind("qpos"), b.bind("qvel")
         self._sensors = b.bind("sensordata")
         self._gain, self._force = b.expand("actuator_gainprm"), b.expand("actuator_forcerange")
+        if self.model.nmocap:
+            self._mocap = b.bind("mocap_pos")
         self._floor = b.expand("geom_friction")[:, self.model.geom("floor").id]
         if randomise > 0:
             self._mass, self._inertia = b.expand("body_mass"), b.expand("body_inertia")
@@ -96,7 +100,7 @@ class Worlds:
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for i, rng in zip(ids, rngs, strict=True):
             self._rngs[i] = rng
-            self._place(i, draw(rng, self.robot, self.model.nbody, rng.random() < self.randomise))
+            self._place(i, draw(rng, self.robot, self._bodies, rng.random() < self.randomise))
         self._state_qpos[ids] = 0.0
         self._state_qpos[ids, 2], self._state_qpos[ids, 3:7] = self._legs.stand(pose - self._zero[ids])
         self._state_qpos[ids[:, None], self._qpos] = pose - self._zero[ids]
@@ -123,8 +127,9 @@ class Worlds:
         self._gyro_bias[i], self._acc_bias[i], self._tilt[i] = body.gyro_bias, body.accelerometer_bias, body.imu_tilt
         self._floor[i, 0] = body.friction
         if self.randomise > 0:
-            self._mass[i] = self.model.body_mass * body.mass
-            self._inertia[i] = self.model.body_inertia * body.mass[:, None]
+            own = slice(self._bodies)
+            self._mass[i, own] = self.model.body_mass[own] * body.mass
+            self._inertia[i, own] = self.model.body_inertia[own] * body.mass[:, None]
 
     def step(self, command: Command) -> None:
         """Advance by one tick under `command`, whose arrays are `(n, n_joints)` or broadcast to it."""
@@ -158,6 +163,10 @@ class Worlds:
     def push(self, velocity: Array) -> None:
         """Change the bases' velocity by `(n, 2)` m/s, world frame."""
         self._state_qvel[:, :2] += velocity
+
+    def move(self, world: int, places: Array) -> None:
+        """Put the centres of the scene's spheres in one world to `(m, 3)` m."""
+        self._mocap[world] = places
 
     def observe(self) -> Observation:
         """What the rig's sensors say now: delayed, quantised, biased and noisy."""

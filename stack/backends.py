@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import Any
 
 from hw.config import ConfigError, nearest
-from hw.hal import Backend
+from hw.hal import Backend, Scene
 from hw.robot import Robot
 
 
@@ -37,8 +37,13 @@ def backend_kind(name: str) -> Kind:
     return BACKENDS[name]
 
 
-def make_backend(name: str, robot: Robot, *, seed: int, randomise: bool, port: str | None) -> Backend:
-    """A body, not yet connected. Raises ConfigError for an unknown name or a setting that it does not take."""
+def make_backend(
+    name: str, robot: Robot, *, seed: int, randomise: bool, port: str | None, scene: Scene | None = None
+) -> Backend:
+    """A body, not yet connected, with a scene around a simulated one.
+
+    Raises ConfigError for an unknown name or a setting that it does not take.
+    """
     kind = backend_kind(name)
     if kind.simulated and port is not None:
         raise ConfigError(f"backend '{name}' has no port: drop --port, or choose --backend dynamixel")
@@ -47,6 +52,6 @@ def make_backend(name: str, robot: Robot, *, seed: int, randomise: bool, port: s
     if not kind.simulated and randomise:
         raise ConfigError(f"backend '{name}' is a robot that is what it is: drop --randomise")
     make = getattr(import_module(kind.module), kind.attribute)
-    chosen = {"seed": seed, "randomise": randomise} if kind.simulated else {"port": port}
+    chosen = {"seed": seed, "randomise": randomise, "scene": scene} if kind.simulated else {"port": port}
     backend: Backend = make(robot, **chosen, **kind.options)
     return backend

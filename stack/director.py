@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hw.hal import Array, Instruction, Observation, Policy, State, Task, Trace
+from hw.hal import Array, Instruction, Observation, Percept, Policy, State, Task, Trace
 from hw.robot import Robot
 from stack.coast import missing
 from stack.loop import Adopted, Estimator, Proposal
@@ -19,7 +19,10 @@ SETTLE_SECONDS = 1.5  # standing still at home, in which the estimator learns th
 
 
 class Director:
-    """Pilot of a run. `push` changes the body's velocity, m/s `(2,)`; None where a body cannot be pushed."""
+    """Pilot of a run. `push` changes the body's velocity, m/s `(2,)`; None where a body cannot be pushed.
+
+    `look` sees what is around the robot (`hw.hal.Surroundings`); without it the task says what should be there.
+    """
 
     def __init__(
         self,
@@ -29,12 +32,14 @@ class Director:
         task: Task,
         policy: Policy,
         push: Callable[[Array], None] | None = None,
+        look: Callable[[State], Percept] | None = None,
     ) -> None:
         self._robot, self._guard, self._estimator, self._task, self._policy = robot, guard, estimator, task, policy
         self._push = push
+        self._look = task.percept if look is None else look
         self._settled = 0
         self._plans = 0  # adopted so far
-        self._rows: list[tuple[State, Instruction]] = []
+        self._rows: list[tuple[State, Instruction, Percept]] = []
         self.ended: str | None = None  # "done" or "time", if the task ended by itself
 
     @property
@@ -58,7 +63,8 @@ class Director:
 
     def trace(self) -> Trace:
         """What the robot believes to have gone through in the task."""
-        states = [state for state, _ in self._rows]
+        states = [state for state, _, _ in self._rows]
+        percepts = [percept for _, _, percept in self._rows]
         gravity = np.array([state.gravity for state in states]).reshape(-1, 3)
         rates = np.array([state.angular_velocity for state in states]).reshape(-1, 3)
         return Trace(
@@ -67,8 +73,11 @@ class Director:
             yaw=np.array([state.yaw for state in states], dtype=float),
             velocity=np.array([state.velocity for state in states]).reshape(-1, 3),
             yaw_rate=-(gravity * rates).sum(-1),  # about the vertical
-            command=np.array([instruction.velocity for _, instruction in self._rows]).reshape(-1, 3),
+            command=np.array([instruction.velocity for _, instruction, _ in self._rows]).reshape(-1, 3),
             fallen=self._guard.phase is Phase.FAULT and self._guard.cause == "fall" and self.ended is None,
+            joints=np.array([state.position for state in states]).reshape(-1, len(self._robot.joints)),
+            obstacles=_stacked([percept.obstacles for percept in percepts]),
+            robots=_stacked([percept.robots for percept in percepts]),
         )
 
     def _wake(self, tick: int, observation: Observation, state: State | None) -> None:
@@ -80,9 +89,9 @@ class Director:
 
     def _do_task(self, state: State) -> Proposal:
         tick = self.task_ticks
-        percept = self._task.percept(state)
+        percept = self._look(state)
         instruction = self._task.instruct(tick, state, percept)
-        self._rows.append((state, instruction))
+        self._rows.append((state, instruction, percept))
         shown = Proposal(instruction=instruction, percept=percept)
         if self._task.done(state):
             self._end("done", "the task is done")
@@ -115,3 +124,9 @@ class Director:
     def _end(self, how: str, text: str) -> None:
         self.ended = how
         self._guard.stop("task", text)
+
+
+def _stacked(rows: list[Array | None]) -> Array | None:
+    """Rows `(ticks, n, 3)` of what was perceived; None where there was nothing to perceive."""
+    present = [row for row in rows if row is not None]
+    return np.array(present) if present and len(present) == len(rows) else None

@@ -74,8 +74,17 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         {"tick": _INTEGER, "mode": _TEXT, "phase": _TEXT} | _arrays({"position": "rad", "gain": "of the firmware's"})
     ),
     "/instruction": _schema(
-        {"tick": _INTEGER, "source": _TEXT}
-        | _arrays({"velocity": "m/s, m/s, rad/s", "goal": "m, heading frame", "place": "m, goal in the odometry frame"})
+        {"tick": _INTEGER, "source": _TEXT, "text": _TEXT}
+        | _arrays(
+            {
+                "velocity": "m/s, m/s, rad/s",
+                "goal": "m, heading frame",
+                "path": "m, heading frame",
+                "place": "m, goal in the odometry frame",
+                "obstacles": "x, y, radius m, odometry frame",
+                "robots": "x, y m and heading rad, odometry frame",
+            }
+        )
     ),
     "/plan": _schema(
         {"tick": _INTEGER, "requested": _INTEGER, "adopted": _INTEGER, "first": _INTEGER, "seconds": _NUMBER}
@@ -133,12 +142,13 @@ def messages(record: TickRecord) -> list[tuple[str, dict[str, Any]]]:
         out.append(("/state", tick | {name: pack(getattr(record.state, name), COMPACT) for name in _STATE}))
     if proposal.instruction is not None:
         instruction: dict[str, Any] = tick | {"velocity": pack(proposal.instruction.velocity, COMPACT)}
-        if proposal.instruction.goal is not None:
-            instruction["goal"] = pack(proposal.instruction.goal, COMPACT)
-        if proposal.percept is not None:
-            instruction["source"] = proposal.percept.source
-            if proposal.percept.goal is not None:
-                instruction["place"] = pack(proposal.percept.goal, COMPACT)
+        if proposal.instruction.text is not None:
+            instruction["text"] = proposal.instruction.text
+        arrays = {"goal": proposal.instruction.goal, "path": proposal.instruction.path}
+        if (percept := proposal.percept) is not None:
+            instruction["source"] = percept.source
+            arrays |= {"place": percept.goal, "obstacles": percept.obstacles, "robots": percept.robots}
+        instruction |= {name: pack(array, COMPACT) for name, array in arrays.items() if array is not None}
         out.append(("/instruction", instruction))
     if proposal.plan is not None:
         plan = proposal.plan.plan

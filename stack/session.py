@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hw.config import ConfigError
-from hw.hal import Backend, Policy, Task, Trace
+from hw.hal import Backend, Policy, Scene, Task, Trace
 from hw.robot import Robot, load_robot
 from stack.backends import backend_kind, make_backend
 from stack.clock import RealTime, Schedule, WallClock
@@ -106,9 +106,17 @@ def run(
         raise ConfigError(
             "nothing moves by itself on a real robot: give start=True (--start), or confirm at the prompt"
         )
+    scene = start_task(task, settings.seed)
     body = backend or make_backend(
-        settings.backend, robot, seed=settings.seed, randomise=settings.randomise, port=settings.port
+        settings.backend,
+        robot,
+        seed=settings.seed,
+        randomise=settings.randomise,
+        port=settings.port,
+        scene=scene if simulated else None,  # who runs a real robot puts up what the task says
     )
+    if scene is not None and simulated and getattr(body, "stage", None) is None:
+        raise ConfigError(f"task '{task.name}' has a scene: make the backend with it (stack.session.prepare does)")
     with ExitStack() as stack:
         pilot = make_policy(settings.policy, robot, task, realtime) if policy is None else policy
         if script.plans is not None and hasattr(pilot, "only"):
@@ -119,7 +127,6 @@ def run(
         push = getattr(body, "push", None)
         if push is None and _pushes(task):
             raise ConfigError(f"backend '{body.name}' cannot push the robot: drop the task's push setting")
-        task.reset(np.random.default_rng([settings.seed, TASK_STREAM]))
         pilot.reset(settings.seed)
         sensors, motors = body.connect()
         if not (simulated or settings.start) and confirm is not None:
@@ -129,7 +136,8 @@ def run(
         interrupt = stack.enter_context(Interrupt())
         guard = Guard(robot, motors, gain)
         estimator = Estimator(robot, load_odometry(robot))
-        director = Director(robot, guard, estimator, task, pilot, push)
+        look = None if scene is None or not simulated else body.look  # type: ignore[attr-defined]
+        director = Director(robot, guard, estimator, task, pilot, push, look)
         tally = _Tally()
         listeners: list[Listener] = [tally]
         recorder = None
@@ -175,6 +183,31 @@ def run(
         return result
 
 
+def prepare(settings: Settings) -> tuple[Task, Backend]:
+    """The task of a run, its episode drawn, and the simulated body with its scene, for `run` and for judging it.
+
+    Raises ConfigError like `run`.
+    """
+    robot = load_robot(settings.robot)
+    task, _ = _task(settings, robot)
+    scene = start_task(task, settings.seed)
+    body = make_backend(
+        settings.backend,
+        robot,
+        seed=settings.seed,
+        randomise=settings.randomise,
+        port=settings.port,
+        scene=scene,
+    )
+    return task, body
+
+
+def start_task(task: Task, seed: int) -> Scene | None:
+    """Draw the episode that a run with this seed does; its scene."""
+    task.reset(np.random.default_rng([seed, TASK_STREAM]))
+    return task.scene()
+
+
 def _task(settings: Settings, robot: Robot) -> tuple[Task, float]:
     values = dict(settings.set)
     text = values.pop("gain", "1")
@@ -186,7 +219,7 @@ def _task(settings: Settings, robot: Robot) -> tuple[Task, float]:
         raise ConfigError(f"gain: {gain:g} is outside 0 to {MAX_GAIN:g}: it scales the servos' position gain")
     if settings.seconds is not None:
         values["seconds"] = repr(settings.seconds)
-    return load_task(settings.task, values, robot.dt), gain
+    return load_task(settings.task, values, robot.dt, robot), gain
 
 
 def _with_failure(result: Result, error: str | None) -> Result:

@@ -111,18 +111,13 @@ def episode_check(job: Any) -> None:
 def episode(job: Any) -> dict[str, Any]:
     """One run, judged by the truth. One that the guard broke off is no success, however far it came."""
     from hw.robot import load_robot
-    from stack.backends import make_backend
-    from stack.session import run
-    from stack.tasks import load_task
+    from stack.session import prepare, run
     from tools.witness import Witness
 
-    robot = load_robot(job.robot)
-    backend = make_backend(job.backend, robot, seed=job.seed, randomise=job.randomise, port=job.port)
-    witness = Witness(simulated_truth(backend), robot.dt)
+    task, backend = prepare(job)
+    witness = Witness(simulated_truth(backend), load_robot(job.robot).dt, getattr(backend, "stage", None))
     result = run(job, backend=backend, on_tick=witness)
     trace = witness.trace()
-    task = load_task(job.task, _task_values(job), robot.dt)
-    task.reset(witness.task_rng(job.seed))
     return {
         "seed": job.seed,
         "outcome": result.outcome,
@@ -140,11 +135,6 @@ def simulated_truth(backend: Backend) -> Truth:
     if truth is None:
         raise ConfigError(f"backend '{backend.name}' has no truth to judge by: use a simulated one, or `servoid run`")
     return truth
-
-
-def _task_values(job: Any) -> dict[str, str]:
-    values = {key: value for key, value in job.set.items() if key != "gain"}
-    return values if job.seconds is None else {**values, "seconds": repr(job.seconds)}
 
 
 def wilson(successes: int, n: int) -> list[float]:

@@ -2,35 +2,40 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from hw.hal import Array, Trace, Truth
 from stack.loop import TickRecord
-from stack.session import TASK_STREAM
+
+if TYPE_CHECKING:
+    from sim.scene import Stage
 
 
 class Witness:
-    """An `on_tick` listener: one row for each tick of the task."""
+    """An `on_tick` listener: one row for each tick of the task. `stage` is the scene in play, where there is one."""
 
-    def __init__(self, truth: Truth, dt: float) -> None:
-        self._truth, self._dt = truth, dt
+    def __init__(self, truth: Truth, dt: float, stage: Stage | None = None) -> None:
+        self._truth, self._dt, self._stage = truth, dt, stage
         self._rows: list[tuple[Array, float, Array, float, Array]] = []
-        self._fallen = False
+        self._joints: list[Array] = []
+        self._obstacles: list[Array] = []
+        self._fallen = self._touched = False
 
     def __call__(self, record: TickRecord) -> None:
         instruction, truth = record.proposal.instruction, self._truth
         if instruction is None:
             return
         self._fallen |= bool(truth.fallen[0])
+        self._joints.append(truth.joints[0].copy())
+        if self._stage is not None:
+            self._touched |= bool(truth.touching[0])
+            self._obstacles.append(self._stage.obstacles)
         rate = -float(truth.gravity[0] @ truth.angular_velocity[0])
         self._rows.append(
             (truth.position[0].copy(), float(truth.yaw[0]), truth.velocity[0], rate, instruction.velocity)
         )
-
-    @staticmethod
-    def task_rng(seed: int) -> np.random.Generator:
-        """The random stream that the session gave the task, to draw the same episode again."""
-        return np.random.default_rng([seed, TASK_STREAM])
 
     def trace(self) -> Trace:
         """The run by the truth; without rows if the guard never let the task begin."""
@@ -39,17 +44,18 @@ class Witness:
             return Trace(self._dt, none, np.zeros(0), none, np.zeros(0), none, self._fallen)
         position, yaw, velocity, rate, command = (np.array(column) for column in zip(*self._rows, strict=True))
         yaw = np.unwrap(yaw)
-        offset = position - position[0] * [1.0, 1.0, 0.0]
-        c, s = np.cos(yaw[0]), np.sin(yaw[0])
-        x, y = offset[:, 0], offset[:, 1]
+        origin = position[0] * [1.0, 1.0, 0.0]
         return Trace(
             dt=self._dt,
-            displacement=np.stack([c * x + s * y, c * y - s * x, offset[:, 2]], -1),
+            displacement=_turned(position - origin, yaw[0]),
             yaw=yaw - yaw[0],
             velocity=velocity,
             yaw_rate=rate,
             command=command,
             fallen=self._fallen,
+            joints=np.array(self._joints),
+            obstacles=_turned(np.array(self._obstacles) - origin, yaw[0]) if self._obstacles else None,
+            touched=self._touched if self._obstacles else None,
         )
 
     def odometry_error(self, estimate: Trace) -> float:
@@ -58,3 +64,10 @@ class Witness:
             return float("nan")
         end = self.trace().displacement[-1, :2]
         return float(np.linalg.norm(end - estimate.displacement[-1, :2]))
+
+
+def _turned(points: Array, yaw: float) -> Array:
+    """Points `(..., 3)` seen in a frame that is turned by `yaw` about the vertical; their third value stays."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([c * x + s * y, c * y - s * x, points[..., 2]], -1)

@@ -6,28 +6,34 @@ while the controller thinks, so that a run comes out the same every time.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
 from hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
 from hw.dynamixel.motors import DynamixelMotors
-from hw.hal import Array, BackendError, Clock, Truth
+from hw.hal import Array, BackendError, Clock, Percept, Scene, State, Truth
 from hw.robot import Robot
-from sim.rig.control import LockedClock, RigProcess, RigTruth
+from sim.rig.control import Control, LockedClock, RigProcess, RigTruth
+from sim.scene import Stage
 
 
 class VirtualBackend:
     """A robot of emulated servos, the same draw as `sim.backend.SimBackend` makes of a seed.
 
-    `truth` and `push` are for evaluation alone; they go over the rig's control socket and never over its bus.
+    `truth`, `push` and `stage`, the scene in play, are for evaluation alone; they go over the rig's control socket and
+    never over its bus.
     """
 
     name = "virtual"
     clock: Clock
 
-    def __init__(self, robot: Robot, *, seed: int = 0, randomise: bool = False) -> None:
+    def __init__(self, robot: Robot, *, seed: int = 0, randomise: bool = False, scene: Scene | None = None) -> None:
         self.clock = self._clock = VirtualClock()
         self.truth: Truth = VirtualTruth(self)
         self._robot, self._seed, self._randomise = robot, seed, randomise
+        self.stage = None if scene is None else Stage(scene, self.truth, robot.dt, self._roll)
         self._rig: RigProcess | None = None
         self._rig_truth: RigTruth | None = None
         self._body: DynamixelBackend | None = None
@@ -48,7 +54,9 @@ class VirtualBackend:
             raise BackendError("the virtual rig is connected already")
         try:
             rig = self._rig = RigProcess(self._robot, seed=self._seed, randomise=self._randomise)
-            self._rig_truth = rig.truth()
+            if self.stage is not None:
+                rig.control.furnish(self.stage.scene, self._seed, randomise=self._randomise)
+            self._rig_truth = rig.truth(None if self.stage is None else self.stage.scene)
             self._clock.attach(rig)
             self._body = DynamixelBackend(self._robot, port=rig.port, clock=self.clock, name=self.name)
             handles = self._body.connect()
@@ -62,7 +70,15 @@ class VirtualBackend:
 
     def push(self, velocity: Array) -> None:
         """Change the base's velocity by `(2,)` m/s, world frame, before time goes on."""
-        self._clock.pushes.append(np.array(velocity, dtype=float))
+        self._clock.requests.append(partial(Control.push, velocity=np.array(velocity, dtype=float)))
+
+    def look(self, state: State) -> Percept:
+        """What the robot sees of the scene (see `hw.hal.Surroundings`)."""
+        assert self.stage is not None, "there is no scene"
+        return self.stage.look(state)
+
+    def _roll(self, places: Array) -> None:
+        self._clock.requests.append(partial(Control.roll, places=places))
 
     def close(self) -> None:
         """Torque off, acknowledged, then the end of the rig. Raises BackendError when torque may still be on."""
@@ -86,12 +102,12 @@ class VirtualBackend:
 class VirtualClock:
     """The locked time of a rig [ns]; 0 before it is attached, and standing still once it is detached.
 
-    Pushes wait here until time goes on: whoever asks for one may be broken off by a second Ctrl-C, which must not cut
-    a request to the rig in half.
+    Requests wait here until time goes on: whoever makes one may be broken off by a second Ctrl-C, which must not cut it
+    in half on its way to the rig.
     """
 
     def __init__(self) -> None:
-        self.pushes: list[Array] = []
+        self.requests: list[Callable[[Control], None]] = []
         self._rig: RigProcess | None = None
         self._locked: LockedClock | None = None
         self._last = 0
@@ -102,7 +118,7 @@ class VirtualClock:
     def detach(self) -> None:
         self._last = self.now_ns()
         self._rig = self._locked = None
-        self.pushes.clear()
+        self.requests.clear()
 
     def now_ns(self) -> int:
         return self._last if self._locked is None else self._locked.now_ns()
@@ -115,9 +131,9 @@ class VirtualClock:
         self._locked.sleep_until(time_ns)
 
     def deliver(self) -> None:
-        """Send the pushes that wait."""
-        while self.pushes and self._rig is not None:
-            self._rig.control.push(self.pushes.pop(0))
+        """Send the requests that wait."""
+        while self.requests and self._rig is not None:
+            self.requests.pop(0)(self._rig.control)
 
 
 class VirtualTruth:
@@ -133,7 +149,7 @@ class VirtualTruth:
 
     def _now(self) -> Truth:
         clock = self._backend._clock
-        if self._truth is None or self._time != clock.now_ns() or clock.pushes:
+        if self._truth is None or self._time != clock.now_ns() or clock.requests:
             self._truth, self._time = self._backend._fetch(), clock.now_ns()
         return self._truth
 
@@ -166,3 +182,13 @@ class VirtualTruth:
     def fallen(self) -> Array:
         """Whether the robot has fallen `(1,)`."""
         return self._now().fallen
+
+    @property
+    def joints(self) -> Array:
+        """Joint positions `(1, n_joints)` rad."""
+        return self._now().joints
+
+    @property
+    def touching(self) -> Array:
+        """Whether the robot touches an obstacle of the scene `(1,)`."""
+        return self._now().touching

@@ -12,10 +12,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hw.hal import Array, BackendError
+from hw.hal import Array, BackendError, Scene
 from hw.robot import Robot, load_robot, save_robot
 from sim.model import build
 from sim.rig.delivery import Delivery
+from sim.scene import plain
 from sim.truth import Truth
 
 _START_SECONDS = 60.0
@@ -71,6 +72,15 @@ class Control:
         """Change the base's velocity by `(2,)` m/s, world frame."""
         self.call("push", velocity=np.asarray(velocity).tolist())
 
+    def furnish(self, scene: Scene, seed: int, *, randomise: bool = False) -> None:
+        """Put a scene around the robot, and reset the rig."""
+        self.call("furnish", scene=plain(scene))
+        self.reset(seed, randomise=randomise)
+
+    def roll(self, places: Array) -> None:
+        """Put the centres of the scene's spheres to `(m, 3)` m."""
+        self.call("roll", places=np.asarray(places).tolist())
+
     def move(self, pose: dict[str, float]) -> None:
         """Move joints of the held robot by hand [rad]."""
         self.call("move", pose=pose)
@@ -121,9 +131,9 @@ class LockedClock:
 class RigTruth:
     """The truth about a rig's robot, fetched on demand."""
 
-    def __init__(self, control: Control, robot: Robot) -> None:
+    def __init__(self, control: Control, robot: Robot, scene: Scene | None = None) -> None:
         self._control = control
-        model = build(robot)
+        model = build(robot, scene)
         self._arrays = {
             "qpos": np.zeros((1, model.nq)),
             "qvel": np.zeros((1, model.nv)),
@@ -196,8 +206,9 @@ class RigProcess:
         started: dict[str, Any] = json.loads(line)
         return started
 
-    def truth(self) -> RigTruth:
-        return RigTruth(self.control, self.robot)
+    def truth(self, scene: Scene | None = None) -> RigTruth:
+        """The truth about the robot, in the scene that the rig was furnished with."""
+        return RigTruth(self.control, self.robot, scene)
 
     def close(self) -> None:
         """End the rig."""

@@ -13,6 +13,7 @@ import numpy as np
 from hw.config import nearest
 from sim.rig.faults import Fault
 from sim.rig.rig import Rig
+from sim.scene import from_plain
 
 
 class Connection:
@@ -65,6 +66,18 @@ def _push(rig: Rig, velocity: list[float]) -> dict[str, Any]:
     return {}
 
 
+def _furnish(rig: Rig, scene: dict[str, Any]) -> dict[str, Any]:
+    """A scene around the robot; a reset must follow."""
+    rig.plant.furnish(from_plain(scene))
+    return {}
+
+
+def _roll(rig: Rig, places: list[list[float]]) -> dict[str, Any]:
+    """Move the scene's spheres."""
+    rig.plant.move(np.asarray(places, float))
+    return {}
+
+
 def _move(rig: Rig, pose: dict[str, float]) -> dict[str, Any]:
     rig.move(pose)
     return {}
@@ -107,6 +120,8 @@ _OPERATIONS: dict[str, Callable[..., dict[str, Any]]] = {
     "release": _release,
     "hold": _hold,
     "push": _push,
+    "furnish": _furnish,
+    "roll": _roll,
     "move": _move,
     "press": _press,
     "inject": _inject,

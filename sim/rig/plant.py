@@ -10,11 +10,12 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from hw.hal import Array
+from hw.hal import Array, Scene
 from hw.legs import Legs
 from hw.robot import Robot
 from sim.model import TIMESTEP, build
 from sim.randomise import Body, draw
+from sim.scene import robot_bodies
 from sim.truth import Truth
 
 CLEARANCE = 0.05  # m between the soles and the floor while the robot is held
@@ -32,9 +33,15 @@ class Plant:
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
-        self.model = build(robot)
-        self.data = mujoco.MjData(self.model)
         self._legs = Legs(robot)
+        self.furnish(None)
+
+    def furnish(self, scene: Scene | None) -> None:
+        """Put a scene around the robot, which is held at home again."""
+        robot = self.robot
+        self.model = build(robot, scene)
+        self.data = mujoco.MjData(self.model)
+        self._bodies = robot_bodies(self.model)
         joints = [self.model.joint(name) for name in robot.names]
         self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
@@ -56,10 +63,11 @@ class Plant:
         """
         self._rng = np.random.default_rng([seed, episode])
         randomise = self._rng.random() < float(randomise)
-        self.body: Body = draw(self._rng, self.robot, self.model.nbody, randomise)
+        self.body: Body = draw(self._rng, self.robot, self._bodies, randomise)
         self.stiffness = self.body.stiffness / self.robot.servos[0].stiffness  # factor on every servo's
-        self.model.body_mass[:] = self._nominal["body_mass"] * self.body.mass
-        self.model.body_inertia[:] = self._nominal["body_inertia"] * self.body.mass[:, None]
+        own = slice(self._bodies)
+        self.model.body_mass[own] = self._nominal["body_mass"][own] * self.body.mass
+        self.model.body_inertia[own] = self._nominal["body_inertia"][own] * self.body.mass[:, None]
         self.model.geom_friction[:] = self._nominal["geom_friction"]
         self.model.geom_friction[self.model.geom("floor").id, 0] = self.body.friction
         mujoco.mj_setConst(self.model, self.data)
@@ -127,6 +135,10 @@ class Plant:
     def push(self, velocity: Array) -> None:
         """Change the base's velocity by `(2,)` m/s, world frame."""
         self.data.qvel[0:2] += velocity
+
+    def move(self, places: Array) -> None:
+        """Put the centres of the scene's spheres to `(m, 3)` m."""
+        self.data.mocap_pos[:] = places
 
     @property
     def joints(self) -> Array:

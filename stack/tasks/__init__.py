@@ -5,6 +5,7 @@ from __future__ import annotations
 from hw.config import ConfigError, load_yaml, nearest, resolve
 from hw.hal import Task
 from hw.overrides import override
+from hw.robot import Robot
 from stack.tasks.base import BaseTask, Settings
 from stack.tasks.goal import Goal
 from stack.tasks.stand import Stand
@@ -32,12 +33,18 @@ def load_settings(name: str, settings: dict[str, str] | None = None) -> Settings
     return override(base, cls.complete(settings or {}))
 
 
-def load_task(name: str, settings: dict[str, str] | None = None, dt: float = 0.02) -> Task:
+def load_task(
+    name: str, settings: dict[str, str] | None = None, dt: float = 0.02, robot: Robot | None = None
+) -> Task:
     """A task for one robot, to be `reset` before each episode. `dt` is the length of a control tick [s].
 
-    Raises ConfigError for an unknown task or setting, or a value that does not parse.
+    Raises ConfigError for an unknown task or setting, a value that does not parse, or what `robot` cannot do.
     """
-    return task_class(name)(load_settings(name, settings), dt)
+    task = task_class(name)(load_settings(name, settings), dt)
+    task.name = name
+    if robot is not None:
+        task.check(robot)
+    return task
 
 
 __all__ = ["BaseTask", "Settings", "load_settings", "load_task", "names", "task_class"]

@@ -7,8 +7,9 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from hw.hal import Array, Instruction, Percept, State, Trace
-from stack.tasks.guidance import Trajectory, Weights, twist_cost
+from hw.hal import Array, Instruction, Percept, Scene, State, Trace
+from hw.robot import Robot
+from stack.tasks.guidance import Trajectory, Weights, total_cost
 
 Range = tuple[float, float]
 
@@ -44,6 +45,13 @@ class BaseTask:
     def reset(self, rng: np.random.Generator) -> None:
         """Draw the episode. All randomness of a task comes from `rng`."""
 
+    def check(self, robot: Robot) -> None:
+        """Raise ConfigError where the settings ask for what `robot` cannot do."""
+
+    def scene(self) -> Scene | None:
+        """What a simulated world holds in this episode beside the robot; None for nothing."""
+        return None
+
     def percept(self, state: State) -> Percept:
         """What the task itself tells the robot about its surroundings at `state`."""
         return Percept(source="task", age=0.0)
@@ -56,8 +64,8 @@ class BaseTask:
         raise NotImplementedError(f"task {self.name} asks for nothing")
 
     def cost(self, trajectory: Trajectory, instruction: Instruction) -> Any:
-        """Guidance cost `(batch,)`: squared distance from the instructed twist."""
-        return twist_cost(trajectory, instruction.velocity, self.settings.cost)
+        """Guidance cost `(batch,)`: the weighted sum of what the instruction holds (see `guidance.total_cost`)."""
+        return total_cost(trajectory, instruction, self.settings.cost)
 
     def done(self, state: State) -> bool:
         """Whether the episode may end before its time."""

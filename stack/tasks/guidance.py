@@ -1,34 +1,44 @@
-"""The guidance cost of a predicted trajectory: how far it is from moving with a constant twist.
+"""The guidance cost of a predicted trajectory: a weighted sum of terms, each for one thing that an instruction holds.
 
 Works on torch tensors through their own methods, so that tasks load without torch.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
 
-from hw.hal import Array
+from hw.hal import Array, Instruction
 
 _STANDING = 1e-3  # m/s and rad/s: an instructed twist below it means to stand
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of squared errors."""
+    """Weights of the terms of a cost, and the two lengths that shape those about obstacles."""
 
     velocity: float = 1.0  # per (m/s)^2
     yaw_rate: float = 0.1  # per (rad/s)^2
     displacement: float = 1.0  # per m^2
     yaw: float = 0.1  # per rad^2
     stand: float = 10.0  # per (m/s)^2 of each tick's velocity, where nothing but standing is asked
+    goal: float = 0.0  # per m of each tick's distance from the goal
+    facing: float = 0.0  # of 1 - cos of each tick's bearing of the goal
+    path: float = 10.0  # per m^2 of each tick's distance from where the path wants it
+    repulsion: float = 0.1  # of exp(-sharpness * distance) from each obstacle, at each tick
+    sharpness: float = 15.0  # per m
+    avoidance: float = 0.0  # of softplus(1 - distance / margin) from each obstacle, at each tick
+    margin: float = 0.275  # m
 
     def __post_init__(self) -> None:
-        for key in ("velocity", "yaw_rate", "displacement", "yaw", "stand"):
-            if getattr(self, key) < 0.0:
-                raise ValueError(f"{key}: a weight must not be negative")
+        for f in fields(self):
+            if getattr(self, f.name) < 0.0:
+                raise ValueError(f"{f.name}: a weight must not be negative")
+        for key in ("sharpness", "margin"):
+            if getattr(self, key) == 0.0:
+                raise ValueError(f"{key}: must be positive")
 
 
 class Trajectory(Protocol):
@@ -39,6 +49,61 @@ class Trajectory(Protocol):
     velocity: Any  # (batch, horizon, 2) m/s, each frame's own heading frame, like `State.velocity`
     yaw_rate: Any  # (batch, horizon) rad/s
     dt: float  # s between frames
+
+
+def total_cost(trajectory: Trajectory, instruction: Instruction, weights: Weights) -> Any:
+    """Sum `(batch,)` of the terms of everything that the instruction holds.
+
+    The terms for goal, path and obstacles are means over the horizon, so that weights do not depend on its length.
+    """
+    cost = twist_cost(trajectory, instruction.velocity, weights)
+    if instruction.goal is not None and (weights.goal > 0.0 or weights.facing > 0.0):
+        cost = cost + goal_cost(trajectory, instruction.goal, weights)
+    if instruction.path is not None:
+        cost = cost + path_cost(trajectory, instruction.path, weights)
+    if instruction.obstacles is not None and len(instruction.obstacles):
+        cost = cost + obstacle_cost(trajectory, instruction.obstacles, weights)
+    return cost
+
+
+def goal_cost(trajectory: Trajectory, goal: Array, weights: Weights) -> Any:
+    """`w1 |p - g| + w2 (1 - cos(heading, g - p))` of each tick, for a goal `(2,)` m (UniPhys, eq. 5): `(batch,)`."""
+    way = trajectory.displacement.new_tensor(np.asarray(goal, dtype=float)) - trajectory.displacement
+    distance = _norm(way)
+    ahead = (way[..., 0] * trajectory.yaw.cos() + way[..., 1] * trajectory.yaw.sin()) / distance
+    return (weights.goal * distance + weights.facing * (1.0 - ahead)).mean(-1)
+
+
+def path_cost(trajectory: Trajectory, path: Array, weights: Weights) -> Any:
+    """Squared distance of each tick from its place on the path `(n, 2)` m (Diffuse-CLoC, eq. 5): `(batch,)`.
+
+    Ticks beyond the end of the path are not compared.
+    """
+    places = trajectory.displacement.new_tensor(np.asarray(path, dtype=float))
+    ticks = min(len(places), trajectory.displacement.shape[-2])
+    return weights.path * ((trajectory.displacement[..., :ticks, :] - places[:ticks]) ** 2).sum(-1).mean(-1)
+
+
+def obstacle_cost(trajectory: Trajectory, obstacles: Array, weights: Weights) -> Any:
+    """Closeness to obstacles `(n, 5)` that move with constant velocity, summed over them: `(batch,)`.
+
+    With d the signed distance of the base from an obstacle, `exp(-c d)` (Diffuse-CLoC, eq. 3 and 4), and
+    `softplus(1 - d / margin)` (UniPhys, eq. 7, whose margin is 1 m).
+    """
+    as_tensor = trajectory.displacement.new_tensor
+    centre, radius, velocity = np.split(np.asarray(obstacles, dtype=float), [2, 3], axis=-1)
+    times = trajectory.dt * np.arange(1, trajectory.displacement.shape[-2] + 1)
+    centres = as_tensor(centre + times[:, None, None] * velocity)  # (horizon, n, 2)
+    distance = _norm(trajectory.displacement[..., None, :] - centres) - as_tensor(radius[:, 0])
+    cost = weights.repulsion * (-weights.sharpness * distance).exp()
+    if weights.avoidance > 0.0:
+        cost = cost + weights.avoidance * (1.0 + (1.0 - distance / weights.margin).exp()).log()
+    return cost.sum(-1).mean(-1)
+
+
+def _norm(vectors: Any) -> Any:
+    """Length of `(..., 2)`, with a gradient at zero too."""
+    return ((vectors**2).sum(-1) + 1e-9).sqrt()
 
 
 def integrate_twist(velocity: Array, times: Array) -> tuple[Array, Array]:

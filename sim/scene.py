@@ -1,0 +1,110 @@
+"""The scene of a task in a MuJoCo model, and what a robot sees of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from hw.hal import Array, Percept, Scene, State, Truth
+
+PREFIX = "scene/"  # of the names of a scene's bodies, which follow the robot's
+PILLAR_HEIGHT = 0.4  # m: taller than the robot's shoulders
+_PILLAR_COLOUR, _SPHERE_COLOUR = (0.55, 0.42, 0.32, 1.0), (0.80, 0.20, 0.20, 1.0)
+_FOUND = 1  # data bit of MuJoCo's contact sensor
+
+
+def add_scene(model: mujoco.MjSpec, scene: Scene) -> None:
+    """Add static pillars, mocap spheres and a contact sensor for each of both. Like the floor, they meet all that
+    collides with the floor."""
+    bodies = []
+    if len(scene.pillars):
+        bodies.append(model.worldbody.add_body(name=f"{PREFIX}pillars"))
+        for x, y, radius in scene.pillars:
+            _add_geom(bodies[0], mujoco.mjtGeom.mjGEOM_CYLINDER, [radius, PILLAR_HEIGHT / 2, 0], _PILLAR_COLOUR, [x, y])
+    for number, (x, y, radius, _) in enumerate(scene.spheres):
+        body = model.worldbody.add_body(name=f"{PREFIX}sphere{number}", mocap=True, pos=[x, y, radius])
+        _add_geom(body, mujoco.mjtGeom.mjGEOM_SPHERE, [radius, 0, 0], _SPHERE_COLOUR)
+        bodies.append(body)
+    for body in bodies:
+        model.add_sensor(
+            name=body.name,
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname=body.name,
+            intprm=[_FOUND, 0, 1],
+        )
+
+
+def _add_geom(body: Any, kind: mujoco.mjtGeom, size: list[float], colour: tuple[float, ...], at: Any = (0, 0)) -> None:
+    height = size[1] if kind == mujoco.mjtGeom.mjGEOM_CYLINDER else 0.0
+    body.add_geom(
+        type=kind, size=size, pos=[*at, height], rgba=colour, contype=1, conaffinity=0, condim=3, solref=[0.008, 1.0]
+    )
+
+
+def robot_bodies(model: mujoco.MjModel) -> int:
+    """How many of a model's bodies, the first ones, are the world's and the robot's, and not a scene's."""
+    return next((i for i in range(model.nbody) if model.body(i).name.startswith(PREFIX)), model.nbody)
+
+
+def scene_sensors(model: mujoco.MjModel) -> Array:
+    """Addresses of the scene's contact sensors in the sensor data."""
+    sensors = (model.sensor(i) for i in range(model.nsensor))
+    return np.array([int(s.adr[0]) for s in sensors if s.name.startswith(PREFIX)], dtype=int)
+
+
+def plain(scene: Scene) -> dict[str, Any]:
+    """A scene as JSON values."""
+    goal = None if scene.goal is None else scene.goal.tolist()
+    return {"pillars": scene.pillars.tolist(), "spheres": scene.spheres.tolist(), "goal": goal}
+
+
+def from_plain(values: dict[str, Any]) -> Scene:
+    """The scene that `plain` wrote."""
+    return Scene(
+        np.array(values["pillars"], dtype=float).reshape(-1, 3),
+        np.array(values["spheres"], dtype=float).reshape(-1, 4),
+        None if values["goal"] is None else np.array(values["goal"], dtype=float),
+    )
+
+
+class Stage:
+    """A scene in play. `move` puts the spheres' centres `(m, 3)` m into the world, before time goes on."""
+
+    def __init__(self, scene: Scene, truth: Truth, dt: float, move: Callable[[Array], None]) -> None:
+        self.scene = scene
+        self._truth, self._dt, self._move = truth, dt, move
+        self._spheres = scene.spheres[:, :2].copy()
+
+    @property
+    def obstacles(self) -> Array:
+        """Pillars and spheres as they are now `(n, 3)` m: x, y, radius, world frame."""
+        return np.concatenate([self.scene.pillars, np.column_stack([self._spheres, self.scene.spheres[:, 2]])])
+
+    def look(self, state: State) -> Percept:
+        """What is seen, in the odometry frame of `state`: right relative to the robot, wherever it believes to be."""
+        base, yaw = self._truth.position[0, :2].copy(), float(self._truth.yaw[0])
+        obstacles = self.obstacles
+        obstacles[:, :2] = _seen(obstacles[:, :2], base, yaw, state)
+        goal = None if self.scene.goal is None else _seen(self.scene.goal[None], base, yaw, state)[0]
+        if len(self._spheres):
+            self._pursue(base)
+        return Percept(source="scene", age=0.0, goal=goal, obstacles=obstacles)
+
+    def _pursue(self, base: Array) -> None:
+        """Let the spheres roll toward the robot for a tick."""
+        way = base - self._spheres
+        distance = np.linalg.norm(way, axis=1, keepdims=True)
+        step = np.minimum(self.scene.spheres[:, 3:] * self._dt, distance)
+        self._spheres = self._spheres + step * way / np.maximum(distance, 1e-9)
+        self._move(np.column_stack([self._spheres, self.scene.spheres[:, 2]]))
+
+
+def _seen(places: Array, base: Array, yaw: float, state: State) -> Array:
+    """World places `(n, 2)` m in the odometry frame of `state`, seen from the true base."""
+    turn = float(state.yaw) - yaw
+    cos, sin = np.cos(turn), np.sin(turn)
+    return (places - base) @ np.array([[cos, sin], [-sin, cos]]) + state.displacement[:2]
