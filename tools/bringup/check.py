@@ -1,0 +1,54 @@
+"""Compare every register that matters with the robot's file.
+
+With `--fix` what differs is written, with torque off, and compared again. Nothing moves. Exit code 0: the robot is as
+its file says; 1: something differs.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+
+from tools import exit_codes
+from tools.bringup.line import add_line_arguments, assembled, open_line
+from tools.output import reporting
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_line_arguments(parser)
+    parser.add_argument("--fix", action="store_true", help="write what differs")
+
+
+def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        from hw.dynamixel.survey import as_table, compare, correct, find_board, find_servos
+
+        robot = assembled(args, report)
+        with open_line(args, robot) as line:
+            line.bus.return_delay = 254 * 2e-6  # until the servos' own is known
+            find_board(line.bus, robot)
+            found = find_servos(line.bus, robot)
+            before = left = compare(robot, found)
+            report.line(f"{len(found)} servos and the board answer; {len(before)} registers differ")
+            if before:
+                report.line(as_table(before))
+            if before and args.fix:
+                correct(line.bus, found, before)
+                left = compare(robot, find_servos(line.bus, robot))
+                report.line(f"written {len(before)} registers, read back: {len(left)} differ")
+                if left:
+                    report.line(as_table(left))
+        if not left:
+            report.line(f"all as {robot.name} needs it")
+        elif not args.fix:
+            report.line("servoid bringup check --fix writes what is wanted")
+        report.result(
+            {
+                "servos": len(found),
+                "differences": [asdict(difference) for difference in before],
+                "fixed": len(before) - len(left) if args.fix else 0,
+                "left": [asdict(difference) for difference in left],
+                "ready": not left,
+            }
+        )
+    return exit_codes.FAILED if left else exit_codes.DONE

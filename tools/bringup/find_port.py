@@ -1,0 +1,103 @@
+"""Find the serial port of the robot.
+
+Lists the USB serial ports. Where a person is watching it then waits for an adapter to be plugged in or unplugged, and
+says which one that was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import asdict
+
+from hw.hal import BackendError
+from tools import exit_codes
+from tools.bringup.line import VIRTUAL, add_line_arguments
+from tools.bringup.ports import PortInfo, usb_ports
+from tools.output import Report, reporting
+from tools.run import positive
+
+PATIENCE = 60.0  # s
+_POLL = 0.2  # s
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_line_arguments(parser)
+    parser.add_argument(
+        "--wait",
+        type=positive,
+        metavar="S",
+        help=f"wait so long for a change (default: {PATIENCE:g} on a terminal, not at all elsewhere)",
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        if args.port == VIRTUAL:
+            return _virtual(args, report)
+        before = usb_ports()
+        _show(before, report)
+        if args.port is not None and args.port not in before:
+            raise BackendError(
+                f"{args.port}: no USB serial port of that name: plug it in, or leave --port out"
+            )
+        wait = args.wait or (PATIENCE if sys.stdin.isatty() and not args.json else 0.0)
+        changed = None
+        if wait and args.port is None:
+            report.line()
+            report.line(f"Unplug the robot's adapter now, or plug it in ({wait:g} s; Ctrl-C leaves).")
+            changed = _change(before, wait)
+            if changed is None:
+                report.line("nothing changed: is it another cable, or one that only charges?")
+            else:
+                what, port = changed
+                report.line(f"{what}: {port.path} ({port.what})")
+                if port.name != port.path:
+                    report.line(f"its name, wherever it is plugged in: {port.name}")
+                report.line(f"next: servoid bringup scan --port {port.path}")
+        report.result(
+            {
+                "ports": [asdict(port) for port in before.values()],
+                "changed": None if changed is None else {"what": changed[0], **asdict(changed[1])},
+            }
+        )
+    return exit_codes.DONE
+
+
+def _show(ports: dict[str, PortInfo], report: Report) -> None:
+    if not ports:
+        report.line("no USB serial port here: plug the robot's adapter in")
+        return
+    report.table(
+        ("port", "what", "permission", "name that stays"),
+        [(p.path, p.what, "yes" if p.allowed else "no: servoid doctor", p.name) for p in ports.values()],
+    )
+
+
+def _change(before: dict[str, PortInfo], seconds: float) -> tuple[str, PortInfo] | None:
+    """What came or went within so many seconds."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        now = usb_ports()
+        if came := now.keys() - before.keys():
+            time.sleep(0.5)  # until udev has made its link and given permission
+            return "plugged in", usb_ports().get(min(came), now[min(came)])
+        if gone := before.keys() - now.keys():
+            return "unplugged", before[min(gone)]
+        time.sleep(_POLL)
+    return None
+
+
+def _virtual(args: argparse.Namespace, report: Report) -> int:
+    """Start a rig, and show where it would be found."""
+    from hw.robot import load_robot
+    from sim.rig.control import RigProcess
+
+    robot = load_robot(args.robot)
+    with RigProcess(robot) as rig:
+        report.line(f"a virtual rig of {robot.name} had its port at {rig.port}, {robot.bus.baud} bit/s; it has ended.")
+        report.line("One that stays, at a path of your choice: servoid virtual --link /tmp/rig")
+        port = PortInfo(rig.port, rig.port, f"virtual rig of {robot.name}", True)
+    report.result({"ports": [asdict(port)], "changed": None})
+    return exit_codes.DONE

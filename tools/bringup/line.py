@@ -1,0 +1,89 @@
+"""The line to the servos that a verb works on: a serial port, or a virtual rig of its own."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hw.config import ConfigError
+from hw.hal import Clock
+from hw.robot import Robot, load_robot
+from tools.output import Report, add_json_argument
+
+if TYPE_CHECKING:
+    from hw.dynamixel.bus import Bus
+    from sim.rig.control import Control
+    from sim.rig.delivery import Delivery
+
+VIRTUAL = "virtual"
+
+
+@dataclass(frozen=True)
+class Line:
+    """A bus that is open at the robot's baud. `control` is of a virtual rig at its end, None at a real robot."""
+
+    bus: Bus
+    clock: Clock
+    control: Control | None
+
+
+def add_line_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--port",
+        metavar="PATH|virtual",
+        help="serial port of the robot (servoid bringup find-port), or a virtual rig of its own",
+    )
+    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
+    add_json_argument(parser)
+
+
+def is_virtual(args: argparse.Namespace) -> bool:
+    """Whether the verb has a virtual rig of its own. Raises ConfigError when no port was given."""
+    if args.port is None:
+        from tools.bringup.ports import usb_ports
+
+        there = ", ".join(usb_ports()) or "none is plugged in"
+        raise ConfigError(f"say which port with --port PATH (USB ports here: {there}), or --port {VIRTUAL} to practise")
+    return bool(args.port == VIRTUAL)
+
+
+def assembled(args: argparse.Namespace, report: Report) -> Robot:
+    """The robot as its file says or, where there is hardware and it was calibrated, as it was measured."""
+    robot = load_robot(args.robot)
+    if not is_virtual(args):
+        from hw.calibration import calibrated
+
+        robot, text = calibrated(robot)
+        report.line(text)
+    return robot
+
+
+@contextmanager
+def open_line(
+    args: argparse.Namespace, robot: Robot, *, delivery: Delivery | None = None, seed: int = 0
+) -> Iterator[Line]:
+    """Open the port that the person named. `delivery` is of a virtual rig. Raises BackendError with the remedy."""
+    from hw.clock import WallClock
+    from hw.dynamixel.bus import Bus
+    from hw.dynamixel.port import SerialPort
+
+    with ExitStack() as stack:
+        clock: Clock = WallClock()
+        path, control = str(args.port), None
+        if is_virtual(args):
+            from sim.rig.control import LockedClock, RigProcess
+
+            rig = stack.enter_context(RigProcess(robot, delivery=delivery, seed=seed))
+            path, control, clock = rig.port, rig.control, LockedClock(rig.control)
+        elif Path(path + ".control").is_socket():  # where `servoid virtual --link` puts it
+            from sim.rig.control import Control
+
+            control = Control(path + ".control")
+            stack.callback(control.close)
+        port = SerialPort(path, robot.bus.baud)
+        stack.callback(port.close)
+        yield Line(Bus(port, clock), clock, control)

@@ -1,0 +1,15 @@
+"""Questions to the person at the robot. They go to standard error, so that `--json` keeps standard output."""
+
+from __future__ import annotations
+
+import sys
+
+from hw.config import ConfigError
+
+
+def confirm(text: str, option: str) -> None:
+    """Wait for Enter. Raises ConfigError naming `option`, which answers in advance, when nobody is there."""
+    print(f"{text}. Enter to go on, Ctrl-C to leave: ", end="", file=sys.stderr, flush=True)
+    if not sys.stdin.readline():
+        print(file=sys.stderr)
+        raise ConfigError(f"nobody is there to press Enter: give {option} to go on without being asked")

@@ -1,0 +1,166 @@
+"""Ask who is on the bus, at every baud.
+
+Lists each servo and board with ID, baud, model, firmware, voltage, temperature and errors, and what does not fit the
+robot's file. Switches the servos' power on where a board keeps it off; moves nothing. Exit code 3: something is
+to be mended.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from hw.config import ConfigError
+from hw.hal import BackendError
+from hw.robot import Robot, load_robot
+from tools import exit_codes
+from tools.bringup.line import add_line_arguments, open_line
+from tools.output import Report, reporting
+
+if TYPE_CHECKING:
+    from hw.dynamixel.discovery import Census, Device
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_line_arguments(parser)
+    parser.add_argument(
+        "--baud", type=int, action="append", default=[], metavar="N", help="ask at this baud only; may be given again"
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        from hw.dynamixel.discovery import BAUDS, census, power_on
+
+        robot = load_robot(args.robot)
+        for baud in args.baud:
+            check_baud(baud)
+        bauds = args.baud or _first(robot.bus.baud, BAUDS)
+        with open_line(args, robot) as line:
+            power = power_on(line.bus, robot.bus.board_id, _first(robot.bus.baud, bauds))
+            report.line(power or f"no board with ID {robot.bus.board_id}: servos with a supply of their own may answer")
+            found = census(line.bus, bauds, report.line)
+        if not found.devices and not found.problems:
+            raise BackendError(
+                f"{args.port}: nobody answers at {', '.join(map(str, bauds))} bit/s: is the supply on, is the adapter "
+                "on the servos' connector, and do both have the same ground?"
+            )
+        if found.skipped:
+            report.line(f"this adapter cannot be set to {', '.join(map(str, found.skipped))} bit/s: nobody asked there")
+        problems = found.problems + [text for device in found.devices for text in misfits(device, robot)]
+        _show(found, robot, problems, report)
+        missing = absent(found, robot)
+        if missing:
+            report.line(f"not on the bus at {robot.bus.baud} bit/s: {', '.join(missing)}")
+        report.result(
+            {
+                "port": args.port,
+                "bauds": list(bauds),
+                "devices": [described(device, robot) for device in found.devices],
+                "missing": missing,
+                "problems": problems,
+            }
+        )
+    return exit_codes.HARDWARE if problems else exit_codes.DONE
+
+
+def check_baud(baud: int) -> None:
+    """Raise ConfigError for a baud that no servo has."""
+    from hw.dynamixel.discovery import BAUDS
+
+    if baud not in BAUDS:
+        raise ConfigError(f"--baud {baud}: Dynamixel servos have {', '.join(map(str, BAUDS))} bit/s")
+
+
+def joint_of(device: Device, robot: Robot) -> str | None:
+    """The joint that a servo is of, by its ID; None at another baud than the robot's, where it is nobody's yet."""
+    if device.is_board or device.baud != robot.bus.baud:
+        return None
+    return next((joint.name for joint in robot.joints if joint.id == device.id), None)
+
+
+def absent(found: Census, robot: Robot) -> list[str]:
+    """Joints whose servo does not answer."""
+    there = {joint_of(device, robot) for device in found.devices}
+    return [f"{joint.name} (ID {joint.id})" for joint in robot.joints if joint.name not in there]
+
+
+def misfits(device: Device, robot: Robot) -> list[str]:
+    """What a person should mend about a device, with the remedy."""
+    from hw.faults import describe, remedy
+
+    if device.is_board:
+        return []
+    texts = []
+    if device.table is None:
+        texts.append(f"{device}: this model is not known here: is it a Dynamixel of Protocol 2.0?")
+    error = device.get("hardware_error_status") or 0
+    if error:
+        texts.append(f"{device}: reports {', '.join(describe(error))}: {remedy(error)}")
+    name = joint_of(device, robot)
+    if name is None:
+        if device.baud == robot.bus.baud:
+            texts.append(f"{device}: no joint of {robot.name} has this ID: servoid bringup setup JOINT gives it one")
+        else:
+            texts.append(f"{device}: {robot.name} is at {robot.bus.baud} bit/s: servoid bringup setup JOINT adopts it")
+        return texts
+    servo = robot.servos[robot.names.index(name)]
+    if device.model != servo.model_number:
+        texts.append(f"{name} (ID {device.id}) is {device.name}, but the robot's file says {servo.name}: change either")
+    volts, (low, high) = device.measured("present_input_voltage"), servo.voltage_range
+    if volts is not None and not low <= volts <= high:
+        texts.append(f"{name} (ID {device.id}) has {volts:.1f} V, outside {low:g} to {high:g} V: check the supply")
+    return texts
+
+
+def described(device: Device, robot: Robot) -> dict[str, Any]:
+    """A device as JSON values."""
+    from hw.faults import describe
+
+    torque = device.get("torque_enable")
+    return {
+        "id": device.id,
+        "baud": device.baud,
+        "model": device.name,
+        "model_number": device.model,
+        "firmware": device.firmware,
+        "voltage": device.measured("present_input_voltage"),
+        "temperature": device.measured("present_temperature"),
+        "torque": None if torque is None else bool(torque),
+        "errors": describe(device.get("hardware_error_status") or 0),
+        "joint": joint_of(device, robot),
+    }
+
+
+def _show(found: Census, robot: Robot, problems: list[str], report: Report) -> None:
+    rows = []
+    for device in found.devices:
+        values = described(device, robot)
+        rows.append(
+            (
+                device.id,
+                device.baud,
+                device.name,
+                device.firmware,
+                _number(values["voltage"], "V", 1),
+                _number(values["temperature"], "C", 0),
+                {True: "on", False: "off", None: "-"}[values["torque"]],
+                ", ".join(values["errors"]) or "-",
+                values["joint"] or ("the board" if device.is_board else "-"),
+            )
+        )
+    report.line()
+    report.table(("ID", "baud", "model", "firmware", "supply", "heat", "torque", "errors", "joint"), rows)
+    report.line()
+    report.line(f"{len(found.servos)} servos, {len(found.boards)} board" + ("s" if len(found.boards) != 1 else ""))
+    for text in problems:
+        report.line(f"! {text}")
+
+
+def _number(value: float | None, unit: str, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f} {unit}"
+
+
+def _first(baud: int, others: tuple[int, ...] | list[int]) -> list[int]:
+    """The robot's own baud before the others."""
+    return [baud, *(other for other in others if other != baud)]
