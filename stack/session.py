@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from hw.calibration import calibrated
 from hw.config import ConfigError
 from hw.hal import Backend, Policy, Scene, Task, Trace
 from hw.robot import Robot, load_robot
@@ -107,9 +108,10 @@ def run(
             "nothing moves by itself on a real robot: give start=True (--start), or confirm at the prompt"
         )
     scene = start_task(task, settings.seed)
+    assembled, assembly = (robot, None) if simulated or backend is not None else calibrated(robot)
     body = backend or make_backend(
         settings.backend,
-        robot,
+        assembled,
         seed=settings.seed,
         randomise=settings.randomise,
         port=settings.port,
@@ -130,11 +132,14 @@ def run(
         pilot.reset(settings.seed)
         sensors, motors = body.connect()
         if not (simulated or settings.start) and confirm is not None:
-            confirm(f"{robot.name} will go to its home pose and then: {task.name}")
+            known = f"{assembly}. " if assembly is not None else ""
+            confirm(f"{known}{robot.name} will go to its home pose and then: {task.name}")
 
         # From here on a Ctrl-C is a request, until the motors are off.
         interrupt = stack.enter_context(Interrupt())
         guard = Guard(robot, motors, gain)
+        if assembly is not None:
+            guard.note("system", assembly)
         estimator = Estimator(robot, load_odometry(robot))
         look = None if scene is None or not simulated else body.look  # type: ignore[attr-defined]
         director = Director(robot, guard, estimator, task, pilot, push, look)
