@@ -39,9 +39,7 @@ def main(args: argparse.Namespace) -> int:
         before = usb_ports()
         _show(before, report)
         if args.port is not None and args.port not in before:
-            raise BackendError(
-                f"{args.port}: no USB serial port of that name: plug it in, or leave --port out"
-            )
+            raise BackendError(f"{args.port}: no USB serial port of that name: plug it in, or leave --port out")
         wait = args.wait or (PATIENCE if sys.stdin.isatty() and not args.json else 0.0)
         changed = None
         if wait and args.port is None:

@@ -7,9 +7,9 @@ import sys
 from hw.config import ConfigError
 
 
-def confirm(text: str, option: str) -> None:
-    """Wait for Enter. Raises ConfigError naming `option`, which answers in advance, when nobody is there."""
+def confirm(text: str, remedy: str = "give --yes to go on without being asked") -> None:
+    """Wait for Enter. Raises ConfigError with `remedy` when nobody is there."""
     print(f"{text}. Enter to go on, Ctrl-C to leave: ", end="", file=sys.stderr, flush=True)
     if not sys.stdin.readline():
         print(file=sys.stderr)
-        raise ConfigError(f"nobody is there to press Enter: give {option} to go on without being asked")
+        raise ConfigError(f"nobody is there to press Enter: {remedy}")

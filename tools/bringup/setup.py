@@ -54,7 +54,7 @@ def main(args: argparse.Namespace) -> int:
             if changes:
                 report.line(f"will be written: {', '.join(changes)}")
                 if not args.yes:
-                    confirm("It is kept without power", "--yes")
+                    confirm("It is kept without power")
                 from hw.dynamixel.discovery import assign
 
                 after = assign(line.bus, device, id, baud)

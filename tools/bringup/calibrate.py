@@ -1,0 +1,241 @@
+"""Measure how each servo sits in its joint: zero and direction.
+
+Torque is off: you put the robot into its reference pose by hand, then turn one joint after the other. The result is
+kept in your configuration folder and used by everything that drives the robot. Nothing is written to a servo.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hw.config import ConfigError, nearest
+from hw.hal import Array, BackendError
+from hw.robot import Robot, load_robot
+from tools import exit_codes
+from tools.bringup.line import Line, add_line_arguments, is_virtual, open_line
+from tools.bringup.prompt import confirm
+from tools.output import Report, reporting
+
+if TYPE_CHECKING:
+    from hw.calibration import Calibration
+    from hw.dynamixel.survey import Found
+    from tools.bringup.encoders import Encoders
+    from tools.bringup.hands import Hands
+
+MOVED = 0.15  # rad that a joint has to be turned by
+BEYOND = 0.1  # rad beyond its range at which a joint cannot be
+FAR = 0.5  # rad between a zero and the file's that a person should look at
+PATIENCE = 120.0  # s for each thing that a person does
+_OTHER_SECONDS = 4.0  # for which another joint may be off before it is taken for a mistake
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_line_arguments(parser)
+    parser.add_argument(
+        "--pose", choices=("zero", "home"), default="zero", help="reference pose: all joints at 0 (default), or home"
+    )
+    parser.add_argument(
+        "--joint", action="append", default=[], metavar="JOINT", help="this joint only; may be given again"
+    )
+    parser.add_argument("--keep-directions", action="store_true", help="measure zeros only")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write there instead of into the configuration folder")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of a virtual rig's assembly (default: 0)")
+    parser.add_argument("--yes", action="store_true", help="write without asking")
+
+
+def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        from hw.calibration import apply, calibration_path, save_calibration
+
+        robot = load_robot(args.robot)
+        virtual = is_virtual(args)
+        path = args.out or (None if virtual else calibration_path(robot))
+        chosen = _chosen(args.joint, robot)
+        earlier = _earlier(path, robot, chosen)
+        reference = _reference(args.pose, robot)
+        delivery = None
+        if virtual:
+            from sim.rig.delivery import Delivery
+
+            delivery = Delivery(assembly="random")
+        with open_line(args, robot, delivery=delivery, seed=args.seed) as line:
+            zeros, directions = _measure(line, robot, reference, chosen, args, report)
+        result = _calibration(robot, zeros, directions, chosen, earlier, args.pose)
+        _show(robot, result, report)
+        apply(robot, result, "what was measured")  # refuses what no servo could be driven with
+        if path is None:
+            report.line("not kept: a virtual rig of its own is gone now; --out FILE keeps it")
+        else:
+            if not args.yes:
+                kept_text = ", and the earlier one kept beside it" if path.exists() else ""
+                confirm(f"{path} will be written{kept_text}: whatever drives {robot.name} will use it")
+            kept = save_calibration(result, path)
+            report.line(f"written to {path}" + (f"; the earlier one is {kept}" if kept else ""))
+            report.line("next: servoid bringup check --fix, which sets the servos' own limits to match")
+        report.result({"path": path, **asdict(result)})
+    return exit_codes.DONE
+
+
+def _measure(
+    line: Line, robot: Robot, reference: Array, chosen: list[int], args: argparse.Namespace, report: Report
+) -> tuple[Array, Array]:
+    """Zeros [rad] and directions `(n_joints,)`."""
+    import numpy as np
+
+    from hw.dynamixel.discovery import BAUDS, power_on
+    from hw.dynamixel.survey import find_servos
+    from tools.bringup.encoders import Encoders, short
+    from tools.bringup.hands import Person, VirtualHands
+
+    power_on(line.bus, robot.bus.board_id, [robot.bus.baud, *BAUDS])
+    if line.bus.port.baud != robot.bus.baud:
+        line.bus.set_baud(robot.bus.baud)
+    line.bus.return_delay = 254 * 2e-6  # until the servos' own is known
+    found = find_servos(line.bus, robot)
+    refuse(found)
+    encoders = Encoders(line.bus, line.clock, robot, found)
+    hands: Hands = Person(report) if line.control is None else VirtualHands(line.control, robot, report)
+    angles = dict(zip(robot.names, reference.tolist(), strict=True))
+    where = "every joint at 0, as in the robot's drawing" if args.pose == "zero" else "its home pose, standing"
+    hands.pose(angles, f"{robot.name} is limp. Put it into its reference pose, {where}, and hold it still")
+    at_reference = encoders.still(PATIENCE)
+    directions = np.array([joint.direction for joint in robot.joints])
+    if not args.keep_directions:
+        for i, sign in directions_of(encoders, hands, robot, reference, chosen).items():
+            directions[i] = sign
+    return short(reference - directions * at_reference), directions
+
+
+def refuse(found: list[Found]) -> None:
+    """Raise BackendError for servos that cannot be measured: with torque, or with registers that bend angles."""
+    if stiff := [servo.joint.name for servo in found if servo.get("torque_enable")]:
+        raise BackendError(
+            f"{', '.join(stiff)} has torque on: end the program that drives the robot, or hold it and switch its power "
+            "off and on"
+        )
+    for register in ("homing_offset", "drive_mode"):
+        if bent := [servo.joint.name for servo in found if servo.get(register)]:
+            raise BackendError(
+                f"{', '.join(bent)} has a {register} that is not 0, which would bend what is measured: "
+                "servoid bringup check --fix first"
+            )
+
+
+def directions_of(
+    encoders: Encoders, hands: Hands, robot: Robot, reference: Array, chosen: list[int]
+) -> dict[int, int]:
+    """Direction of each chosen joint, by number, from turns by hand, each away from the nearer end of its range."""
+    import numpy as np
+
+    from tools.bringup.turning import describe_turns
+
+    signs = np.where(robot.upper - reference >= reference - robot.lower, 1, -1)
+    texts = describe_turns(robot, reference, signs)
+    found = {}
+    for count, i in enumerate(chosen, start=1):
+        start = encoders.still(PATIENCE)
+        text = f"[{count}/{len(chosen)}] turn {robot.names[i]} by some 20 degrees, so that {texts[i]}; hold it there"
+        hands.turn(robot.names[i], int(signs[i]), text)
+        angle = turned(encoders, start, i, robot)
+        check_range(robot, i, float(reference[i]) + int(signs[i]) * abs(angle))
+        hands.back(robot.names[i])
+        found[i] = int(signs[i]) * (1 if angle > 0.0 else -1)
+    return found
+
+
+def turned(encoders: Encoders, start: Array, i: int, robot: Robot) -> float:
+    """Wait until joint `i` was turned from `start`; by how much [rad] its servo turned.
+
+    Raises BackendError when another joint was, which is how swapped IDs show.
+    """
+    import numpy as np
+
+    from tools.bringup.encoders import PERIOD_NS, short
+
+    ticks, others = round(PATIENCE * 1e9 / PERIOD_NS), 0
+    for _ in range(ticks):
+        moved = short(encoders.read() - start)
+        if abs(moved[i]) >= MOVED:
+            return float(short(encoders.still(PATIENCE) - start)[i])
+        other = int(np.abs(moved).argmax())
+        others = others + 1 if abs(moved[other]) >= MOVED and abs(moved[i]) < MOVED / 4 else 0
+        if others * PERIOD_NS >= _OTHER_SECONDS * 1e9:
+            a, b = robot.joints[i], robot.joints[other]
+            raise BackendError(
+                f"{b.name} (ID {b.id}) turned, not {a.name} (ID {a.id}): begin again; if it was {a.name} that you "
+                "turned, the two servos have each other's ID: servoid bringup setup"
+            )
+    raise BackendError(f"{robot.names[i]} was not turned within {PATIENCE:g} s: begin again")
+
+
+def check_range(robot: Robot, i: int, position: float) -> None:
+    """Raise BackendError when joint `i` was turned to where it cannot be."""
+    joint = robot.joints[i]
+    low, high = joint.range
+    if not low - BEYOND <= position <= high + BEYOND:
+        raise BackendError(
+            f"{joint.name} would be at {position:.2f} rad now, beyond its range {low:g} to {high:g}: it was turned the "
+            "wrong way, or did not begin in the reference pose; begin again"
+        )
+
+
+def _reference(pose: str, robot: Robot) -> Array:
+    import numpy as np
+
+    if pose == "home":
+        return robot.home
+    if outside := [joint.name for joint in robot.joints if not joint.range[0] <= 0.0 <= joint.range[1]]:
+        raise ConfigError(f"{', '.join(outside)} cannot be at 0: give --pose home")
+    return np.zeros(len(robot.joints))
+
+
+def _chosen(names: list[str], robot: Robot) -> list[int]:
+    for name in names:
+        if name not in robot.names:
+            raise ConfigError(f"{robot.name} has no joint '{name}'; {nearest(name, robot.names)}")
+    return [i for i, name in enumerate(robot.names) if not names or name in names]
+
+
+def _earlier(path: Path | None, robot: Robot, chosen: list[int]) -> Calibration | None:
+    """The calibration that joints which are not measured now are taken from; read before anybody moves anything."""
+    if len(chosen) == len(robot.joints) or path is None or not path.exists():
+        return None
+    from hw.calibration import load_calibration
+
+    return load_calibration(path)
+
+
+def _calibration(
+    robot: Robot, zeros: Array, directions: Array, chosen: list[int], earlier: Calibration | None, pose: str
+) -> Calibration:
+    from hw.calibration import Calibration, JointCalibration
+
+    joints = {}
+    known: Mapping[str, Any] = {} if earlier is None else earlier.joints
+    for i, (joint, servo) in enumerate(zip(robot.joints, robot.servos, strict=True)):
+        direction, zero = joint.direction, joint.zero
+        if i in chosen:
+            direction, zero = int(directions[i]), round(float(zeros[i]), 5)
+        elif joint.name in known:
+            joints[joint.name] = known[joint.name]
+            continue
+        joints[joint.name] = JointCalibration(joint.id, servo.name, direction, zero)
+    return Calibration(robot.name, datetime.now().astimezone().isoformat(timespec="seconds"), pose, joints)
+
+
+def _show(robot: Robot, result: Calibration, report: Report) -> None:
+    rows = []
+    for joint in robot.joints:
+        measured = result.joints[joint.name]
+        remarks = ["the other way round"] if measured.direction != joint.direction else []
+        remarks += (
+            ["far from the file's: was this the reference pose?"] if abs(measured.zero - joint.zero) > FAR else []
+        )
+        rows.append((joint.name, joint.id, f"{measured.direction:+d}", f"{measured.zero:+.4f}", "; ".join(remarks)))
+    report.line()
+    report.table(("joint", "ID", "direction", "zero [rad]", ""), rows)
