@@ -15,6 +15,8 @@ from hw.hal import Array, ReferenceFrames
 from hw.legs import LegInverse, Legs
 from hw.robot import Robot
 
+_ACROSS = 5.0  # rad/s of turning that weigh as much as 1 m/s sideways
+
 
 @dataclass(frozen=True)
 class GaitSettings:
@@ -33,6 +35,7 @@ class GaitSettings:
     backward_gain: float  # and steps backward
     backward_shift: float  # m that the feet trail for each m/s backward, so that the heels come free
     max_velocity: tuple[float, float, float]  # forward, sideways, turning
+    max_stride: float  # m/s forward that steps are made for: soft legs cannot follow longer ones
     acceleration: tuple[float, float, float]  # a second
     ankle_pitch_gain: float
     ankle_roll_gain: float
@@ -63,12 +66,12 @@ class Gait:
         self.target = np.zeros((*shape, 3))
         self.activity = np.zeros(shape)
 
-    def reset(self, where: Array | slice = slice(None), phase: Array | float = 0.0) -> None:
-        """Stand still, in the worlds `where` (default: all), at `phase` 0..1 of the cycle."""
+    def reset(self, where: Array | slice = slice(None)) -> None:
+        """Stand still, in the worlds `where` (default: all)."""
         if self.phase.ndim:
-            self.phase[where], self.velocity[where], self.target[where], self.activity[where] = phase, 0.0, 0.0, 0.0
+            self.phase[where], self.velocity[where], self.target[where], self.activity[where] = 0.0, 0.0, 0.0, 0.0
         else:
-            self.phase, self.activity = np.asarray(phase, float), np.zeros(())
+            self.phase, self.activity = np.zeros(()), np.zeros(())
             self.velocity, self.target = np.zeros(3), np.zeros(3)
 
     def command(self, velocity: Array) -> None:
@@ -81,7 +84,11 @@ class Gait:
         self.velocity = self.velocity + np.clip(self.target - self.velocity, -self._slew, self._slew)
         # Steps fade in over half a cycle and out over a whole one.
         rate = np.where(moving, 2.0, -1.0) * self._phase_step
-        self.phase = np.where(self.activity > 0, (self.phase + self._phase_step) % 1.0, self.phase)
+        # The first step says where it goes: the left foot takes it, but for a walk to the right. Were it drawn, who
+        # learns from this could not know what comes, and the mean of a step of either foot is none.
+        rightward = _ACROSS * self.target[..., 1] + self.target[..., 2] < 0
+        begun = np.where(rightward, 0.5, 0.0)
+        self.phase = np.where(self.activity > 0, (self.phase + self._phase_step) % 1.0, begun)
         self.activity = np.clip(self.activity + rate, 0.0, 1.0)
 
     def frames(self, ahead: Array) -> ReferenceFrames:
@@ -115,7 +122,11 @@ class Gait:
         lift = np.where(swinging, np.sin(np.pi * u) ** 2, 0.0) * activity[..., None]
 
         period = (1.0 - swing_share) * s.cycle  # that a foot stands
-        vx, vy, wz = velocity[..., None, 0], s.sideways_gain * velocity[..., None, 1], velocity[..., None, 2]
+        vx, vy, wz = (
+            np.minimum(velocity[..., None, 0], s.max_stride),
+            s.sideways_gain * velocity[..., None, 1],
+            velocity[..., None, 2],
+        )
         backward = np.minimum(vx, 0.0)
         vx = vx + (s.backward_gain - 1.0) * backward
         yaw = wz * period * travel

@@ -55,7 +55,7 @@ def write_dataset(folder: Path, robot: Robot, episodes: int = 12, ticks: int = 1
             "observation.state": rows(raws),
             "action": rows(actions),
             "action_applied": rows(applied),
-            "command": rows((np.zeros((episodes * ticks, 3)),)),
+            "command": rows(tuple(np.tile([turn, 0.0, 0.0], (ticks, 1)) for turn in rng.uniform(-0.1, 0.3, episodes))),
             "episode_index": np.repeat(np.arange(episodes), ticks),
             "frame_index": frame,
             "timestamp": (frame * robot.dt).astype(np.float32),

@@ -61,8 +61,7 @@ def save(
     )
     tensors: dict[str, Array] = {f"denoiser.{k}": v.detach().float().cpu().numpy() for k, v in weights.items()}
     for name, normaliser in (("states", states), ("actions", actions)):
-        tensors[f"{name}.mean"] = torch.as_tensor(normaliser.mean).numpy()
-        tensors[f"{name}.std"] = torch.as_tensor(normaliser.std).numpy()
+        tensors |= {f"{name}.{key}": value for key, value in normaliser.to_numpy().items()}
     checkpoint.write(path, tensors, head)
 
 
@@ -71,13 +70,14 @@ def load(path: Path, robot: Robot) -> Model:
     head, tensors = checkpoint.read(path)
     denoiser = Denoiser(check_fit(path, head, robot))
     try:
-        weights = {k.removeprefix("denoiser."): torch.from_numpy(v) for k, v in tensors.items() if "denoiser." in k}
-        denoiser.load_state_dict(weights)
-        states, actions = (
-            Normaliser(torch.from_numpy(tensors[f"{k}.mean"]), torch.from_numpy(tensors[f"{k}.std"]))
-            for k in ("states", "actions")
-        )
-    except (KeyError, RuntimeError) as error:
+        denoiser.load_state_dict({k: torch.from_numpy(v) for k, v in _part(tensors, "denoiser").items()})
+        states, actions = (Normaliser.from_numpy(_part(tensors, name)).to_torch() for name in ("states", "actions"))
+    except (KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{path}: its tensors do not fit its own header: {error}") from error
     denoiser.eval().requires_grad_(False)
     return Model(denoiser, states, actions, head)
+
+
+def _part(tensors: Mapping[str, Array], name: str) -> dict[str, Array]:
+    """The tensors `name.*`, without the prefix."""
+    return {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}

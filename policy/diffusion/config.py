@@ -32,11 +32,15 @@ class DenoiserConfig:
     horizon: int = 16
     levels: int = 20
     mask: str = "state_full_action_causal"
+    text: str = ""  # name of the encoder of its instructions; empty: it takes none
+    text_size: int = 0  # of an encoded instruction
 
     def __post_init__(self) -> None:
         for name in ("state_size", "action_size", "layers", "width", "heads", "history", "horizon", "levels"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"denoiser: {name} must be at least 1, not {getattr(self, name)}")
+        if self.text_size < 0 or bool(self.text) != bool(self.text_size):
+            raise ConfigError(f"denoiser: an encoder '{self.text}' and a text_size of {self.text_size} do not agree")
         if self.width % self.heads:
             raise ConfigError(f"denoiser: width {self.width} is not a multiple of heads {self.heads}")
 

@@ -20,9 +20,11 @@ from hw.config import ConfigError
 from hw.hal import Array
 from hw.robot import Robot
 from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.features import Mirror, Normaliser, raw_layout, to_tokens
+from policy.diffusion.features import Emphasis, Mirror, Normaliser, raw_layout, to_tokens
+from policy.text.captions import MOTIONS, mirrored, motion_of
+from policy.text.encoder import load_encoder
 
-COLUMNS = ("observation.state", "action", "action_applied", "episode_index", "frame_index")
+COLUMNS = ("observation.state", "action", "action_applied", "command", "episode_index", "frame_index")
 
 
 class DatasetError(ConfigError):
@@ -36,6 +38,7 @@ class Recording:
     raw: Array  # (rows, raw size) float32
     action: Array  # (rows, n_joints) rad, what the expert decided
     applied: Array  # (rows, n_joints) rad, what really ran
+    command: Array  # (rows, 3) m/s forward, m/s left, rad/s that were asked
     episode: Array  # (rows,) int
     info: dict[str, Any]  # meta/info.json
 
@@ -61,7 +64,7 @@ def read_recording(folder: Path, robot: Robot) -> Recording:
     n = len(robot.joints)
     if info.get("fps", robot.rate) != robot.rate:
         raise DatasetError(f"{folder}: recorded at {info['fps']} ticks a second, and {robot.name} runs at {robot.rate}")
-    sizes = {"observation.state": raw_layout(n).size, "action": n, "action_applied": n}
+    sizes = {"observation.state": raw_layout(n).size, "action": n, "action_applied": n, "command": 3}
     parts: dict[str, list[Array]] = {name: [] for name in COLUMNS}
     for file in files:
         try:
@@ -93,15 +96,55 @@ def read_recording(folder: Path, robot: Robot) -> Recording:
         episode, frame = columns["episode_index"][where], columns["frame_index"][where]
         raise DatasetError(f"{folder}: episode {episode} does not go on by one after frame {frame}")
     return Recording(
-        columns["observation.state"], columns["action"], columns["action_applied"], columns["episode_index"], info
+        raw=columns["observation.state"],
+        action=columns["action"],
+        applied=columns["action_applied"],
+        command=columns["command"],
+        episode=columns["episode_index"],
+        info=info,
     )
+
+
+class Captions:
+    """Encoded phrasings of each tick's command: what the windows are told."""
+
+    def __init__(self, command: Array, encoder: str) -> None:
+        """`command` is `(rows, 3)`."""
+        self._motion = torch.from_numpy(motion_of(command))
+        self._mirrored = torch.from_numpy(mirrored(np.arange(len(MOTIONS))))
+        self._count = torch.tensor([len(motion.phrasings) for motion in MOTIONS])
+        reader, longest = load_encoder(encoder), int(self._count.max())
+        self.size = reader.size
+        self._text = torch.zeros(len(MOTIONS), longest, reader.size)
+        for i, motion in enumerate(MOTIONS):
+            self._text[i, : len(motion.phrasings)] = torch.from_numpy(reader.encode(motion.phrasings))
+
+    def of(self, rows: Tensor, mirrored: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Encoded captions `(batch, size)` of `rows` `(batch,)`: a phrasing drawn, or the first without `generator`."""
+        motion = self._motion[rows]
+        motion = torch.where(mirrored, self._mirrored[motion], motion)
+        if generator is None:
+            return self._text[motion, 0]
+        share = torch.rand(len(rows), generator=generator)
+        return self._text[motion, (share * self._count[motion]).long()]
 
 
 class Windows:
     """Windows over a recording, drawn as normalised batches."""
 
-    def __init__(self, recording: Recording, robot: Robot, config: DenoiserConfig, held_out: float = 0.02) -> None:
-        """A share `held_out` of the episodes, evenly spread and at least one, is kept for validation."""
+    def __init__(
+        self,
+        recording: Recording,
+        robot: Robot,
+        config: DenoiserConfig,
+        held_out: float = 0.02,
+        emphasis: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        """A share `held_out` of the episodes, evenly spread and at least one, is kept for validation.
+
+        `emphasis` of global states, drawn from `seed`: see `features.Emphasis`; 0 for none.
+        """
         self.config = config
         self.n_joints = len(robot.joints)
         self._mirror = Mirror.of(robot.mirror)
@@ -115,27 +158,36 @@ class Windows:
             )
         every = max(2, round(1 / held_out))
         kept = np.arange(len(long)) % every == 0
-        self.validation = self._presents(long[kept], first, last)
-        self.training = self._presents(long[~kept], first, last)
+        # A window shows what one command does: one that changes on the way leads anywhere.
+        change = np.r_[True, np.any(np.diff(recording.command, axis=0) != 0.0, axis=1)]
+        segment = np.cumsum(change)
+        self.validation = self._presents(long[kept], first, last, segment)
+        self.training = self._presents(long[~kept], first, last, segment)
+        if not len(self.training) or not len(self.validation):
+            raise DatasetError(f"no command lasts for the {last} ticks that a window looks ahead; use longer ones")
         self._raw = torch.from_numpy(recording.raw)
         self._action = torch.from_numpy(recording.action)
         self._applied = torch.from_numpy(recording.applied)
-        self.states, self.actions = self._fit()
+        self.captions = Captions(recording.command, config.text) if config.text else None
+        states, actions = self._fit()
+        if emphasis:
+            states = Emphasis.of(states, self.n_joints, emphasis, seed)
+        self.states, self.actions = states.to_torch(), actions.to_torch()
 
     @staticmethod
-    def _presents(spans: Array, before: int, after: int) -> Tensor:
-        """Rows that can be the present of a window."""
-        return torch.from_numpy(np.concatenate([np.arange(a + before, b - after) for a, b in spans]))
+    def _presents(spans: Array, before: int, after: int, segment: Array) -> Tensor:
+        """Rows that can be the present of a window. `segment` `(rows,)` numbers the commands."""
+        rows = np.concatenate([np.arange(a + before, b - after) for a, b in spans])
+        return torch.from_numpy(rows[segment[rows] == segment[rows + after - 1]])
 
     def _fit(self, samples: int = 20_000) -> tuple[Normaliser, Normaliser]:
-        """Normalisation over a fixed draw of windows and their mirror images, as torch tensors."""
+        """Normalisation over a fixed draw of windows and their mirror images."""
         generator = torch.Generator().manual_seed(0)
         count = min(samples, len(self.training))
         pick = self.training[torch.randint(len(self.training), (count,), generator=generator)]
         drawn = [self._gather(pick, torch.full((len(pick),), mirrored)) for mirrored in (False, True)]
-        fitted = [Normaliser.fit(torch.cat([part[i] for part in drawn]).flatten(0, 1).numpy()) for i in (0, 1)]
-        a, b = (Normaliser(torch.from_numpy(f.mean), torch.from_numpy(f.std)) for f in fitted)
-        return a, b
+        states, actions = (torch.cat([part[i] for part in drawn]).flatten(0, 1).numpy() for i in (0, 1))
+        return Normaliser.fit(states), Normaliser.fit(actions)
 
     def _gather(self, present: Tensor, mirrored: Tensor) -> tuple[Tensor, Tensor]:
         """Tokens and actions of windows in physical units; `mirrored` `(batch,)` bool."""
@@ -150,20 +202,24 @@ class Windows:
         actions = torch.where(flip, self._mirror.actions(actions), actions)
         return to_tokens(raw, raw[:, past], self.n_joints), actions
 
-    def draw(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def draw(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor | None]:
         """A normalised training batch, each window mirrored with probability one half.
 
-        Shapes `(batch, state tokens, token size)` and `(batch, action tokens, n_joints)`.
+        Shapes `(batch, state tokens, state size)`, `(batch, action tokens, n_joints)`, `(batch, text size)`; without
+        an encoder the last is None.
         """
         present = self.training[torch.randint(len(self.training), (batch,), generator=generator)]
         mirrored = torch.rand(batch, generator=generator) < 0.5
-        return self._encode(self._gather(present, mirrored))
+        text = self.captions.of(present, mirrored, generator) if self.captions else None
+        return *self._encode(self._gather(present, mirrored)), text
 
-    def held_out(self, count: int) -> tuple[Tensor, Tensor]:
+    def held_out(self, count: int) -> tuple[Tensor, Tensor, Tensor | None]:
         """Up to `count` normalised validation windows, the same every time."""
         pick = torch.linspace(0, len(self.validation) - 1, min(count, len(self.validation))).long()
         present = self.validation[pick]
-        return self._encode(self._gather(present, torch.arange(len(present)) % 2 == 1))
+        mirrored = torch.arange(len(present)) % 2 == 1
+        text = self.captions.of(present, mirrored) if self.captions else None
+        return *self._encode(self._gather(present, mirrored)), text
 
     def _encode(self, window: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         states, actions = window

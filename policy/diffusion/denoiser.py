@@ -64,6 +64,9 @@ class Denoiser(nn.Module):
         self.level = nn.Embedding(config.levels + 1, width)
         self.position = nn.Parameter(0.02 * torch.randn(config.history + config.horizon, width))
         self.kind = nn.Parameter(0.02 * torch.randn(2, width))
+        if config.text_size:
+            self.embed_text = nn.Sequential(nn.Linear(config.text_size, width), nn.GELU(), nn.Linear(width, width))
+            self.no_text = nn.Parameter(torch.zeros(width))
         self.blocks = nn.ModuleList(Block(width, config.heads) for _ in range(config.layers))
         self.norm = nn.LayerNorm(width)
         self.head_state = nn.Linear(width, config.state_size)
@@ -73,21 +76,39 @@ class Denoiser(nn.Module):
         self.register_buffer("mask", torch.from_numpy(mask), persistent=False)
 
     def forward(
-        self, states: Tensor, actions: Tensor, state_levels: Tensor, action_levels: Tensor
+        self,
+        states: Tensor,
+        actions: Tensor,
+        state_levels: Tensor,
+        action_levels: Tensor,
+        text: Tensor | None = None,
+        told: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Clean states and actions predicted from noisy ones.
 
         Shapes `(batch, state tokens, state_size)`, `(batch, action tokens, action_size)`; levels are integers
-        `(batch, tokens)`, or `(tokens,)` when the batch shares them.
+        `(batch, tokens)`, or `(tokens,)` when the batch shares them. `text` `(batch, text_size)` is the encoded
+        instruction, None for a window without one; `told` `(batch,)` bool says which windows of a batch have one.
         """
         n = states.shape[1]
         at_state = self.embed_state(states) + self.level(state_levels) + self.position + self.kind[0]
         at_action = self.embed_action(actions) + self.level(action_levels) + self.position[:-1] + self.kind[1]
         x = torch.cat([at_state, at_action], 1)
+        if self.config.text_size:
+            x = x + self._instruction(text, told)
         for block in self.blocks:
             x = block(x, self.mask)
         x = self.norm(x)
         return self.head_state(x[:, :n]), self.head_action(x[:, n:])
+
+    def _instruction(self, text: Tensor | None, told: Tensor | None) -> Tensor:
+        """What is added to every token: `(batch, 1, width)` or, without an instruction, `(width,)`."""
+        if text is None:
+            return self.no_text
+        embedded = self.embed_text(text)
+        if told is not None:
+            embedded = torch.where(told[:, None], embedded, self.no_text)
+        return embedded[:, None]
 
     @property
     def parameter_count(self) -> int:

@@ -9,9 +9,9 @@ Every function takes numpy arrays or torch tensors and returns what it was given
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 import numpy as np
 
@@ -208,11 +208,60 @@ class Normaliser:
         std = np.maximum(values.std(0, dtype=np.float64), cls.FLOOR)
         return cls(values.mean(0, dtype=np.float64).astype(np.float32), std.astype(np.float32))
 
+    def to_torch(self) -> Self:
+        """The same with torch tensors."""
+        import torch
+
+        return replace(self, **{field.name: torch.as_tensor(getattr(self, field.name)) for field in fields(self)})
+
+    def to_numpy(self) -> dict[str, Array]:
+        """Its arrays by name, as a checkpoint stores them."""
+        return {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+
+    @staticmethod
+    def from_numpy(arrays: Mapping[str, Array]) -> Normaliser:
+        """Inverse of `to_numpy`. Raises KeyError or TypeError where arrays are missing or unknown."""
+        return Emphasis(**arrays) if "project" in arrays else Normaliser(**arrays)
+
     def encode(self, x: AnyArray) -> AnyArray:
         return (x - self.mean) / self.std
 
     def decode(self, x: AnyArray) -> AnyArray:
         return x * self.std + self.mean
+
+
+GLOBAL_FIELDS = ("displacement", "heading", "height", "velocity", "angular_velocity", "gravity")
+
+
+@dataclass(frozen=True)
+class Emphasis(Normaliser):
+    """Normalised states `s` projected to `[A B | I] s`, so that the few global features weigh as much as the joints.
+
+    A is drawn from a normal distribution, B scales global features (Diffuse-CLoC, section 3.1, after
+    Karunratanakul et al., arXiv:2305.12577). Rows are divided by their norm, so that all inputs stay of order one.
+    `recover` is the least-squares inverse.
+    """
+
+    project: AnyArray  # (features, 2 features)
+    recover: AnyArray  # (2 features, features)
+
+    @classmethod
+    def of(cls, states: Normaliser, n_joints: int, strength: float, seed: int) -> Emphasis:
+        """Over `states`, numpy; `strength` is B of the global features. The matrix is kept in the checkpoint."""
+        layout = token_layout(n_joints)
+        weights = np.ones(layout.size)
+        for name in GLOBAL_FIELDS:
+            weights[layout.slice(name)] = strength
+        mixed = np.random.default_rng(seed).standard_normal((layout.size, layout.size)) * weights
+        mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
+        project = np.concatenate([mixed, np.eye(layout.size)]).T
+        return cls(states.mean, states.std, project.astype(np.float32), np.linalg.pinv(project).astype(np.float32))
+
+    def encode(self, x: AnyArray) -> AnyArray:
+        return super().encode(x) @ self.project
+
+    def decode(self, x: AnyArray) -> AnyArray:
+        return super().decode(x @ self.recover)
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,11 @@ from hw.robot import Robot
 from policy.checkpoint import resolve
 from policy.diffusion.checkpoint import Model, load
 from policy.diffusion.features import Trajectory, raw_layout, to_raw, to_tokens
-from policy.diffusion.sampler import Guidance, Known, Sampler
+from policy.diffusion.sampler import Guidance, Known, Sampler, classifier_free
 from policy.diffusion.schedule import cosine_signal, full_sequence
 from policy.diffusion.settings import DiffusionSettings
+from policy.text.captions import MOTIONS, motion_of
+from policy.text.encoder import load_encoder
 
 # (trajectory, instruction) -> cost (batch,), as tasks define it
 Cost = Callable[[Trajectory, Instruction], Any]
@@ -41,7 +43,9 @@ class Runtime:
         self.cost = cost if settings.guidance.weight > 0 else None
         n_states, n_actions = len(config.state_ticks), len(config.action_ticks)
         self.matrix = full_sequence(config.levels, settings.steps, n_states, n_actions, settings.lead)
-        self._sampler = Sampler(model.denoiser, cosine_signal(config.levels))
+        self._signal = cosine_signal(config.levels)
+        self._encoder = load_encoder(config.text) if config.text and settings.text_weight else None
+        self._read: dict[str, Tensor] = {}  # instructions that were encoded
         self._state_mask = torch.from_numpy(config.state_ticks <= 0)
 
     def plan(self, request: PlanRequest, seed: int) -> Plan:
@@ -78,7 +82,10 @@ class Runtime:
             rows = to_tokens(np.asarray(states, dtype=float), np.asarray(states[:, -1], dtype=float), self._joints)
             generators = [_generator(*pair) for pair in seeds]
             known = self._known(torch.from_numpy(rows.astype(np.float32)), actions)
-            clean_states, clean_actions = self._sampler.sample(
+            predict = classifier_free(
+                self.model.denoiser, self._text(instruction, len(states)), self.settings.text_weight
+            )
+            clean_states, clean_actions = Sampler(predict, self._signal).sample(
                 self.matrix, known, generators, self._guidance(instruction)
             )
             history = self.model.config.history
@@ -120,6 +127,19 @@ class Runtime:
         filled[:, : given.shape[1]] = self.model.actions.encode(given)
         mask = torch.arange(len(config.action_ticks)) < given.shape[1]
         return Known(states, filled, self._state_mask, mask)
+
+    def _text(self, instruction: Instruction, batch: int) -> Tensor | None:
+        """The encoded sentence `(batch, text size)`; where the task gives none, one that names the asked motion."""
+        if self._encoder is None:
+            return None
+        if instruction.text is not None:
+            sentences = [instruction.text] * batch
+        else:
+            twists = np.broadcast_to(instruction.velocity, (batch, 3))
+            sentences = [MOTIONS[i].phrasings[0] for i in motion_of(twists)]
+        for sentence in set(sentences) - self._read.keys():
+            self._read[sentence] = torch.from_numpy(self._encoder.encode([sentence])[0])
+        return torch.stack([self._read[sentence] for sentence in sentences])
 
     def _guidance(self, instruction: Instruction) -> Guidance | None:
         if (cost := self.cost) is None:

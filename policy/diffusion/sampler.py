@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -51,6 +52,27 @@ class Known:
     actions: Tensor  # (batch, action tokens, features)
     state_mask: Tensor  # (state tokens,) bool
     action_mask: Tensor  # (action tokens,) bool
+
+
+def classifier_free(denoise: Callable[..., tuple[Tensor, Tensor]], text: Tensor | None, weight: float) -> Predictor:
+    """A predictor told `text` `(batch, size)`: `x0 = x0() + weight * (x0(text) - x0())` (Ho and Salimans, 2207.12598).
+
+    `weight` 0 leaves the instruction unread and 1 needs no second window, so both cost one call.
+    """
+    if text is None or weight == 0.0:
+        return denoise
+    if weight == 1.0:
+        return partial(denoise, text=text)
+    told = torch.arange(2 * len(text)) < len(text)
+    twice = torch.cat([text, text])
+
+    def predict(states: Tensor, actions: Tensor, *levels: Tensor) -> tuple[Tensor, Tensor]:
+        pairs = denoise(torch.cat([states, states]), torch.cat([actions, actions]), *levels, text=twice, told=told)
+        with_text, without = zip(*(x.chunk(2) for x in pairs), strict=True)
+        state, action = (b + weight * (a - b) for a, b in zip(with_text, without, strict=True))
+        return state, action
+
+    return predict
 
 
 def draw_noise(generators: Sequence[torch.Generator], tokens: int, features: int) -> Tensor:

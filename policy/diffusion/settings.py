@@ -32,6 +32,7 @@ class DiffusionSettings:
     lead: int = 1  # extra calls by which the states are finished before the actions
     replan: int = 12  # ticks between requests
     delay: int = 2  # ticks from a request to the adoption of its plan
+    text_weight: float = 1.0  # classifier-free guidance by the instruction; 0: unread, 1: as trained
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
 
     def __post_init__(self) -> None:

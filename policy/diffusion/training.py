@@ -8,14 +8,17 @@ from torch import Tensor, nn
 from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.denoiser import Denoiser
 
+UNTOLD = 0.1  # share of windows without an instruction
+
 
 def draw_levels(
     config: DenoiserConfig, batch: int, committed: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Noise levels `(batch, state tokens)` and `(batch, action tokens)`; the past is clean.
+    """Noise levels `(batch, state tokens)` and `(batch, action tokens)`.
 
     Half of the windows have independent levels, clean included; the others share one, as they do when a plan is
-    sampled. There the first 0 to `committed` actions to come are clean: they run while a plan is being made.
+    sampled. There the first 0 to `committed` actions to come are clean: they run while a plan is being made. The past
+    is clean but in half of the windows with independent levels, which learn to mend one (UniPhys, section 3.2).
     """
     half = batch // 2
     n_states, n_actions, k = len(config.state_ticks), len(config.action_ticks), config.levels
@@ -25,8 +28,9 @@ def draw_levels(
     state_ticks, action_ticks = torch.from_numpy(config.state_ticks), torch.from_numpy(config.action_ticks)
     clean = torch.zeros(batch, 1, dtype=torch.long)
     clean[:half] = torch.randint(committed + 1, (half, 1), generator=generator)
-    states = torch.where(state_ticks <= 0, 0, states)
-    actions = torch.where(action_ticks < clean, 0, actions)
+    known = torch.arange(batch)[:, None] < half + (batch - half) // 2
+    states = torch.where((state_ticks <= 0) & known, 0, states)
+    actions = torch.where((action_ticks < clean) & known, 0, actions)
     return states, actions
 
 
@@ -50,14 +54,24 @@ def action_weight(config: DenoiserConfig, near: int = 8, far_weight: float = 0.2
 
 
 def losses(
-    denoiser: Denoiser, states: Tensor, actions: Tensor, signal: Tensor, committed: int, generator: torch.Generator
+    denoiser: Denoiser,
+    states: Tensor,
+    actions: Tensor,
+    text: Tensor | None,
+    signal: Tensor,
+    committed: int,
+    generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """State and action losses of a batch of clean windows: squared error of the predicted clean tokens (x0)."""
+    """State and action losses of a batch of clean windows: squared error of the predicted clean tokens (x0).
+
+    One window in ten is shown without its instruction `text` `(batch, text_size)`, for classifier-free guidance.
+    """
     config = denoiser.config
     state_levels, action_levels = draw_levels(config, len(states), committed, generator)
     noisy_states = add_noise(states, state_levels, signal, generator)
     noisy_actions = add_noise(actions, action_levels, signal, generator)
-    clean_states, clean_actions = denoiser(noisy_states, noisy_actions, state_levels, action_levels)
+    told = torch.rand(len(states), generator=generator) >= UNTOLD
+    clean_states, clean_actions = denoiser(noisy_states, noisy_actions, state_levels, action_levels, text, told)
     return (
         token_error(clean_states, states, (state_levels > 0).float()),
         token_error(clean_actions, actions, (action_levels > 0) * action_weight(config)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hw.hal import Array, ReferenceFrames, State
+from hw.mirror import Mirror
 from hw.robot import Robot
 
 AHEAD = np.array([0, 3, 8])  # ticks ahead that the tracker sees of its reference
@@ -22,6 +23,13 @@ class TrackerObservation:
         self._before = np.zeros((*shape, n))
         self._fresh = np.ones(shape, bool)
         self.size = 3 + 3 + 2 + 1 + feet + 4 * n + _HISTORY * (n + 3) + len(AHEAD) * (n + 4 + feet)
+        joints, swapped, look = Mirror.joints(robot), Mirror.feet(robot), len(AHEAD)
+        self.mirror = Mirror.join(
+            Mirror.VECTOR, Mirror.ROTATION, Mirror.PLANAR, Mirror.SCALAR, swapped, *[joints] * 4,
+            *[joints, Mirror.ROTATION] * _HISTORY,
+            *[joints] * look, *[Mirror.PLANAR] * look, *[Mirror.FLIPPED] * look, *[Mirror.SCALAR] * look,
+            *[swapped] * look,
+        )  # fmt: skip
 
     def reset(self, where: Array | None = None) -> None:
         """Forget the history in the worlds `where` (default: all)."""

@@ -117,6 +117,28 @@ def test_it_stands_when_nothing_is_asked_and_again_after_a_walk() -> None:
     assert not gait.velocity.any()
 
 
+def test_the_foot_on_the_side_it_goes_to_takes_the_first_step() -> None:
+    for velocity, foot in (([0.2, 0, 0], 0), ([0, 0.1, 0], 0), ([0, -0.1, 0], 1), ([0.1, 0, -0.5], 1)):
+        for before in (0, 37):  # however long it walked and stood before
+            gait = Gait(ROBOT, SETTINGS)
+            walked(gait, np.array([0.2, 0.0, 0.0]), before)
+            walked(gait, np.zeros(3), 100)
+            gait.command(np.array(velocity))
+            while (contact := gait.frames(NOW).contact[0]).all():
+                gait.advance()
+            assert contact.tolist() == [float(foot != 0), float(foot != 1)]
+
+
+def test_steps_stay_as_long_as_legs_can_follow_however_fast_it_is_asked() -> None:
+    frames = []
+    for speed in (SETTINGS.max_stride, 0.6):
+        gait = Gait(ROBOT, replace(SETTINGS, arm_swing=0.0))
+        walked(gait, np.array([speed, 0.0, 0.0]), 120)
+        frames.append(gait.frames(NOW))
+        assert frames[-1].velocity[0, 0] == pytest.approx(speed)
+    np.testing.assert_allclose(frames[0].position, frames[1].position, atol=1e-12)
+
+
 def test_velocity_is_slewed_and_clipped() -> None:
     gait, last = Gait(ROBOT, SETTINGS), np.zeros(3)
     gait.command(np.array([9.0, -9.0, 9.0]))
@@ -157,11 +179,9 @@ def test_frames_ahead_are_what_comes() -> None:
 def test_many_worlds_walk_as_one_robot_does_and_reset_alone() -> None:
     commands = np.array([[0.2, 0.0, 0.0], [0.0, 0.1, 0.5], [0.0, 0.0, 0.0]])
     many = Gait(ROBOT, SETTINGS, (3,))
-    many.reset(np.array([1]), 0.3)
     walked(many, commands, 37)
-    for i, phase in enumerate((0.0, 0.3, 0.0)):
+    for i in range(3):
         one = Gait(ROBOT, SETTINGS)
-        one.reset(phase=phase)
         walked(one, commands[i], 37)
         np.testing.assert_allclose(many.frames(NOW).position[i], one.frames(NOW).position, atol=1e-12)
     many.reset(np.array([0]))
@@ -220,4 +240,4 @@ def test_it_walks_five_seconds_on_the_nominal_robot() -> None:
     assert x[0] - x[1] > 0.5
     assert y[2] - y[3] > 0.2
     assert turned[4] > 1.0
-    assert turned[5] < -1.5
+    assert turned[5] < -1.0

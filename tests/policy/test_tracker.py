@@ -10,6 +10,7 @@ import pytest
 
 from hw.config import ConfigError
 from hw.hal import State
+from hw.mirror import Mirror
 from hw.robot import load_robot
 from policy.gait import Gait, load_gait
 from policy.tracker import rewards
@@ -71,6 +72,33 @@ def test_its_size_is_the_one_it_says_and_float32() -> None:
     assert seen.shape == (3, observe.size)
     assert seen.dtype == np.float32
     assert np.isfinite(seen).all()
+
+
+def test_a_mirrored_robot_is_observed_as_the_mirror_image() -> None:
+    """What training shows the tracker beside each sample must be what it would have seen."""
+    rng = np.random.default_rng(0)
+    joints, feet = Mirror.joints(ROBOT), Mirror.feet(ROBOT)
+    here, there = TrackerObservation(ROBOT), TrackerObservation(ROBOT)
+    left, right = gait(), gait()
+    left.command(np.array([0.2, 0.1, 0.5]))
+    right.command(np.array([0.2, -0.1, -0.5]))
+    for _ in range(40):
+        position, speed = ROBOT.home + rng.normal(0, 0.1, 20), rng.normal(0, 1, 20)
+        gravity, rate, velocity = rng.normal(0, 0.1, 3) - [0, 0, 1], rng.normal(0, 1, 3), rng.normal(0, 0.2, 3)
+        contact, applied = rng.random(2), ROBOT.home + rng.normal(0, 0.1, 20)
+        seen = here(
+            state(position, joint_velocity=speed, gravity=gravity, angular_velocity=rate, velocity=velocity,
+                  contact=contact),
+            applied, left.frames(AHEAD),
+        )  # fmt: skip
+        image = there(
+            state(joints(position), joint_velocity=joints(speed), gravity=Mirror.VECTOR(gravity),
+                  angular_velocity=Mirror.ROTATION(rate), velocity=Mirror.VECTOR(velocity), contact=feet(contact)),
+            joints(applied), right.frames(AHEAD),
+        )  # fmt: skip
+        np.testing.assert_allclose(here.mirror(seen), image, atol=1e-5)
+        left.advance()
+        right.advance()
 
 
 def test_history_is_that_of_the_world_and_of_the_ticks_before() -> None:

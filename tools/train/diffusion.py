@@ -63,6 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--history", type=int, default=4, help="past and present states (ticks)")
     parser.add_argument("--horizon", type=int, default=16, help="ticks to come")
     parser.add_argument("--levels", type=int, default=20, help="noise levels")
+    parser.add_argument("--text", default="words", help="encoder of instructions; empty: a model that takes none")
+    parser.add_argument("--emphasis", type=float, default=5.0, help="of global states; 0: no projection")
     parser.add_argument("--mask", default="state_full_action_causal", help="attention mask")
     parser.add_argument("--committed", type=int, default=d.committed, help="longest delay, in ticks, to be trained for")
     parser.add_argument("--precision", choices=("bf16", "fp32"), default=d.precision)
@@ -84,17 +86,23 @@ def main(args: argparse.Namespace) -> int:
     from policy.diffusion.config import DenoiserConfig
     from policy.diffusion.dataset import Windows, read_recording
     from policy.diffusion.features import token_layout
+    from policy.text.encoder import load_encoder
 
     survival = _survival(args) if args.survival_worlds else None
     torch.set_num_threads(args.threads)
     robot = load_robot(args.robot)
-    names = ("layers", "width", "heads", "history", "horizon", "levels", "mask")
+    shape = ("layers", "width", "heads", "history", "horizon", "levels", "mask", "text")
     n = len(robot.joints)
-    config = DenoiserConfig(token_layout(n).size, n, **{name: getattr(args, name) for name in names})
+    config = DenoiserConfig(
+        token_layout(n).size * (2 if args.emphasis else 1),
+        n,
+        text_size=load_encoder(args.text).size if args.text else 0,
+        **{name: getattr(args, name) for name in shape},
+    )
     names = ("minutes", "batch", "learning_rate", "committed", "evaluate_every", "seed", "precision")
     settings = Settings(**{name: getattr(args, name) for name in names})
     recording = read_recording(args.data, robot)
-    windows = Windows(recording, robot, config)
+    windows = Windows(recording, robot, config, emphasis=args.emphasis, seed=args.seed)
     source = f"{args.data.resolve().name}: {len(recording.spans)} episodes, {len(recording.raw)} ticks"
     trainer = Trainer(windows, robot, config, settings, args.out, source, args.licence, survival)
     if not (args.resume and trainer.resume()) and args.init is not None:
@@ -239,9 +247,9 @@ class Trainer:
         rate = settings.learning_rate * warm * (0.5 + 0.5 * math.cos(math.pi * progress))
         for group in self.optimiser.param_groups:
             group["lr"] = rate
-        states, actions = self.windows.draw(settings.batch, self.generator)
+        states, actions, text = self.windows.draw(settings.batch, self.generator)
         with torch.autocast("cpu", torch.bfloat16, enabled=settings.precision == "bf16"):
-            parts = losses(self.network, states, actions, self.signal, settings.committed, self.generator)
+            parts = losses(self.network, states, actions, text, self.signal, settings.committed, self.generator)
         total = parts[0] + parts[1]
         if not torch.isfinite(total):
             raise ConfigError(f"the loss is not finite at step {self.step}: try a lower --learning-rate, or fp32")
@@ -287,10 +295,10 @@ class Trainer:
 
         network = Denoiser(self.config).eval()
         network.load_state_dict(self.average.weights)
-        states, actions = self.windows.held_out(count)
+        states, actions, text = self.windows.held_out(count)
         with torch.inference_mode():
             generator = torch.Generator().manual_seed(0)
-            return losses(network, states, actions, self.signal, self.settings.committed, generator)[1].item()
+            return losses(network, states, actions, text, self.signal, self.settings.committed, generator)[1].item()
 
     # -- files -----------------------------------------------------------------------------------------------------
 

@@ -102,6 +102,7 @@ class Trainer:
         env, s = self.env, self.env.settings
         progress = min(self.samples / self.budget, 1.0)
         env.push_scale = min(1.0, 0.25 + 0.75 * progress / 0.2)
+        self.ppo.actor.distribution.log_std_param.fill_(np.log(np.interp(progress, [0.0, 1.0], s.noise)))
         self.ppo.learning_rate = s.learning_rate * (1.0 - 0.85 * progress)
         for group in self.ppo.optimizer.param_groups:
             group["lr"] = self.ppo.learning_rate
@@ -181,15 +182,30 @@ def _observations(env: Any) -> Any:
     )
 
 
+def _with_mirrored(env: Any, obs: Any, actions: Any) -> tuple[Any, Any]:
+    """Samples followed by their mirror images: a robot that walks has no better side."""
+    import torch
+    from tensordict import TensorDict
+
+    def both(x: Any, mirror: Any) -> Any:
+        return torch.cat([x, x[:, torch.as_tensor(mirror.index)] * torch.as_tensor(mirror.sign)])
+
+    if obs is not None:
+        pair = {"actor": both(obs["actor"], env.mirror_actor), "critic": both(obs["critic"], env.mirror_critic)}
+        obs = TensorDict(pair, batch_size=[2 * len(obs)])
+    return obs, None if actions is None else both(actions, env.mirror_action)
+
+
 def _ppo(env: Any) -> Any:
     from rsl_rl.algorithms import PPO
 
-    class Shape:
+    class Shape:  # what rsl-rl reads of an environment, and `_with_mirrored` after it
         num_envs, num_actions = env.n, len(env.robot.joints)
+        mirror_actor, mirror_critic, mirror_action = env.mirror_actor, env.mirror_critic, env.mirror_action
 
     s = env.settings
     network = {"class_name": "MLPModel", "activation": "elu", "obs_normalization": True}
-    noise = {"class_name": "GaussianDistribution", "init_std": s.initial_std, "std_type": "log"}
+    noise = {"class_name": "GaussianDistribution", "init_std": s.noise[0], "std_type": "log", "learn_std": False}
     config = {
         "num_steps_per_env": s.horizon,
         "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
@@ -201,9 +217,10 @@ def _ppo(env: Any) -> Any:
             "num_learning_epochs": s.epochs,
             "num_mini_batches": s.mini_batches,
             "gamma": s.discount,
-            "entropy_coef": s.entropy,
+            "entropy_coef": 0.0,  # the noise follows a schedule
             "learning_rate": s.learning_rate,
             "schedule": "fixed",
+            "symmetry_cfg": {"data_augmentation_func": _with_mirrored, "use_data_augmentation": True},
             "use_clipped_value_loss": False,  # its clip is absolute: with returns of tens the critic never gets there
         },
     }

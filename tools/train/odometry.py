@@ -81,9 +81,7 @@ def mixed(a: dict[str, Array], b: dict[str, Array], seed: int) -> dict[str, Arra
     return {key: np.concatenate([a[key], b[key]])[order] for key in a}
 
 
-def record(
-    robot: Any, tracker: Any, worlds: int, seconds: float, seed: int, odometry: Any = None
-) -> dict[str, Array]:
+def record(robot: Any, tracker: Any, worlds: int, seconds: float, seed: int, odometry: Any = None) -> dict[str, Array]:
     """Walk randomised worlds; returns rows `(n, ticks, features)`, starts `(n, ticks)` and errors `(n, ticks, 3)`."""
     from tqdm import trange
 

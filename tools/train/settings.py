@@ -13,8 +13,7 @@ class ExpertSettings:
     """Ranges are (low, high); shares are of 1. The file says the rest."""
 
     hidden: tuple[int, ...]
-    initial_std: float
-    entropy: float
+    noise: tuple[float, float]
     learning_rate: float
     discount: float
     horizon: int

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hw.hal import Array
+from hw.mirror import Mirror
 from hw.robot import Robot
 from policy.gait import Gait, load_gait
 from policy.mlp import Mlp
@@ -25,6 +26,12 @@ class Tracking:
         self.fleet = Fleet(robot, n, odometry, randomise=settings.randomised, seed=seed)
         self.gait = Gait(robot, load_gait(), (n,))
         self.observation = TrackerObservation(robot, (n,))
+        joints, feet = Mirror.joints(robot), Mirror.feet(robot)
+        self.mirror_action, self.mirror_actor = joints, self.observation.mirror
+        self.mirror_critic = Mirror.join(
+            self.mirror_actor, Mirror.VECTOR, feet, Mirror.vectors(feet),
+            *[Mirror.PLANAR, Mirror.FLIPPED] * 2, *[Mirror.SCALAR] * 4, joints,
+        )  # fmt: skip
         self.ticks = np.zeros(n, int)
         self.limit = round(settings.episode_seconds / robot.dt)
         self.push_scale = 1.0
@@ -40,8 +47,7 @@ class Tracking:
     def _reset(self, where: Array) -> None:
         fleet = self.fleet
         fleet.reset(where)
-        for i in np.flatnonzero(where):
-            self.gait.reset(np.array([i]), fleet.rngs[i].random())
+        self.gait.reset(where)
         self.observation.reset(where)
         self.ticks[where] = self._next_command[where] = 0
         self._next_push[where] = 25
@@ -154,8 +160,8 @@ def _draw(rng: np.random.Generator, s: ExpertSettings) -> Array:
     if kind < s.stand + s.forward:
         return command * [1.0, 0.0, 0.0]
     if kind < s.stand + s.forward + s.single:
-        axis = rng.integers(3)
-        return np.where(np.arange(3) == axis, np.minimum(command, [0.0, np.inf, np.inf]), 0.0)
+        command[0] = rng.uniform(s.vx[0], 0.0)
+        return np.where(np.arange(3) == rng.integers(3), command, 0.0)
     if command[0] > _MIXED_SPEED:  # no fast walking while turning or side-stepping
         command[0] -= _MIXED_SPEED
     return command

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from hw.hal import Array, ReferenceFrames
 from hw.robot import Robot
 from policy.checkpoint import resolve
@@ -24,9 +22,8 @@ class Walker:
         self._observation = TrackerObservation(fleet.robot, (fleet.n,))
 
     def reset(self, where: Array) -> None:
-        """New episodes in the worlds `where`: stand, at a random phase of the gait."""
-        for i in np.flatnonzero(where):
-            self.gait.reset(np.array([i]), self.fleet.rngs[i].random())
+        """New episodes in the worlds `where`: stand."""
+        self.gait.reset(where)
         self._observation.reset(where)
 
     def act(self, command: Array) -> Array:

@@ -13,7 +13,9 @@ import torch
 from hw.robot import load_robot
 from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.dataset import DatasetError, Windows, read_recording
-from policy.diffusion.features import Mirror, token_layout
+from policy.diffusion.features import Emphasis, Mirror, Normaliser, token_layout
+from policy.text.captions import MOTIONS, motion_of
+from policy.text.encoder import load_encoder
 
 ROBOT = load_robot()
 CONFIG = DenoiserConfig(54, 20, width=16)
@@ -62,7 +64,8 @@ def test_no_window_spans_two_episodes_and_held_out_episodes_are_not_trained_on(s
 
 def test_batches_are_normalised_and_half_of_them_mirrored(synthetic_dataset: Path) -> None:
     windows = Windows(read_recording(synthetic_dataset, ROBOT), ROBOT, CONFIG)
-    states, actions = windows.draw(2000, torch.Generator().manual_seed(0))
+    states, actions, text = windows.draw(2000, torch.Generator().manual_seed(0))
+    assert text is None  # this model takes no instruction
     assert states.shape == (2000, 20, 54)
     assert actions.shape == (2000, 19, 20)
     assert states.mean((0, 1)).abs().max() < 0.2
@@ -85,6 +88,52 @@ def test_mirrored_windows_are_those_of_mirrored_rows(synthetic_dataset: Path) ->
     plain = Windows(image, ROBOT, CONFIG)._gather(pick, torch.zeros(50, dtype=torch.bool))
     for a, b in zip(flipped, plain, strict=True):
         torch.testing.assert_close(a, b)
+
+
+def test_windows_in_which_the_command_changes_on_the_way_are_left_out(synthetic_dataset: Path) -> None:
+    recording = read_recording(synthetic_dataset, ROBOT)
+    command = recording.command.copy()
+    command[60:120, 1] = 0.05  # half-way through the first episode
+    windows = Windows(replace(recording, command=command), ROBOT, CONFIG)
+    presents = torch.cat([windows.training, windows.validation])
+    first = presents[presents < 120].tolist()
+    # The present may be the first tick of a new command, and the last that a whole window of the old one follows.
+    assert first == [*range(3, 45), *range(60, 104)]
+
+
+def test_windows_are_told_what_was_asked_and_mirrored_ones_the_opposite(synthetic_dataset: Path) -> None:
+    recording = read_recording(synthetic_dataset, ROBOT)
+    left = replace(recording, command=np.tile(np.float32([0.0, 0.0, 0.8]), (len(recording.command), 1)))
+    reader = load_encoder("words")
+    config = replace(CONFIG, text="words", text_size=reader.size)
+    windows = Windows(left, ROBOT, config)
+    _, _, text = windows.draw(400, torch.Generator().manual_seed(0))
+    known = {
+        name: reader.encode(MOTIONS[motion_of(np.array([0.0, 0.0, turn]))].phrasings)
+        for name, turn in (("left", 0.8), ("right", -0.8))
+    }
+    counts = {name: sum((row == rows).all(1).any() for row in text.numpy()) for name, rows in known.items()}
+    assert sum(counts.values()) == 400
+    assert 150 < counts["right"] < 250
+    assert len(np.unique(text.numpy(), axis=0)) > 8  # in many words
+
+
+def test_global_states_are_emphasised_and_recovered(synthetic_dataset: Path) -> None:
+    windows = Windows(read_recording(synthetic_dataset, ROBOT), ROBOT, CONFIG)
+    emphasis = Emphasis.of(Normaliser(windows.states.mean.numpy(), windows.states.std.numpy()), 20, 5.0, seed=0)
+    rows = np.random.default_rng(0).normal(size=(500, 54)).astype(np.float32) * emphasis.std + emphasis.mean
+    projected = emphasis.encode(rows)
+    assert projected.shape == (500, 108)
+    np.testing.assert_allclose(emphasis.decode(projected), rows, atol=1e-4)
+    assert 0.8 < projected.std(0).mean() < 1.2
+    assert (
+        Emphasis.of(Normaliser(emphasis.mean, emphasis.std), 20, 5.0, seed=0).project.tolist()
+        == emphasis.project.tolist()
+    )
+    # A deviation of one of a global feature moves the inputs more than that of a joint does.
+    height, knee = token_layout(20).slice("height").start, token_layout(20).slice("position").start
+    power = np.linalg.norm(emphasis.project, axis=1)
+    assert power[height] > 1.5 * power[knee]
 
 
 def test_a_missing_column_is_named(copy: Path) -> None:

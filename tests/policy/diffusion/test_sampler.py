@@ -7,7 +7,7 @@ from torch import Tensor
 from hw.config import ConfigError
 from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.denoiser import Denoiser
-from policy.diffusion.sampler import Guidance, Known, Sampler
+from policy.diffusion.sampler import Guidance, Known, Sampler, classifier_free
 from policy.diffusion.schedule import cosine_signal, full_sequence
 from policy.diffusion.training import losses
 
@@ -142,7 +142,7 @@ def planner() -> tuple[Denoiser, Sampler]:
         z = torch.randn(64, 1, 1, generator=generator)
         states = z.repeat(1, 5, 1)
         states[:, 0] = 0.0  # the present says nothing
-        loss = sum(losses(denoiser, states, z.repeat(1, 4, 1), signal, 0, generator))
+        loss = sum(losses(denoiser, states, z.repeat(1, 4, 1), None, signal, 0, generator))
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -167,3 +167,29 @@ def test_guiding_states_moves_the_actions(planner: tuple[Denoiser, Sampler], gra
     assert guided_states[:, 1:].mean() > 1.2
     # The last call sees states that are guided already; with a lead it sees the finished ones, and follows them closer.
     assert guided_actions[:, 0].mean() > (1.3 if lead else 0.8)
+
+
+def test_classifier_free_guidance_goes_beyond_what_an_instruction_makes_of_a_window() -> None:
+    torch.manual_seed(0)
+    config = DenoiserConfig(3, 2, width=16, heads=2, history=1, horizon=4, text="words", text_size=5)
+    denoiser, text = Denoiser(config).eval(), torch.randn(6, 5)
+    window = torch.randn(6, 5, 3), torch.randn(6, 4, 2), torch.full((5,), 7), torch.full((4,), 7)
+    with torch.no_grad():
+        bare, told = denoiser(*window), denoiser(*window, text=text)
+        for weight in (0.0, 1.0, 2.5):
+            guided = classifier_free(denoiser, text, weight)(*window)
+            for x, without, with_text in zip(guided, bare, told, strict=True):
+                torch.testing.assert_close(x, without + weight * (with_text - without), atol=1e-5, rtol=1e-4)
+    assert (bare[0] - told[0]).abs().max() > 1e-4
+
+
+def test_windows_of_a_batch_without_an_instruction_do_not_see_one() -> None:
+    torch.manual_seed(0)
+    config = DenoiserConfig(3, 2, width=16, heads=2, history=1, horizon=4, text="words", text_size=5)
+    denoiser = Denoiser(config).eval()
+    window = torch.randn(2, 5, 3), torch.randn(2, 4, 2), torch.full((5,), 7), torch.full((4,), 7)
+    with torch.no_grad():
+        mixed = denoiser(*window, text=torch.randn(2, 5), told=torch.tensor([True, False]))
+        bare = denoiser(*window)
+    torch.testing.assert_close(mixed[0][1], bare[0][1])
+    assert (mixed[0][0] - bare[0][0]).abs().max() > 1e-4
