@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import yaml
@@ -76,7 +77,11 @@ class Foot:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the guard enforces. Speeds rad/s, angles rad, temperature degrees C, `stale` in ticks."""
+    """What the guard enforces. Speeds rad/s, angles rad, temperatures degrees C, voltages V, `stale` in ticks.
+
+    From `derate_temperature` and `derate_voltage` on gains go down, until at `temperature` and `voltage` the robot is
+    lowered. None: no such limit, only the servos' own.
+    """
 
     joint_speed: float
     margin: float
@@ -84,14 +89,19 @@ class Limits:
     tilt: float
     stale: int
     temperature: float
+    derate_temperature: float | None = None
+    voltage: float | None = None
+    derate_voltage: float | None = None
 
 
 @dataclass(frozen=True)
 class Imu:
-    """Errors of the IMU: standard deviation of a sample's noise, half-width of the bias at power-on.
+    """The IMU: where it is and how it is mounted, and its errors: standard deviation of a sample's noise, half-width of
+    the bias at power-on.
 
     `average` [s] is the span that its low-pass filter averages over: samples at the loop's rate alone would alias.
-    `signs` are those of a real board's axes against the base's.
+    `signs` are those of the sensor's axes against the mounted ones, `mounting` [rad] the roll, pitch and yaw that then
+    turn these into the base's (hw/imu/mounting.py). The board's (`opencr`) is on the servo bus; another has a `port`.
     """
 
     gyro_noise: float
@@ -101,12 +111,23 @@ class Imu:
     average: float
     latency: float
     signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    kind: Literal["opencr", "witmotion", "bno08x"] = "opencr"
+    port: str | None = None
+    baud: int = 115200  # of that port
+    yaw_sign: float = 1.0  # of a bno08x: -1 if its yaw counts clockwise
+
+
+Button = Literal["mode", "start", "user"]
 
 
 @dataclass(frozen=True)
 class Bus:
+    """The servo bus. Any of the board's `stop_buttons` is an emergency stop."""
+
     baud: int
     board_id: int
+    stop_buttons: tuple[Button, ...] = ("mode", "start", "user")
 
 
 @dataclass(frozen=True)

@@ -52,8 +52,46 @@ def _check_numbers(robot: Robot, marks: Marks) -> None:
         _require_positive(getattr(robot.limits, key), f"limits.{key}", marks)
     _require_not_negative(robot.limits.margin, "limits.margin", marks)
     _require_radians(robot.limits.tilt, "limits.tilt", marks)
+    _check_derating(robot, marks)
+    _check_imu(robot, marks)
+
+
+def _check_derating(robot: Robot, marks: Marks) -> None:
+    """Gains go down before the limit is reached, from the right side."""
+    limits = robot.limits
+    if limits.derate_temperature is not None and not 0 < limits.derate_temperature < limits.temperature:
+        raise marks.error(
+            "limits.derate_temperature",
+            f"{limits.derate_temperature:g} is not between 0 and limits.temperature ({limits.temperature:g})",
+        )
+    if limits.voltage is not None:
+        _require_positive(limits.voltage, "limits.voltage", marks)
+    if limits.derate_voltage is not None and limits.derate_voltage <= (limits.voltage or 0.0):
+        raise marks.error(
+            "limits.derate_voltage", f"{limits.derate_voltage:g} V is not above limits.voltage: gains go down first"
+        )
+
+
+def _check_imu(robot: Robot, marks: Marks) -> None:
+    imu = robot.imu
     for key in ("gyro_noise", "gyro_bias", "accelerometer_noise", "accelerometer_bias", "latency"):
-        _require_not_negative(getattr(robot.imu, key), f"imu.{key}", marks)
+        _require_not_negative(getattr(imu, key), f"imu.{key}", marks)
+    _require_positive(imu.baud, "imu.baud", marks)
+    for i, sign in enumerate((*imu.signs, imu.yaw_sign)):
+        if sign not in (1.0, -1.0):
+            raise marks.error(f"imu.signs[{i}]" if i < 3 else "imu.yaw_sign", f"must be 1 or -1, not {sign:g}")
+    for i, angle in enumerate(imu.mounting):
+        _require_radians(angle, f"imu.mounting[{i}]", marks)
+    if imu.kind == "opencr":
+        if imu.port is not None:
+            raise marks.error(
+                "imu.port", "the board's IMU is on the servo bus: drop the port, or name another imu.kind"
+            )
+        return
+    if not imu.port:
+        raise marks.error("imu.kind", f"a {imu.kind} has a serial port of its own: name it as imu.port")
+    if math.prod(imu.signs) < 0:
+        raise marks.error("imu.signs", f"a {imu.kind} has right-handed axes: negate two of them or none")
 
 
 def _check_identity(robot: Robot, marks: Marks) -> None:

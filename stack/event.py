@@ -9,8 +9,9 @@ from dataclasses import dataclass
 class Event:
     """One event. `kind` is a short word that programs may test; `text` says what happened and what to do.
 
-    Kinds: `phase` (the guard changed its state), `rejected` (a non-finite target), `fall`, `stale`, `temperature`,
-    `servo` (a hardware error), `homing`, `policy`, `plan`, `record`, `interrupt`, `task`, `system`.
+    Kinds: `phase` (the guard changed its state), `rejected` (a non-finite target), `fall`, `stale`, `button` (the stop
+    button), `servo` (a hardware error), `temperature`, `voltage`, `overload` (a blocked joint), `derated` (gains went
+    down), `homing`, `policy`, `plan`, `record`, `interrupt`, `task`, `system`.
     """
 
     tick: int

@@ -12,8 +12,10 @@ tests/stack/test_safety.py:
 4. A target that is not finite is never sent: the last goal holds, and after PATIENCE in a row the robot is damped.
 5. DAMPED and FAULT are final: DAMP, then OFF, and never ACTIVE again.
 6. Samples older than `stale` ticks, or that never came, end in FAULT; so do tilt beyond `tilt` and a servo's error.
-7. A stop that leaves time for it (Ctrl-C, heat, a full disk, the end of a task) lowers a standing robot first. One that
-   was not brought home, but holds the pose that it was found in, is not lowered: it hangs or lies.
+7. A stop that leaves time for it (Ctrl-C, the stop button, heat, a low supply, a blocked joint, a full disk, the end of
+   a task) lowers a standing robot first. One that was not brought home, but holds the pose that it was found in, is not
+   lowered: it hangs or lies.
+8. Gains only go down within a run: below what was asked for where servos get hot, the supply low or a joint blocked.
 
 Homing is the guard's own: from the pose that the robot is in, slowly, to the home pose.
 """
@@ -25,12 +27,13 @@ from enum import StrEnum
 
 import numpy as np
 
-from hw.faults import describe
+from hw.faults import STOP_BUTTON
 from hw.hal import Array, Command, Mode, Motors, Observation, State
 from hw.robot import Robot
-from stack.coast import complete, missing
+from stack.coast import missing
 from stack.crouch import crouch
 from stack.event import Event
+from stack.health import Health
 from stack.limits import limit
 
 PATIENCE = 3  # targets in a row that may be not finite
@@ -84,6 +87,7 @@ class Guard:
         self.lowest = crouch(robot)
         self._motors = motors
         self._gain = np.full(len(robot.names), gain)
+        self._health = Health(robot, self._gain)
         self._events: list[Event] = []
         self._command = self._make(Mode.OFF)
         self._motion: Motion | None = None
@@ -209,11 +213,15 @@ class Guard:
     # How -------------------------------------------------------------------------------------------------------------
 
     def _take(self, observation: Observation) -> bool:
-        """Begin from the pose that the robot is in; False, and a fault, where that is not known."""
+        """Begin from the pose that the robot is in; False, and an end, where that is not known or the stop button is
+        pressed."""
         self._expect(Phase.LIMP)
         lacking = missing(observation, self.robot.names)
         if lacking:
             self.fault("stale", f"no valid sample from {', '.join(lacking)}: check the cable and the power", lacking[0])
+            return False
+        if (observation.fault & STOP_BUTTON).any():
+            self.stop("button", "the stop button was pressed before the robot began: let go of it and start again")
             return False
         self.applied = np.array(observation.position, dtype=float)
         self._accepted = self._tick
@@ -261,35 +269,21 @@ class Guard:
         self._accepted = self._tick
 
     def _check(self, observation: Observation, state: State | None) -> None:
-        limits, names = self.robot.limits, self.robot.names
-        oldest = limits.stale * self.robot.dt + 1e-9
-        joints = np.isfinite(observation.position) & np.isfinite(observation.velocity) & (observation.age <= oldest)
-        if not joints.all():
-            name = names[int(np.flatnonzero(~joints)[0])]
-            self.fault("stale", f"no fresh sample from {name} for {limits.stale} ticks: check its cable", name)
-            return
-        tilt = _tilt(observation, state)
-        if not (complete(observation) and float(observation.imu_age) <= oldest and math.isfinite(tilt)):
-            self.fault("stale", f"no fresh sample from the IMU for {limits.stale} ticks: check its cable")
-            return
-        broken = np.flatnonzero(observation.fault)
-        if broken.size:
-            name, causes = names[broken[0]], describe(int(observation.fault[broken[0]]))
-            self.fault("servo", f"{name} reports {', '.join(causes)}: let it cool, then reboot it", name)
-            return
-        if tilt > limits.tilt and self.phase is not Phase.HOMING:  # on the way home it may hang from a hand
-            self.fault("fall", f"tilted by {math.degrees(tilt):.0f} degrees")
-            return
-        hot = np.flatnonzero(np.nan_to_num(observation.temperature, nan=-np.inf) > limits.temperature)
-        if hot.size:
-            name = names[hot[0]]
-            self.stop("temperature", f"{name} is at {observation.temperature[hot[0]]:.0f} C: let it cool", name)
+        """Act on what is wrong. On the way home the robot may hang from a hand, tilted."""
+        found = self._health.examine(observation, state, self.applied, upright=self.phase is not Phase.HOMING)
+        for ends, kind, text, joint in found:
+            if ends == "now" and self.phase not in ENDED:
+                self.fault(kind, text, joint)
+            elif ends == "lowered":
+                self.stop(kind, text, joint)
+            else:
+                self.note(kind, text, joint)
 
     def _elapsed(self) -> int:
         return min(max(1, self._tick - self._accepted), self.robot.limits.stale)
 
     def _make(self, mode: Mode) -> Command:
-        return Command(position=self.applied, gain=self._gain, mode=mode)
+        return Command(position=self.applied, gain=self._gain * self._health.factor, mode=mode)
 
     def _enter(self, phase: Phase, text: str) -> None:
         if self.phase is Phase.LIMP and phase in ENDED:
@@ -300,14 +294,3 @@ class Guard:
     def _expect(self, phase: Phase) -> None:
         if self.phase is not phase:
             raise RuntimeError(f"the guard is {self.phase}, not {phase}")
-
-
-def _tilt(observation: Observation, state: State | None) -> float:
-    """Angle [rad] of the base from upright: the estimate's, or that of the IMU's own fusion where that is larger."""
-    if state is None:
-        return math.nan
-    tilt = math.acos(min(1.0, max(-1.0, -float(state.gravity[2]))))
-    if np.isfinite(observation.orientation).all():
-        _, x, y, _ = observation.orientation / np.linalg.norm(observation.orientation)
-        tilt = max(tilt, math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * float(x * x + y * y)))))
-    return tilt

@@ -14,7 +14,7 @@ from hw.dynamixel.bus import Bus
 from hw.dynamixel.group import GroupRead
 from hw.dynamixel.survey import Found
 from hw.dynamixel.units import Units
-from hw.faults import REBOOTED, STOP_BUTTON, TORQUE_LOST, WATCHDOG
+from hw.faults import REBOOTED, STOP_BUTTON, STOP_BUTTON_AGAIN, TORQUE_LOST, WATCHDOG
 from hw.hal import Array
 
 BLOCK = 4  # servos looked at in a tick
@@ -39,6 +39,7 @@ class Watch:
         self._monitors = [(b, GroupRead([(self._ids[i], start, length) for i in b])) for b in blocks]
         self._slow = [(b, GroupRead([(self._ids[i], slow, slow_length) for i in b])) for b in blocks]
         self._turn = 0
+        self._pressed = False
         self.armed = False  # whether torque is meant to be on
         self.fault: Array = np.array([servo.get("hardware_error_status") for servo in found], dtype=np.int64)
         self.temperature: Array = np.full(n, np.nan)  # degrees C, of the newest look only
@@ -79,9 +80,11 @@ class Watch:
                 self.fault[i] |= value
 
     def press(self, pressed: bool) -> None:
-        """The board's button stops the robot, and is not forgotten when it is let go."""
-        if pressed:
-            self.fault |= STOP_BUTTON
+        """A stop button of the board is down or not. A press is not forgotten when it is let go, and the second one
+        counts as another."""
+        if pressed and not self._pressed:
+            self.fault |= STOP_BUTTON_AGAIN if (self.fault & STOP_BUTTON).any() else STOP_BUTTON
+        self._pressed = pressed
 
     def expect(self, armed: bool) -> None:
         """Torque was switched on or off on purpose: what was found before is no longer a fault."""

@@ -7,12 +7,14 @@ while the controller thinks, so that a run comes out the same every time.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
+from hw.dynamixel.backend import DynamixelBackend
 from hw.dynamixel.motors import DynamixelMotors
+from hw.dynamixel.sensors import DynamixelSensors
 from hw.hal import Array, BackendError, Clock, Percept, Scene, State, Truth
 from hw.robot import Robot
 from sim.rig.control import Control, LockedClock, RigProcess, RigTruth
@@ -58,7 +60,7 @@ class VirtualBackend:
                 rig.control.furnish(self.stage.scene, self._seed, randomise=self._randomise)
             self._rig_truth = rig.truth(None if self.stage is None else self.stage.scene)
             self._clock.attach(rig)
-            self._body = DynamixelBackend(self._robot, port=rig.port, clock=self.clock, name=self.name)
+            self._body = DynamixelBackend(_on_the_board(self._robot), port=rig.port, clock=self.clock, name=self.name)
             handles = self._body.connect()
         except BaseException:
             self.close()
@@ -97,6 +99,11 @@ class VirtualBackend:
             raise BackendError("the virtual rig is not connected: it has no truth")
         self._clock.deliver()
         return self._rig_truth.fetch()
+
+
+def _on_the_board(robot: Robot) -> Robot:
+    """The robot with its IMU on the bus, mounted as it is: a virtual rig has no other."""
+    return replace(robot, imu=replace(robot.imu, kind="opencr", port=None))
 
 
 class VirtualClock:

@@ -9,7 +9,7 @@ import numpy as np
 
 from hw.dynamixel.codec import StatusError
 from hw.dynamixel.tables import Item, table
-from hw.hal import Array
+from hw.imu.mounting import Mounting
 from sim.rig.device import Device
 from sim.rig.motors import Motors
 
@@ -18,15 +18,19 @@ AXES = "xyz"
 
 
 class Board(Device):
-    """An OpenCR whose IMU is mounted with `signs` `(3,)` along the base's axes: registers = signs * base frame."""
+    """An OpenCR whose IMU is mounted as the robot's file says, its registers negated where the real one's are."""
 
     def __init__(
-        self, motors: Motors, eeprom: dict[str, int], switch: Callable[[bool], None], signs: Array | None = None
+        self,
+        motors: Motors,
+        eeprom: dict[str, int],
+        switch: Callable[[bool], None],
+        mounting: Mounting | None = None,
     ) -> None:
         """`switch` turns the servos' power on and off."""
         super().__init__(table("opencr"), {"firmware_version": FIRMWARE, **eeprom})
         self._motors, self._switch = motors, switch
-        self._signs = np.ones(3) if signs is None else np.asarray(signs, float)
+        self._mounting = mounting or Mounting()
         self._gyro = self.table.item("gyro_x").scale
         self._acceleration = self.table.item("acceleration_x").scale
         self._angle = self.table.item("roll").scale
@@ -51,8 +55,8 @@ class Board(Device):
         if self.imu_frozen:
             return
         imu = self._motors.plant.imu
-        gyro = self._signs * imu[:3] / self._gyro
-        force = self._signs * imu[3:] / self._acceleration
+        gyro = self._mounting.to_sensor(imu[:3]) / self._gyro
+        force = self._mounting.to_sensor(imu[3:]) / self._acceleration
         angles = np.array(_euler(*self._motors.plant.truth.orientation[0])) / self._angle
         alive = 0 if self.imu_dead else 1
         for i, axis in enumerate(AXES):

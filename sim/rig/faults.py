@@ -24,11 +24,12 @@ from hw.robot import Robot
 Kind = Literal[
     "drop", "late", "truncate", "duplicate", "wrong_id", "corrupt", "error_status", "stuffed",
     "garbage", "babble", "echo", "split", "batching",
-    "reboot", "voltage", "overheating", "encoder", "shock", "overload", "torque_off", "id_conflict", "dead",
-    "baud_mismatch", "watchdog", "imu_dead", "imu_frozen", "vanish", "vanish_in_read", "stall", "brown_out",
+    "reboot", "voltage", "overheating", "encoder", "shock", "overload", "torque_off", "id_conflict", "dead", "heat",
+    "baud_mismatch", "watchdog", "imu_dead", "imu_frozen", "button", "vanish", "vanish_in_read", "stall", "brown_out",
     "clock_step",
 ]  # fmt: skip
 KINDS: tuple[str, ...] = get_args(Kind)
+MISSPOKEN = ("wrong_id", "error_status")  # whole packets that say something wrong
 STATUS_KINDS = ("drop", "late", "truncate", "duplicate", "wrong_id", "corrupt", "error_status")
 ALERTS = {"voltage": 1, "overheating": 4, "encoder": 8, "shock": 16, "overload": 32}  # bits of the hardware error
 
@@ -37,21 +38,24 @@ class Outcome(Enum):
     """What is expected of the controller."""
 
     ABSORBED = "absorbed"  # no effect but a counter
-    NAMED = "named"  # in the log, with the servo; the run goes on
+    NAMED = "named"  # in the log, with the servo; the run goes on, or ends in order
     FATAL = "fatal"  # named, and the robot made safe
 
 
 EXPECTED: dict[str, Outcome] = {
     **dict.fromkeys(STATUS_KINDS, Outcome.ABSORBED),
     **dict.fromkeys(("stuffed", "garbage", "echo", "split"), Outcome.ABSORBED),
-    **dict.fromkeys(("batching", "voltage", "encoder", "clock_step"), Outcome.NAMED),
+    **dict.fromkeys(("batching", "voltage", "encoder", "clock_step", "button", "heat"), Outcome.NAMED),
     **dict.fromkeys(("reboot", "overheating", "shock", "overload", "torque_off", "watchdog"), Outcome.FATAL),
     **dict.fromkeys(("id_conflict", "dead", "baud_mismatch", "babble", "imu_dead", "imu_frozen"), Outcome.FATAL),
     **dict.fromkeys(("vanish", "vanish_in_read", "stall", "brown_out"), Outcome.FATAL),
 }
-_NEEDS_SERVO = (*ALERTS, "reboot", "torque_off", "id_conflict", "dead", "baud_mismatch", "watchdog")
-# s of lateness, V at the servos, s of the step, s of the adapter's batch, error number
-_VALUES = {"late": 0.003, "brown_out": 5.5, "clock_step": 0.5, "batching": 0.016, "error_status": 1.0}
+_NEEDS_SERVO = (*ALERTS, "reboot", "torque_off", "id_conflict", "dead", "baud_mismatch", "watchdog", "heat")
+# s of lateness, V at the servos, s of the step, s of the adapter's batch, error number, bits of the buttons, C
+_VALUES = {
+    "late": 0.003, "brown_out": 5.5, "clock_step": 0.5, "batching": 0.016, "error_status": 1.0, "button": 1.0,
+    "heat": 72.0,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,8 @@ class Fault:
     """One fault. Times s since the rig began or was reset; what lasts goes on to `until`, for ever if there is none.
 
     `probability` is of each status packet or burst that the fault can strike; for what happens once, of its happening.
-    `value` is the lateness or step [s], the voltage [V] or the error number; `expect` replaces the usual outcome.
+    `value` is the lateness or step [s], the voltage [V], the error number, the bits of the buttons that are down or the
+    temperature [C]; `expect` replaces the usual outcome.
     """
 
     kind: Kind
@@ -184,8 +189,16 @@ class Dice:
         """Random bytes."""
         return self._rng.bytes(count)
 
-    def spoil(self, fault: Fault, status: codec.Status, frame: bytes, *, block: bool = False) -> list[Chunk]:
-        """What goes over the wire instead of `frame`, the status of a servo; `block`: its part of a fast frame."""
+    def misspeak(self, fault: Fault, status: codec.Status) -> codec.Status:
+        """What a servo says instead of `status`, with a good checksum; by another fault it is left as it is."""
+        if fault.kind == "wrong_id":
+            return status._replace(id=(status.id + 1) % codec.MAX_ID)
+        if fault.kind == "error_status":
+            return status._replace(error=int(fault.amount))
+        return status
+
+    def spoil(self, fault: Fault, frame: bytes) -> list[Chunk]:
+        """What goes over the wire instead of `frame`, the status of a servo or its part of a fast frame."""
         spot = int(self._rng.integers(0, max(len(frame), 1)))
         if fault.kind == "drop":
             return []
@@ -195,10 +208,6 @@ class Dice:
             return [Chunk(frame[:spot])]
         if fault.kind == "duplicate":
             return [Chunk(frame), Chunk(frame)]
-        if fault.kind == "corrupt" or block:
-            flipped = bytearray(frame)
-            flipped[spot] ^= 1 << int(self._rng.integers(0, 8))
-            return [Chunk(bytes(flipped))]
-        if fault.kind == "wrong_id":
-            return [Chunk(codec.status((status.id + 1) % codec.MAX_ID, status.error, status.data))]
-        return [Chunk(codec.status(status.id, int(fault.amount)))]
+        flipped = bytearray(frame)
+        flipped[spot] ^= 1 << int(self._rng.integers(0, 8))
+        return [Chunk(bytes(flipped))]

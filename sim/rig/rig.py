@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from hw.hal import Array
+from hw.imu.mounting import Mounting
 from hw.robot import Robot
 from sim.rig.board import Board
 from sim.rig.bus import Bus
@@ -90,7 +91,8 @@ class Rig:
             servo.dead = name in unplugged
         codes = self.servos[0].table.bauds
         board = {"id": self.robot.bus.board_id, "baud_rate": codes.index(self.robot.bus.baud)}
-        self.board = Board(self.motors, board, self._switch, np.array(self.robot.imu.signs))
+        mounting = Mounting(self.robot.imu.signs, self.robot.imu.mounting)
+        self.board = Board(self.motors, board, self._switch, mounting)
         self._switch(False)
         self.bus.devices = [*self.servos, self.board]
 
@@ -214,6 +216,8 @@ class Rig:
             self.board.imu_dead = begins
         elif kind == "imu_frozen":
             self.board.imu_frozen = begins
+        elif kind == "button":
+            self.board.buttons = int(fault.amount) if begins else 0
         elif kind == "vanish":
             self.port_open = not begins
         elif kind == "vanish_in_read":
@@ -248,6 +252,8 @@ class Rig:
             neighbour = (i + 1) % len(self.servos)
             joint = self.robot.joints[i if begins else neighbour]
             self.servos[neighbour].put("id", joint.id)
+        elif begins and kind == "heat":
+            firmware.winding[i] = firmware.case[i] = fault.amount
         elif begins and kind == "reboot":
             servo.reboot(self.now_ns)
         elif begins and kind == "torque_off":

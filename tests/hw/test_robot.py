@@ -123,6 +123,13 @@ ROLL = "{name: l_sho_roll, servo: xm430-w350, id: 4, direction: 1, zero: 0.0, ra
         ("joint_speed: 4.5", "joint_speed: -4.5", "limits.joint_speed: must be positive"),
         ("tilt: 1.047", "tilt: 60", "limits.tilt: 60 is more than a turn"),
         ("joint_speed: 4.5 ", "joint_speed: 4.5rad/s ", "without the unit 'rad/s'"),
+        ("derate_temperature: 60", "derate_temperature: 75", "75 is not between 0 and limits.temperature (70)"),
+        ("derate_voltage: 10.5", "derate_voltage: 9.9", "limits.derate_voltage: 9.9 V is not above limits.voltage"),
+        ("stop_buttons: [mode,", "stop_buttons: [mod,", "bus.stop_buttons[0]: expected one of mode, start, user"),
+        ("kind: opencr", "kind: openrc", "imu.kind: expected one of opencr, witmotion, bno08x"),
+        ("kind: opencr", "kind: bno08x", "imu.kind: a bno08x has a serial port of its own: name it as imu.port"),
+        ("signs: [-1, -1, 1]", "signs: [-1, -1, 0]", "imu.signs[2]: must be 1 or -1, not 0"),
+        ("mounting: [0, 0, 0]", "mounting: [0, 0, 90]", "imu.mounting[2]: 90 is more than a turn: angles are in rad"),
     ],
 )
 def test_a_robot_that_cannot_be_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
@@ -130,6 +137,41 @@ def test_a_robot_that_cannot_be_is_refused(tmp_path: Path, old: str, new: str, w
     with pytest.raises(ConfigError, match=re.escape(words)) as caught:
         load_robot(path)
     assert str(caught.value).startswith(f"{path}:{line}: "), caught.value
+
+
+@pytest.mark.parametrize(
+    ("new", "words"),
+    [
+        (
+            "kind: witmotion\n  port: /dev/ttyUSB1\n  signs: [-1, -1, -1]",
+            "imu.signs: a witmotion has right-handed axes",
+        ),
+        ("port: /dev/ttyUSB1\n  signs: [-1, -1, 1]", "imu.port: the board's IMU is on the servo bus: drop the port"),
+        ("baud: 0\n  signs: [-1, -1, 1]", "imu.baud: must be positive"),
+    ],
+)
+def test_an_imu_that_cannot_be_is_refused(tmp_path: Path, new: str, words: str) -> None:
+    old = "signs: [-1, -1, 1]"
+    if new.startswith("kind"):
+        edited(tmp_path, "robots", "op3.yaml", "  kind: opencr              # the board's", "  # the board's")
+        text = (tmp_path / "op3.yaml").read_text().replace(old, new, 1)
+    else:
+        text = (CONFIGS / "robots" / "op3.yaml").read_text().replace(old, new, 1)
+    (tmp_path / "op3.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        load_robot(tmp_path / "op3.yaml")
+
+
+def test_a_robot_file_that_says_nothing_of_it_has_the_boards_imu_and_any_button_stops(tmp_path: Path) -> None:
+    lines = (CONFIGS / "robots" / "op3.yaml").read_text().splitlines()
+    new = ("kind: opencr", "signs: [", "mounting: [", "stop_buttons", "derate_", "voltage: 10")
+    kept = [line for line in lines if not line.strip().startswith(new)]
+    assert len(kept) == len(lines) - 7
+    (tmp_path / "old.yaml").write_text("\n".join(kept))
+    robot = load_robot(tmp_path / "old.yaml")
+    assert (robot.imu.kind, robot.imu.port, robot.imu.signs) == ("opencr", None, (1.0, 1.0, 1.0))
+    assert robot.bus.stop_buttons == ("mode", "start", "user")
+    assert (robot.limits.derate_temperature, robot.limits.voltage, robot.limits.derate_voltage) == (None, None, None)
 
 
 def test_a_missing_leg_joint_is_noticed(tmp_path: Path) -> None:

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scripted_op3 import ROBOT, TICK_NS, Robot, active, run
 
-from hw.faults import REBOOTED, STOP_BUTTON, TORQUE_LOST, WATCHDOG, describe
+from hw.dynamixel.backend import DynamixelBackend
+from hw.faults import (
+    IMU_DEAD,
+    IMU_FROZEN,
+    IMU_SILENT,
+    REBOOTED,
+    STOP_BUTTON,
+    STOP_BUTTON_AGAIN,
+    TORQUE_LOST,
+    WATCHDOG,
+    describe,
+)
 from hw.hal import BackendError
 
 
@@ -90,18 +103,33 @@ def test_an_imu_that_does_not_live_is_not_believed(robot: Robot, kind: str) -> N
     assert ticks <= 4
     _, o = run(robot, sensors, motors, 3)
     assert o.imu_age > 0.05
+    assert (o.fault == {"dead": IMU_DEAD, "frozen": IMU_FROZEN, "silent": IMU_SILENT}[kind]).all(), "and it says why"
     assert np.isfinite(o.position).all()
 
 
-def test_the_boards_button_stops_the_robot(robot: Robot) -> None:
+@pytest.mark.parametrize("bits", [1, 2, 4, 7])
+def test_the_boards_buttons_stop_the_robot(robot: Robot, bits: int) -> None:
     sensors, motors = robot.backend().connect()
     run(robot, sensors, motors, 2)
-    robot.board.put("button", 1)
-    _, o = run(robot, sensors, motors, 1)
-    assert (o.fault & STOP_BUTTON).all()
+    robot.board.put("button", bits)
+    for _ in range(3):
+        _, o = run(robot, sensors, motors, 1)
+        assert (o.fault == STOP_BUTTON).all()
     robot.board.put("button", 0)
     _, o = run(robot, sensors, motors, 1)
-    assert (o.fault & STOP_BUTTON).all(), "letting go does not start it again"
+    assert (o.fault == STOP_BUTTON).all(), "letting go does not start it again"
+    robot.board.put("button", bits)
+    _, o = run(robot, sensors, motors, 1)
+    assert (o.fault == STOP_BUTTON | STOP_BUTTON_AGAIN).all(), "pressed once more"
+
+
+def test_only_the_buttons_that_the_robots_file_names_stop_it(robot: Robot) -> None:
+    named = replace(ROBOT, bus=replace(ROBOT.bus, stop_buttons=("user",)))
+    sensors, _ = DynamixelBackend(named, port=robot.line, clock=robot.line).connect()
+    robot.board.put("button", 1 | 2 | 8)
+    assert not sensors.read().fault.any()
+    robot.board.put("button", 4)
+    assert (sensors.read().fault == STOP_BUTTON).all()
 
 
 def test_a_port_that_vanishes_is_said(robot: Robot) -> None:

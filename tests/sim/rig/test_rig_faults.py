@@ -195,3 +195,29 @@ def test_the_same_seed_strikes_the_same(host: Host, robot: Robot) -> None:
     first = run()
     assert first == run()
     assert len(set(first)) > 1
+
+
+def test_buttons_are_pressed_and_servos_heated_by_a_scenario(host: Host, rig: Rig) -> None:
+    button, temperature = codec.read(BOARD, 30, 1), codec.read(14, 146, 1)
+    assert host.one(button).data == b"\0"
+    rig.inject(Fault("button", at=rig.seconds, until=rig.seconds + 0.1, value=6))
+    inject(rig, "heat", servo="l_knee")
+    assert host.one(button).data == b"\6"
+    assert 70 <= host.one(temperature).data[0] <= 72
+    assert host.read(13, "present_temperature") < 30
+    host.wait(0.15)
+    assert host.one(button).data == b"\0"
+
+
+@pytest.mark.parametrize(
+    ("kind", "good"), [("wrong_id", 19), ("error_status", 20), ("garbage", 3), ("id_conflict", 18)]
+)
+def test_a_fast_frame_is_spoiled_as_plain_answers_are(host: Host, kind: str, good: int) -> None:
+    """The driver reads its servos in fast frames: a fault that strikes only plain answers would never meet it."""
+    inject(host.rig, kind, servo=host.ids[3])
+    host.rig.host_sends(codec.sync_read(host.ids, 132, 4, fast=True))
+    found = [s for s in parse_fast(host.wait(0.01), host.ids, [4] * 20) if s is not None]
+    assert good <= len(found) <= good + 1
+    truth = {s.id: s.get("present_position").to_bytes(4, "little") for s in host.rig.servos}
+    assert all(truth[s.id] == s.data for s in found if not s.error)
+    assert [s.id for s in found if s.error] == ([host.ids[3]] if kind == "error_status" else [])

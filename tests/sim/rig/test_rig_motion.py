@@ -11,6 +11,7 @@ from rig_host import BOARD, Host
 from hw.dynamixel import codec
 from hw.dynamixel.tables import table
 from hw.hal import Array, Command, Mode
+from hw.imu.mounting import Mounting
 from hw.robot import Robot
 from sim.rig.board import Board
 from sim.rig.rig import Rig
@@ -212,7 +213,7 @@ def test_the_board_measures_what_the_body_does(host: Host, rig: Rig) -> None:
         return item.decode(host.one(codec.read(BOARD, item.address, item.width)).data) * item.scale
 
     force = np.array([read(f"acceleration_{axis}") for axis in "xyz"])
-    expected = -rig.plant.truth.gravity[0] * 9.81
+    expected = rig.robot.imu.signs * -rig.plant.truth.gravity[0] * 9.81
     assert force == pytest.approx(expected, abs=0.5)
     assert read("present_input_voltage") == pytest.approx(12.0, abs=0.1)
     rig.plant.release()
@@ -227,12 +228,24 @@ def test_the_board_measures_what_the_body_does(host: Host, rig: Rig) -> None:
     assert read("button") == 2
 
 
-def test_an_imu_is_read_in_the_axes_of_its_mounting(rig: Rig) -> None:
-    turned = Board(rig.motors, {}, lambda on: None, np.array([-1.0, -1.0, 1.0]))
-    for board in (rig.board, turned):
+def test_an_imu_is_read_in_the_axes_of_its_mounting(rig: Rig, robot: Robot) -> None:
+    """The registers of this robot's board are those of a real one: x and y negated. Mounted on its side, they turn."""
+    assert robot.imu.signs == (-1.0, -1.0, 1.0)
+    boards = {
+        "plain": Board(rig.motors, {}, lambda on: None),
+        "real": rig.board,
+        "side": Board(rig.motors, {}, lambda on: None, Mounting(angles=(math.pi / 2, 0.0, 0.0))),
+    }
+    registers = {}
+    for name, board in boards.items():
         board.refresh(0)
-    for axis, sign in zip("xyz", (-1, -1, 1), strict=True):
-        assert turned.get(f"acceleration_{axis}") == sign * rig.board.get(f"acceleration_{axis}") != 0
+        registers[name] = [board.get(f"acceleration_{axis}") for axis in "xyz"]
+    x, y, z = registers["plain"]
+    assert abs(x) > 10
+    assert abs(y) > 10
+    assert z > 16000
+    assert registers["real"] == [-x, -y, z]
+    assert registers["side"] == [x, z, -y]
 
 
 def test_a_frozen_imu_repeats_itself_and_a_living_one_never_does(host: Host, rig: Rig) -> None:

@@ -1,0 +1,83 @@
+"""One read of the robot: all joints in a cycle, the board's buttons, the IMU, and a few servos' silent registers."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hw.dynamixel.bus import Bus
+from hw.dynamixel.group import GroupRead
+from hw.dynamixel.imu import BUTTONS, BoardImu
+from hw.dynamixel.survey import Found
+from hw.dynamixel.tables import table
+from hw.dynamixel.units import Units
+from hw.dynamixel.watch import Watch
+from hw.hal import Observation
+from hw.imu.mounting import Mounting
+from hw.imu.serial_imu import SerialImu
+from hw.robot import Robot
+
+_PRESENT = np.dtype([("current", "<i2"), ("velocity", "<i4"), ("position", "<i4")])
+
+
+def present(found: list[Found]) -> GroupRead:
+    """The group of the control cycle: current (or load, where there is none), velocity and position of every servo,
+    which lie side by side in every model."""
+    parts = [(s.joint.id, s.table.item("present_position").end - _PRESENT.itemsize, _PRESENT.itemsize) for s in found]
+    return GroupRead(parts, fast=all(map(_fast, found)))
+
+
+class DynamixelSensors:
+    """The reading half of the backend. `imu` is one on a port of its own; without it the board's is read."""
+
+    def __init__(
+        self, bus: Bus, robot: Robot, units: Units, watch: Watch, present: GroupRead, imu: SerialImu | None = None
+    ) -> None:
+        self._bus, self._units, self._watch, self._present, self._imu = bus, units, watch, present, imu
+        self._block = BoardImu(table("opencr"), Mounting(robot.imu.signs, robot.imu.mounting))
+        self._board = GroupRead([(robot.bus.board_id, self._block.address, self._block.length)])
+        self._stop = sum({BUTTONS[name] for name in robot.bus.stop_buttons})
+
+    def read(self) -> Observation:
+        """All joints, the IMU, and a few servos' slow registers. A value that did not come at this tick is NaN."""
+        bus, group = self._bus, self._present
+        bus.read_groups((group, self._board))
+        position, velocity, current = self._decode()
+        fresh = self._board.fresh[0]
+        reading = self._block.update(self._board.data[0] if fresh else None, self._board.time_ns[0])
+        if self._imu is not None:
+            reading = self._imu.read()
+        self._watch.press(self._block.buttons & self._stop != 0)
+        self._watch.look(group.alert, hurry=not all(group.fresh))
+        now = bus.clock.now_ns()
+        return Observation(
+            time_ns=now,
+            position=self._units.position(position),
+            velocity=self._units.velocity(velocity),
+            effort=self._units.effort(current),
+            temperature=self._watch.temperature.copy(),
+            voltage=self._watch.voltage.copy(),
+            age=np.array([_age(now, time) for time in group.time_ns]),
+            fault=self._watch.fault | reading.fault,
+            orientation=reading.orientation,
+            angular_velocity=reading.angular_velocity,
+            specific_force=reading.specific_force,
+            imu_age=np.asarray(_age(now, reading.time_ns)),
+        )
+
+    def _decode(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Raw position, velocity and current `(n_joints,)` as floats, NaN where they did not come."""
+        rows = np.full((3, len(self._present.ids)), np.nan)
+        came = [i for i, fresh in enumerate(self._present.fresh) if fresh]
+        raw = np.frombuffer(b"".join(self._present.data[i] or b"" for i in came), dtype=_PRESENT)
+        for row, field in zip(rows, ("position", "velocity", "current"), strict=True):
+            row[came] = raw[field]
+        return rows[0], rows[1], rows[2]
+
+
+def _fast(servo: Found) -> bool:
+    oldest = servo.table.fast_firmware
+    return oldest is not None and servo.firmware >= oldest
+
+
+def _age(now_ns: int, time_ns: int | None) -> float:
+    return float("inf") if time_ns is None else (now_ns - time_ns) * 1e-9
