@@ -48,6 +48,11 @@ def main(args: argparse.Namespace) -> int:
         if found.skipped:
             report.line(f"this adapter cannot be set to {', '.join(map(str, found.skipped))} bit/s: nobody asked there")
         problems = found.problems + [text for device in found.devices for text in misfits(device, robot)]
+        if not found.servos and not problems:
+            problems.append(
+                "the board answers, but no servo does: is the cable from the board to the servos plugged in, and is "
+                "the supply on?"
+            )
         _show(found, robot, problems, report)
         missing = absent(found, robot)
         if missing:

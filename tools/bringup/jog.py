@@ -1,0 +1,185 @@
+"""Move one joint, slowly and a little.
+
+Torque comes on at every joint, each where it is; then one joint moves while an arrow key is held, at 0.25 rad/s and at
+most 0.35 rad from where it was found. It stops when the key is let go. q, Ctrl-C or a minute without a key turn torque
+off. The guard stands between: what it has refused is sent to no servo. Support the robot, it is limp before and after.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, TextIO
+
+from hw.config import ConfigError, nearest
+from hw.hal import Array, Backend, BackendError, Sensors
+from hw.robot import Robot
+from tools import exit_codes
+from tools.bringup.line import add_line_arguments, assembled, is_virtual
+from tools.bringup.prompt import confirm
+from tools.output import Report, reporting
+
+if TYPE_CHECKING:
+    from stack.loop import TickRecord
+    from stack.safety import Guard
+
+_READS = 25  # of a first pose: half a second
+_SHOW_EVERY = 5  # ticks
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("joint", help="joint to move")
+    add_line_arguments(parser)
+    parser.add_argument("--by", type=float, metavar="RAD", help="go by so much and back, instead of listening to keys")
+    parser.add_argument("--start", action="store_true", help="switch torque on without asking")
+
+
+def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        from stack.backends import make_backend
+        from tools.bringup.jogging import SPAN
+
+        robot = assembled(args, report)
+        if args.joint not in robot.names:
+            raise ConfigError(f"{robot.name} has no joint '{args.joint}'; {nearest(args.joint, robot.names)}")
+        if args.by is not None and not 0.0 < abs(args.by) <= SPAN:
+            raise ConfigError(f"--by {args.by:g}: give an angle up to {SPAN:g} rad, or a negative one; it is not 0")
+        if args.by is None and not sys.stdin.isatty():
+            raise ConfigError("keys need a terminal: give --by RAD to move without one")
+        name = "virtual" if is_virtual(args) else "dynamixel"
+        port = None if name == "virtual" else args.port
+        body = make_backend(name, robot, seed=0, randomise=False, port=port)
+        with ExitStack() as stack:
+            stack.callback(body.close)
+            sensors, motors = body.connect()
+            if name == "virtual":
+                body.rig.control.hold()  # type: ignore[attr-defined]  # on a stand, however it is bent
+            result = _jog(body, sensors, motors, robot, args, report)
+        report.result(result)
+    return {"task": exit_codes.DONE, "interrupt": exit_codes.INTERRUPTED}.get(result["cause"], exit_codes.STOPPED)
+
+
+def _jog(
+    body: Backend, sensors: Sensors, motors: Any, robot: Robot, args: argparse.Namespace, report: Report
+) -> dict[str, Any]:
+    import numpy as np
+
+    from stack.clock import RealTime, Schedule, WallClock
+    from stack.estimator import Estimator
+    from stack.interrupt import Interrupt, Stops
+    from stack.loop import Loop
+    from stack.safety import Guard
+    from tools.bringup.jogging import SPEED, JogPilot, Keys, There, reach, restrict
+
+    i = robot.names.index(args.joint)
+    clock = body.clock
+    if not isinstance(clock, WallClock) and args.by is None:
+        clock = RealTime(clock)
+    here = _pose(sensors, clock, robot)
+    low, high = reach(restrict(robot, here, i), i)
+    _announce(report, robot, i, here, (low, high), args)
+    if not args.start:
+        confirm("Support the robot", "give --start to switch torque on without being asked")
+    here = _pose(sensors, clock, robot)  # it may have been moved meanwhile
+    restricted = restrict(robot, here, i)
+    low, high = reach(restricted, i)
+    if args.by is not None and not low - 1e-9 <= here[i] + args.by <= high + 1e-9:
+        raise ConfigError(
+            f"--by {args.by:g}: {args.joint} can go from {low - here[i]:+.3f} to {high - here[i]:+.3f} rad from here"
+        )
+    with ExitStack() as stack:
+        interrupt = stack.enter_context(Interrupt())
+        source = There(args.by) if args.by is not None else stack.enter_context(Keys())
+        guard = Guard(restricted, motors)
+        shown = _Shown(guard, i, args.joint, here, sys.stderr)
+        pilot = JogPilot(restricted, guard, i, source)
+        schedule = Schedule(clock, robot.rate)
+        loop = Loop(sensors, Estimator(robot), pilot, guard, schedule, interrupt, Stops(interrupt), (shown,))
+        try:
+            loop.run()
+        finally:
+            shown.close()
+    events = [*shown.events, *guard.events()]
+    for event in events:
+        if event.kind not in ("phase", "task"):
+            report.line(event.text)
+    report.line(f"{args.joint} went from {shown.low - here[i]:+.3f} to {shown.high - here[i]:+.3f} rad; torque is off")
+    return {
+        "joint": args.joint,
+        "start": float(here[i]),
+        "lowest": shown.low,
+        "highest": shown.high,
+        "speed": SPEED,
+        "others_moved": 0.0 if shown.drift is None else float(np.delete(shown.drift, i).max(initial=0.0)),
+        "cause": guard.cause,
+        "events": [event.text for event in events],
+    }
+
+
+def _pose(sensors: Sensors, clock: Any, robot: Robot) -> Array:
+    """Where every joint is [rad], the newest of several reads. Raises BackendError naming a joint that is silent."""
+    from stack.coast import Coast, missing
+
+    coast = Coast()
+    for _ in range(_READS):
+        clock.sleep_until(clock.now_ns() + round(robot.dt * 1e9))
+        observation = coast.update(sensors.read())
+    if lacking := missing(observation, robot.names):
+        raise BackendError(f"no sample from {', '.join(lacking)}: check cables and power, then servoid bringup scan")
+    return observation.position.copy()
+
+
+def _announce(
+    report: Report, robot: Robot, i: int, here: Array, ends: tuple[float, float], args: argparse.Namespace
+) -> None:
+    from tools.bringup.jogging import SPEED
+
+    joint = robot.joints[i]
+    report.line(
+        f"{joint.name} (ID {joint.id}) is at {here[i]:+.3f} rad; its range is {joint.range[0]:g} to {joint.range[1]:g}."
+    )
+    report.line(f"Torque will come on at all {len(robot.joints)} joints, each where it is. Nothing moves by that.")
+    if args.by is None:
+        report.line(
+            f"Then {joint.name} moves while an arrow key is held (or + and -), at {SPEED:g} rad/s, between "
+            f"{ends[0]:+.3f} and {ends[1]:+.3f} rad. q, Ctrl-C or a minute without a key: torque off."
+        )
+    else:
+        report.line(
+            f"Then {joint.name} goes by {args.by:+.3f} rad at {SPEED:g} rad/s, and back; then torque goes off. "
+            "Ctrl-C: at once."
+        )
+
+
+class _Shown:
+    """Shows the joint while it moves, and remembers how far it went."""
+
+    def __init__(self, guard: Guard, i: int, name: str, start: Array, stream: TextIO) -> None:
+        self._guard, self._i, self._name, self._start, self._stream = guard, i, name, start, stream
+        self._tty = stream.isatty()
+        self._count = 0
+        self.low, self.high = float("inf"), float("-inf")
+        self.drift: Array | None = None  # (n_joints,) rad, the farthest that each joint was from `start`
+        self.events: list[Any] = []
+
+    def __call__(self, record: TickRecord) -> None:
+        import numpy as np
+
+        self.events += record.events
+        angle = float(record.observation.position[self._i])
+        if angle == angle:  # it was read
+            self.low, self.high = min(self.low, angle), max(self.high, angle)
+        away = np.abs(np.nan_to_num(record.observation.position - self._start))
+        self.drift = away if self.drift is None else np.maximum(self.drift, away)
+        self._count += 1
+        if self._tty and self._count % _SHOW_EVERY == 0:
+            effort, goal = float(record.observation.effort[self._i]), float(self._guard.applied[self._i])
+            text = f"{self._name} {angle:+.3f} rad  goal {goal:+.3f}  effort {effort:+.2f} N m  {record.phase}"
+            self._stream.write("\r" + text.ljust(78))
+            self._stream.flush()
+
+    def close(self) -> None:
+        if self._tty:
+            self._stream.write("\n")
+            self._stream.flush()

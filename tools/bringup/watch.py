@@ -1,0 +1,158 @@
+"""Watch the robot: angles, temperatures, voltages, loads and errors of every servo, and how well the bus does.
+
+Only reads: torque stays as it is. Until Ctrl-C, or for `--seconds`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from hw.robot import Robot
+from tools import exit_codes
+from tools.bringup.line import Line, add_line_arguments, assembled, open_line
+from tools.output import Report, reporting
+from tools.run import positive
+
+if TYPE_CHECKING:
+    from hw.dynamixel.bus import Counters
+    from hw.hal import Observation
+
+RATE = 20  # reads a second
+SHOW_SECONDS = 0.5  # between tables on a terminal
+_SILENT = 1.0  # s after which a servo is said to be silent
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_line_arguments(parser)
+    parser.add_argument("--seconds", type=positive, metavar="S", help="end after so long (default: Ctrl-C)")
+
+
+def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        robot = assembled(args, report)
+        with open_line(args, robot) as line:
+            watched = Watched(line, robot)
+            live = sys.stdout.isatty() and not args.json
+            with suppress(KeyboardInterrupt):  # the usual way to end it
+                watched.run(args.seconds, report if live else None)
+            if not live:
+                watched.show(report)
+            report.result(watched.summary())
+    return exit_codes.DONE
+
+
+class Watched:
+    """The robot on a line, read again and again."""
+
+    def __init__(self, line: Line, robot: Robot) -> None:
+        """Raises BackendError when a servo or the board does not answer."""
+        from hw.dynamixel.sensors import DynamixelSensors, present
+        from hw.dynamixel.survey import find_board, find_servos
+        from hw.dynamixel.units import Units
+        from hw.dynamixel.watch import Watch
+        from stack.clock import RealTime, WallClock
+        from stack.coast import Coast
+
+        bus = line.bus
+        bus.return_delay = 254 * 2e-6  # until the servos' own is known
+        find_board(bus, robot)
+        found = find_servos(bus, robot)
+        bus.return_delay = max(servo.get("return_delay_time") for servo in found) * 2e-6
+        units = Units(robot, [servo.table for servo in found])
+        self._sensors = DynamixelSensors(bus, robot, units, Watch(bus, found, units), present(found))
+        self._bus, self._robot, self._coast = bus, robot, Coast()
+        self._clock = line.clock if isinstance(line.clock, WallClock) else RealTime(line.clock)
+        self._before = dataclasses.replace(bus.counters)
+        self._times: list[float] = []  # ms that the reads took
+        self._hottest: list[float] = [float("nan")] * len(found)
+        self._lowest: list[float] = [float("nan")] * len(found)
+        self._newest: Observation | None = None
+        self._drawn = 0
+
+    def run(self, seconds: float | None, report: Report | None) -> None:
+        """Read for so long, or until KeyboardInterrupt; with a report, show a table now and then."""
+        import numpy as np
+
+        count, every = 0, round(SHOW_SECONDS * RATE)
+        start = self._clock.now_ns()
+        while seconds is None or count <= seconds * RATE:
+            self._clock.sleep_until(start + round(count * 1e9 / RATE))
+            began = self._clock.now_ns()
+            self._newest = observation = self._coast.update(self._sensors.read())
+            self._times.append((self._clock.now_ns() - began) * 1e-6)
+            del self._times[:-10_000]
+            self._hottest = np.fmax(self._hottest, observation.temperature).tolist()
+            self._lowest = np.fmin(self._lowest, observation.voltage).tolist()
+            count += 1
+            if report is not None and count % every == 0:
+                self.show(report, redraw=True)
+
+    def show(self, report: Report, *, redraw: bool = False) -> None:
+        """The table as it is now; `redraw` over the one before."""
+        if self._newest is None:
+            return
+        rows = [tuple(row.values()) for row in self._rows()]
+        if redraw and self._drawn:
+            report.line(f"\x1b[{self._drawn + 1}F\x1b[J")
+        head = ("joint", "ID", "angle", "supply", "lowest", "heat", "hottest", "effort", "state")
+        shown = [(*row[:2], *map(_text, row[2:8], _UNITS), row[8]) for row in rows]
+        report.table(head, shown)
+        bus = self._statistics()
+        report.line(
+            f"bus: {bus['reads']} reads, median {bus['read_ms_p50']:.2f} ms, p99 {bus['read_ms_p99']:.2f} ms; "
+            f"{bus['lost']} answers lost, {bus['recovered']} of them recovered, {bus['bad_crc']} damaged, "
+            f"{bus['refused']} refused, {bus['conflicts']} conflicts"
+        )
+        self._drawn = len(rows) + 2
+
+    def summary(self) -> dict[str, Any]:
+        """The newest values and the bus's statistics, as JSON values."""
+        return {"servos": [] if self._newest is None else self._rows(), "bus": self._statistics()}
+
+    def _rows(self) -> list[dict[str, Any]]:
+        from hw.faults import ROBOT, describe
+
+        o = self._newest
+        assert o is not None
+        rows = []
+        for i, joint in enumerate(self._robot.joints):
+            state = ", ".join(describe(int(o.fault[i]) & ~ROBOT)) or "ok"
+            if o.age[i] > _SILENT:
+                state = f"silent for {o.age[i]:.0f} s: check its cable"
+            rows.append(
+                {
+                    "joint": joint.name,
+                    "id": joint.id,
+                    "position": float(o.position[i]),
+                    "voltage": float(o.voltage[i]),
+                    "voltage_min": self._lowest[i],
+                    "temperature": float(o.temperature[i]),
+                    "temperature_max": self._hottest[i],
+                    "effort": float(o.effort[i]),
+                    "state": state,
+                }
+            )
+        return rows
+
+    def _statistics(self) -> dict[str, Any]:
+        import numpy as np
+
+        now, before = self._bus.counters, self._before
+        values: dict[str, Any] = {name: getattr(now, name) - getattr(before, name) for name in _names(now)}
+        p50, p99 = np.percentile(self._times or [0.0], [50, 99])
+        return {"reads": len(self._times), "read_ms_p50": float(p50), "read_ms_p99": float(p99)} | values
+
+
+_UNITS = (("rad", 3), ("V", 1), ("V", 1), ("C", 0), ("C", 0), ("N m", 2))
+
+
+def _text(value: float, unit: tuple[str, int]) -> str:
+    return "-" if value != value else f"{value:.{unit[1]}f} {unit[0]}"
+
+
+def _names(counters: Counters) -> list[str]:
+    return [field.name for field in dataclasses.fields(counters)]
