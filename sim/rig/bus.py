@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 import struct
 from collections.abc import Iterator, Sequence
 
@@ -9,7 +11,7 @@ from hw.dynamixel import codec
 from hw.dynamixel.codec import Instruction, Packet, Parser, Status
 from hw.dynamixel.crc import crc16
 from sim.rig.device import Device
-from sim.rig.faults import STATUS_KINDS, Chunk, Dice
+from sim.rig.faults import MISSPOKEN, STATUS_KINDS, Chunk, Dice
 from sim.rig.wire import FRAME_BITS, Wire, same_baud
 
 TURNAROUND_NS = 2_000  # from the last byte of a request to the first of the reply, at return delay 0
@@ -112,36 +114,42 @@ class Bus:
         lengths = [length for _, _, length in parts]
         if sum(lengths) > _LONGEST_FRAME:
             return
-        by_id = {device.id: device for device in reversed(listening) if device.fast()}
-        first = by_id.get(parts[0][0])
+        able = [device for device in listening if device.fast()]
+        first = next((device for device in able if device.answers_to(parts[0][0])), None)
         if first is None:
             return
         chunks: list[Chunk] = []
         head = codec.fast_head(lengths)
         crc = crc16(head)
         for id, address, length in parts:
-            device = by_id.get(id)
-            status = None if device is None else device.sample(address, length, now_ns)
-            if status is None or len(status.data) != length:
+            sampled = [device.sample(address, length, now_ns) for device in _called(able, id)]
+            answers = [status for status in sampled if status is not None and len(status.data) == length]
+            if not answers:
                 break
-            body = bytes([_error(status), id]) + status.data
-            checksum = crc16(body, crc).to_bytes(2, "little")
-            crc = crc16(body + checksum, crc)
-            block, head = head + body + checksum, b""
             fault = self.dice.strikes(STATUS_KINDS, id, now_ns)
-            if fault is None:
+            if fault is not None:
+                answers = [self.dice.misspeak(fault, status) for status in answers]
+            block = _together([_block(status, crc) for status in answers])
+            crc = crc16(block, crc)
+            block, head = head + block, b""
+            if self.dice.strikes(("garbage",), id, now_ns) is not None:
+                chunks.append(Chunk(self.dice.noise(9)))
+            if fault is None or fault.kind in MISSPOKEN:
                 chunks.append(Chunk(block))
                 continue
-            chunks += self.dice.spoil(fault, status, block, block=True)
+            chunks += self.dice.spoil(fault, block)
             if fault.kind in ("drop", "truncate"):
                 break
         self._put(chunks, now_ns + TURNAROUND_NS + first.return_delay_ns, first.baud, now_ns)
 
     def _send(self, status: Status, start_ns: int, baud: int, now_ns: int) -> int:
         """Put a status on the wire; returns when it ends."""
-        frame = codec.status(status.id, _error(status), status.data)
+        frame = _frame(status)
         fault = self.dice.strikes(STATUS_KINDS, status.id, now_ns)
-        chunks = [Chunk(frame)] if fault is None else self.dice.spoil(fault, status, frame)
+        if fault is not None and fault.kind in MISSPOKEN:
+            chunks = [Chunk(_frame(self.dice.misspeak(fault, status)))]
+        else:
+            chunks = [Chunk(frame)] if fault is None else self.dice.spoil(fault, frame)
         if self.dice.strikes(("garbage",), status.id, now_ns) is not None:
             chunks.insert(0, Chunk(self.dice.noise(9)))
         return self._put(chunks, start_ns, baud, now_ns)
@@ -160,6 +168,21 @@ class Bus:
 
 def _called(devices: list[Device], id: int) -> list[Device]:
     return [device for device in devices if device.answers_to(id)]
+
+
+def _frame(status: Status) -> bytes:
+    return codec.status(status.id, _error(status), status.data)
+
+
+def _block(status: Status, crc: int) -> bytes:
+    """What a servo adds to a fast frame whose bytes so far have checksum `crc`."""
+    body = bytes([_error(status), status.id]) + status.data
+    return body + crc16(body, crc).to_bytes(2, "little")
+
+
+def _together(blocks: list[bytes]) -> bytes:
+    """What the line carries when several servos speak at once: the AND of their bytes."""
+    return bytes(functools.reduce(operator.and_, column) for column in zip(*blocks, strict=True))
 
 
 def _error(status: Status) -> int:
