@@ -21,9 +21,13 @@ class Interrupt:
     The first asks for an orderly end, the second for torque off at once. A policy that hangs would never look: while
     `breakable` is set, and only then, the second signal also raises KeyboardInterrupt. Outside the main thread, where
     Python forbids handlers, it stays at zero unless `request` is called.
+
+    Before anything moves it may be `eager`, and raise at once. An exception can get lost in a library that is just
+    being imported or is cleaning up; what was counted is not lost, and `settle` raises it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, eager: bool = False) -> None:
+        self.eager = eager
         self.count = 0
         self.breakable = False
         self._handlers: dict[signal.Signals, Any] = {}
@@ -31,6 +35,12 @@ class Interrupt:
     def request(self) -> None:
         """The same as one Ctrl-C."""
         self.count += 1
+
+    def settle(self) -> None:
+        """End of being eager: signals are requests from here on. Raises KeyboardInterrupt for one that came before."""
+        self.eager = False
+        if self.count:
+            raise KeyboardInterrupt
 
     def __enter__(self) -> Interrupt:
         if threading.current_thread() is threading.main_thread():
@@ -45,7 +55,7 @@ class Interrupt:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.count += 1
-        if self.count > 1 and self.breakable:
+        if self.eager or (self.count > 1 and self.breakable):
             raise KeyboardInterrupt
 
 

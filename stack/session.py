@@ -120,6 +120,7 @@ def run(
     if scene is not None and simulated and getattr(body, "stage", None) is None:
         raise ConfigError(f"task '{task.name}' has a scene: make the backend with it (stack.session.prepare does)")
     with ExitStack() as stack:
+        interrupt = stack.enter_context(Interrupt(eager=True))
         pilot = make_policy(settings.policy, robot, task, realtime) if policy is None else policy
         if script.plans is not None and hasattr(pilot, "only"):
             pilot.only = script.plans
@@ -136,7 +137,7 @@ def run(
             confirm(f"{known}{robot.name} will go to its home pose and then: {task.name}")
 
         # From here on a Ctrl-C is a request, until the motors are off.
-        interrupt = stack.enter_context(Interrupt())
+        interrupt.settle()
         guard = Guard(robot, motors, gain)
         if assembly is not None:
             guard.note("system", assembly)

@@ -47,6 +47,8 @@ VERBS: dict[str, Verb] = {
             "sim": Verb("batched simulation against the raw engine", "tools.bench.sim"),
             "policy": Verb("planning time", "tools.bench.policy"),
             "loop": Verb("lateness of the control loop", "tools.bench.loop"),
+            "kill": Verb("what becomes of the servos when the controller is killed", "tools.bench.kill"),
+            "interrupt": Verb("whether torque is off after Ctrl-C at any instant", "tools.bench.interrupt"),
         },
     ),
     "replay": Verb("repeat a recorded run and compare", "tools.replay"),
@@ -68,6 +70,8 @@ def main(argv: list[str] | None = None) -> int:
             return 128 + signal.SIGPIPE
         if debug:
             traceback.print_exc()
+        for note in getattr(error, "__notes__", ()):  # a table, say: what the message is about
+            print(note, file=sys.stderr)
         print(f"servoid: {exit_codes.explain(error)}", file=sys.stderr)
         return exit_codes.exit_code(error)
 

@@ -59,9 +59,14 @@ def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         if args.video is not None:
             _prepare_video(args.video)
-        from stack.backends import backend_kind
-        from stack.session import Settings, run
-        from tools.live import LiveLine
+        from stack.interrupt import Interrupt
+
+        with Interrupt(eager=True) as interrupt:  # these take a while, and a Ctrl-C meanwhile must not get lost
+            from stack.backends import backend_kind
+            from stack.session import Settings, run
+            from tools.live import LiveLine
+
+            interrupt.settle()
 
         watched = sys.stdout.isatty() and not args.json
         plan = Settings(

@@ -39,7 +39,8 @@ class VirtualServo(Device):
     def __init__(
         self, motors: Motors, index: int, model: int | str, eeprom: dict[str, int], accepted: Accepted | None = None
     ) -> None:
-        """`accepted` is told of every write to a goal, the torque or the P gain that the servo took."""
+        """`accepted` is told of every write to a goal, the torque or the P gain that the servo took, and of the 255
+        that an expired watchdog writes to its register."""
         self.motors, self.index, self._accepted = motors, index, accepted
         self.stuffed = False  # a fault: current and velocity that need byte stuffing on the wire
         self._base = 0  # ticks of whole turns that do not count
@@ -252,6 +253,8 @@ class VirtualServo(Device):
                     self.torque_off()
         if self._watch_ns is not None and now_ns - self._watch_ns > self.get("bus_watchdog") * 20_000_000:
             self.trip()
+            if self._accepted is not None:
+                self._accepted(self.index, "bus_watchdog", _TRIPPED, math.nan, now_ns)
 
     def trip(self) -> None:
         """The bus watchdog expires: the motor stops, the profile is gone, goals are refused."""
