@@ -150,7 +150,9 @@ class RigTruth:
 
 
 class RigProcess:
-    """A virtual rig in a process of its own, which outlives this one by `linger` seconds of silence."""
+    """A virtual rig in a process of its own. It outlives this one, if this is killed, by `linger` seconds of silence:
+    long enough for whoever looks after the servos then. After that it ends and leaves nothing behind.
+    """
 
     def __init__(
         self,
@@ -181,7 +183,7 @@ class RigProcess:
             "--control",
             control,
         ]
-        command += ["--seed", str(seed), "--linger", str(linger)]
+        command += ["--seed", str(seed), "--linger", str(linger), "--folder", self._folder.name]
         command += ["--randomise"] if randomise else []
         command += ["--faults", str(faults)] if faults else []
         command += [] if delivery is None else delivery.arguments()

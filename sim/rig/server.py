@@ -12,7 +12,9 @@ from __future__ import annotations
 import argparse
 import gc
 import json
+import os
 import select
+import shutil
 import signal
 import socket
 import sys
@@ -283,7 +285,16 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--randomise", action="store_true")
     parser.add_argument("--linger", type=float)
+    parser.add_argument("--folder", type=Path, help="a temporary folder, which goes when the rig ends")
     args = parser.parse_args()
+    try:
+        return _serve(args)
+    finally:  # whoever made the folder may have been killed, which is why it goes from here
+        if args.folder is not None:
+            shutil.rmtree(args.folder, ignore_errors=True)
+
+
+def _serve(args: argparse.Namespace) -> int:
     try:
         server = build(args, linger=args.linger)
     except (ConfigError, OSError) as error:
@@ -295,7 +306,12 @@ def main() -> int:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
-    print(json.dumps({"port": server.port, "control": str(args.control) if args.control else None}), flush=True)
+    try:
+        print(json.dumps({"port": server.port, "control": str(args.control) if args.control else None}), flush=True)
+    except BrokenPipeError:  # whoever started the rig is gone before it had begun
+        server.close()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     server.serve()
     return 0
 

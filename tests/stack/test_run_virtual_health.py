@@ -63,7 +63,7 @@ def test_it_is_named_within_10_ticks_and_the_robot_lowered(happens: Any, kind: s
     assert AT < event.tick <= AT + 10
     assert words in event.text
     assert event.joint in (ROBOT.names if joint is ... else (joint,))
-    phases = [record.phase for record in records if record.tick > AT]
+    phases = [record.phase for record in records if record.tick >= AT]
     assert [phases[i] for i in np.flatnonzero(np.diff([list(Phase).index(p) for p in phases]))] == [
         Phase.RUNNING,
         Phase.LOWERING,

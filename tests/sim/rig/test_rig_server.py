@@ -158,6 +158,51 @@ def test_an_unused_rig_ends_by_itself(tmp_path: Path) -> None:
     process.stdout.close()
 
 
+_STARTED = """
+import sys, time
+from sim.rig.control import LockedClock, RigProcess
+rig = RigProcess(linger=float(sys.argv[1]))
+clock = LockedClock(rig.control)
+print(rig.process.pid, rig.port, rig._folder.name, flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_rig_whose_controller_was_killed_lives_on_and_then_leaves_nothing_behind() -> None:
+    """As long as somebody talks to its servos, and no longer: a guardian does for a moment."""
+    parent = subprocess.Popen([sys.executable, "-c", _STARTED, "2"], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pid, port, folder = parent.stdout.readline().split()
+    parent.kill()
+    parent.wait()
+    parent.stdout.close()
+    assert Path(folder).is_dir()
+    with serial.Serial(port, 2_000_000, timeout=1.0) as line:
+        answers, began = 0, time.monotonic()
+        while time.monotonic() < began + 8.0:  # four times as long as it would linger without
+            line.write(codec.ping(BOARD))
+            answers += len(line.read(14)) == 14  # on a busy machine it may take longer
+            time.sleep(0.5)
+        assert Path(f"/proc/{pid}").exists()
+        assert answers > 2
+    deadline = time.monotonic() + 30.0
+    while Path(f"/proc/{pid}").exists():
+        assert time.monotonic() < deadline, "the rig is an orphan"
+        time.sleep(0.1)
+    assert not Path(folder).exists()
+
+
+def test_a_rig_whose_controller_was_killed_before_it_had_begun_leaves_nothing_behind(tmp_path: Path) -> None:
+    folder = tmp_path / "rig"
+    folder.mkdir()
+    command = [sys.executable, "-m", "sim.rig.server", "--linger", "60", "--folder", str(folder)]
+    process = subprocess.Popen([*command, "--control", str(folder / "control")], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.wait(60) != 0
+    assert not folder.exists()
+
+
 def test_the_command_serves_a_linked_port_until_ctrl_c(tmp_path: Path) -> None:
     link = tmp_path / "rig"
     code = (
