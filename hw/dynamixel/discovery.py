@@ -8,16 +8,18 @@ from dataclasses import dataclass, field
 
 from hw.config import ConfigError
 from hw.dynamixel.bus import Bus, Ping
-from hw.dynamixel.codec import MAX_ID
+from hw.dynamixel.codec import MAX_ID, OVERHEAD
 from hw.dynamixel.survey import EEPROM_BYTES, RAM_BYTES
 from hw.dynamixel.tables import ControlTable, table
 from hw.hal import BackendError
 
 BAUDS = table("xm430-w350").bauds  # bit/s; the same for every model
 FACTORY_ID, FACTORY_BAUD = 1, 57600
+PATIENCE = 0.03  # s of margin for a bus on which nothing is known: adapters come with a latency timer of 16 ms
 BOOT_SECONDS = 1.0  # after the servos' power was switched on
 PING_ANSWER = 14  # bytes
 _ECHO = 14  # bytes at most of a request that some adapters hand back
+_LONGEST_ANSWER = OVERHEAD + RAM_BYTES  # bytes of anything that is asked here
 _BOARD_BYTES = 32  # up to its voltage
 _LONGEST_DELAY = 254 * 2e-6  # s that a servo may be set to wait before it answers
 
@@ -147,26 +149,26 @@ def assign(bus: Bus, device: Device, id: int, baud: int) -> Device:
 
 
 def _ask_all(bus: Bus, baud: int, found: Census) -> None:
-    before = bus.counters.bytes_in
+    before = _broken(bus)
     pings = bus.broadcast_ping()
     heard = {ping.id: ping for ping in pings}
     garbled = {id for id, times in Counter(ping.id for ping in pings).items() if times > 1}
-    if bus.counters.bytes_in - before > PING_ANSWER * len(pings) + _ECHO:
+    if _broken(bus) - before > PING_ANSWER * len(pings) + _ECHO:
         # Somebody cannot be heard among all the others: one at a time says who.
         for id in range(MAX_ID + 1):
-            before = bus.counters.bytes_in
+            before = _broken(bus)
             ping = bus.ping(id, tries=1)
             if ping is not None:
                 heard[id] = ping
-            elif bus.counters.bytes_in - before > _ECHO:
+            elif _broken(bus) - before > _ECHO:
                 garbled.add(id)
     for ping in sorted(heard.values()):
-        before = bus.counters.bytes_in
+        before = _broken(bus)
         device = _read(bus, ping, baud)
         found.devices.append(device)
         if device.memory:
             continue
-        if bus.counters.bytes_in - before > PING_ANSWER + 3 * _ECHO:
+        if _broken(bus) - before > 3 * _ECHO:
             garbled.add(ping.id)
         elif device.table is not None:
             found.problems.append(
@@ -189,6 +191,11 @@ def _read(bus: Bus, ping: Ping, baud: int) -> Device:
             break
         memory += status.data
     return Device(ping.id, baud, ping.model, ping.firmware, memory)
+
+
+def _broken(bus: Bus) -> int:
+    """Bytes that came in time, less those of whole packets that answered nothing: late ones are not garbled ones."""
+    return bus.counters.bytes_in - _LONGEST_ANSWER * bus.counters.unexpected
 
 
 def _model(bus: Bus, id: int) -> int | None:

@@ -64,11 +64,15 @@ def assembled(args: argparse.Namespace, report: Report) -> Robot:
 
 @contextmanager
 def open_line(
-    args: argparse.Namespace, robot: Robot, *, delivery: Delivery | None = None, seed: int = 0
+    args: argparse.Namespace, robot: Robot, *, patient: bool = True, delivery: Delivery | None = None, seed: int = 0
 ) -> Iterator[Line]:
-    """Open the port that the person named. `delivery` is of a virtual rig. Raises BackendError with the remedy."""
+    """Open the port that the person named, and be `patient` with it where nothing is known of its adapter yet.
+
+    `delivery` is of a virtual rig. Raises BackendError with the remedy.
+    """
     from hw.clock import WallClock
-    from hw.dynamixel.bus import Bus
+    from hw.dynamixel.bus import MARGIN, Bus
+    from hw.dynamixel.discovery import PATIENCE
     from hw.dynamixel.port import SerialPort
 
     with ExitStack() as stack:
@@ -86,4 +90,4 @@ def open_line(
             stack.callback(control.close)
         port = SerialPort(path, robot.bus.baud)
         stack.callback(port.close)
-        yield Line(Bus(port, clock), clock, control)
+        yield Line(Bus(port, clock, margin=PATIENCE if patient else MARGIN), clock, control)

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         robot = assembled(args, report)
-        with open_line(args, robot) as line:
+        with open_line(args, robot, patient=False) as line:
             watched = Watched(line, robot)
             live = sys.stdout.isatty() and not args.json
             with suppress(KeyboardInterrupt):  # the usual way to end it
