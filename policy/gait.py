@@ -33,8 +33,10 @@ class GaitSettings:
     arm_swing: float  # rad for each m/s forward
     sideways_gain: float  # soft legs drag their feet: how much longer than asked steps to the side are
     backward_gain: float  # and steps backward
-    backward_shift: float  # m that the feet trail for each m/s backward, so that the heels come free
+    backward_lean: float  # rad that the base leans further forward for each m/s backward, so that its heels come free
+    backward_shift: float  # m that the feet trail for each m/s backward
     max_velocity: tuple[float, float, float]  # forward, sideways, turning
+    max_backward: float  # m/s
     max_stride: float  # m/s forward that steps are made for: soft legs cannot follow longer ones
     acceleration: tuple[float, float, float]  # a second
     ankle_pitch_gain: float
@@ -59,7 +61,9 @@ class Gait:
         self._side = np.sign(self._inverse.hip[:, 1])  # 1 left, -1 right
         self._shift = np.where(self._side > 0, 0.0, 0.5)  # the right foot steps half a cycle later
         self._arm = [robot.names.index(name) for name in ("l_sho_pitch", "r_sho_pitch") if name in robot.names]
-        self._limit, self._slew = np.array(settings.max_velocity), np.array(settings.acceleration) * robot.dt
+        self.upper = np.array(settings.max_velocity)  # that can be asked, and the same to the other sides:
+        self.lower = -np.array([settings.max_backward, *settings.max_velocity[1:]])
+        self._slew = np.array(settings.acceleration) * robot.dt
         self._phase_step = robot.dt / settings.cycle
         self.phase = np.zeros(shape)
         self.velocity = np.zeros((*shape, 3))
@@ -76,7 +80,7 @@ class Gait:
 
     def command(self, velocity: Array) -> None:
         """Ask for `(..., 3)` m/s forward, m/s left, rad/s, clipped to the gait's limits."""
-        self.target = np.clip(velocity, -self._limit, self._limit)
+        self.target = np.clip(velocity, self.lower, self.upper)
 
     def advance(self) -> None:
         """Go on by one tick."""
@@ -135,7 +139,8 @@ class Gait:
         y = y0 + (vy + wz * x0) * period * travel
         y = y + (s.sway * activity * np.sin(2 * np.pi * phase))[..., None]  # away from the foot that steps
         z = self._inverse.hip[:, 2] - s.height + s.lift * lift
-        cos, sin = np.cos(s.lean), np.sin(s.lean)
+        lean = s.lean - s.backward_lean * backward
+        cos, sin = np.cos(lean), np.sin(lean)
         ankle = np.stack([cos * x - sin * z, y, sin * x + cos * z], -1)  # seen from the leaning base
         c, n, zero = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)
         rotation = np.stack(

@@ -11,12 +11,12 @@ from policy.tracker.observation import AHEAD, RESIDUAL, TrackerObservation
 
 
 class ExpertPolicy:
-    """Raises CheckpointError when the shipped tracker does not fit the robot."""
+    """Raises CheckpointError when the tracker of `checkpoint` does not fit the robot."""
 
-    def __init__(self, robot: Robot, task: Task, realtime: bool) -> None:
+    def __init__(self, robot: Robot, task: Task, realtime: bool, checkpoint: str = "expert") -> None:
         del task, realtime  # the tracker sees its reference alone, and answers within the tick
         self._gait, self._observation = Gait(robot, load_gait()), TrackerObservation(robot)
-        self._tracker, _ = Mlp.load(resolve("expert"), "tracker", robot, self._observation.size)
+        self._tracker, _ = Mlp.load(resolve(checkpoint), "tracker", robot, self._observation.size)
 
     def reset(self, seed: int) -> None:
         self._gait.reset()

@@ -1,54 +1,59 @@
-"""Policies by name, imported when they are asked for."""
+"""Policies by name, imported when they are asked for; or from a file of one's own."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 from hw.config import ConfigError, nearest
 from hw.hal import Policy, Task
 from hw.robot import Robot
 
+Maker = Callable[[str, Robot, Task, bool], Policy]
 
-def _diffusion(robot: Robot, task: Task, realtime: bool) -> Policy:
+
+def _diffusion(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
+    from policy.diffusion.settings import load_settings
     from stack.diffusion_policy import diffusion_policy
 
-    return diffusion_policy(robot, cost=task.cost, process=realtime)
+    if source.endswith(".safetensors"):
+        settings = replace(load_settings(), checkpoint=source)
+    else:
+        settings = load_settings(source)
+    return diffusion_policy(robot, settings, task.cost, process=realtime)
 
 
-def _expert(robot: Robot, task: Task, realtime: bool) -> Policy:
+def _expert(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     from stack.expert_policy import ExpertPolicy
 
-    policy: Policy = ExpertPolicy(robot, task=task, realtime=realtime)
+    policy: Policy = ExpertPolicy(robot, task=task, realtime=realtime, checkpoint=source)
     return policy
 
 
-def _gait(robot: Robot, task: Task, realtime: bool) -> Policy:
+def _gait(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     from stack.gait_policy import GaitPolicy
 
     policy: Policy = GaitPolicy(robot, task=task, realtime=realtime)
     return policy
 
 
-POLICIES: dict[str, Callable[[Robot, Task, bool], Policy]] = {
-    "diffusion": _diffusion,
-    "expert": _expert,
-    "gait": _gait,
-}
+POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "gait": _gait}
+_KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert}  # of checkpoints
 
 
 def check_policy(name: str) -> None:
-    """Raises ConfigError with the nearest name."""
-    if name not in POLICIES:
-        raise ConfigError(f"unknown policy '{name}': {nearest(name, POLICIES)}")
+    """Raises ConfigError, for an unknown name with the nearest one."""
+    _maker(name)
 
 
 def make_policy(name: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     """A policy for a robot and a task. Raises ConfigError for an unknown name, or for a checkpoint that does not fit.
 
-    With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is for.
+    `name` is one of POLICIES, the .safetensors file of a diffusion model or a tracker, or a .yaml file of diffusion
+    settings. With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is for.
     """
-    check_policy(name)
-    return POLICIES[name](robot, task, realtime)
+    return _maker(name)(name, robot, task, realtime)
 
 
 def policy_fingerprint(name: str) -> dict[str, str | None]:
@@ -57,10 +62,25 @@ def policy_fingerprint(name: str) -> dict[str, str | None]:
     from stack.provenance import sha256
 
     checkpoint = None
-    if name == "expert":
-        checkpoint = resolve("expert")
-    elif name == "diffusion":
+    if name == "expert" or name.endswith(".safetensors"):
+        checkpoint = resolve(name)
+    elif name != "gait":
         from policy.diffusion.settings import load_settings
 
-        checkpoint = resolve(load_settings().checkpoint)
+        checkpoint = resolve(load_settings(name).checkpoint)
     return {"name": name, "checkpoint_sha256": None if checkpoint is None else sha256(checkpoint)}
+
+
+def _maker(name: str) -> Maker:
+    if name in POLICIES:
+        return POLICIES[name]
+    if name.endswith((".yaml", ".yml")):
+        return _diffusion
+    if name.endswith(".safetensors"):
+        from policy.checkpoint import read_header
+
+        kind = str(read_header(Path(name))["kind"])
+        if kind not in _KINDS:
+            raise ConfigError(f"{name}: a checkpoint of kind '{kind}' is no policy; there are {', '.join(_KINDS)}")
+        return _KINDS[kind]
+    raise ConfigError(f"unknown policy '{name}': {nearest(name, POLICIES)}")

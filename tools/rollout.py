@@ -26,7 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one a core)")
     parser.add_argument("--backend", default="sim", help="sim or virtual (default: %(default)s)")
     parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
-    parser.add_argument("--policy", default="diffusion", help="diffusion, expert or gait (default: %(default)s)")
+    parser.add_argument(
+        "--policy", default="diffusion", help="diffusion (default), expert, gait, or a file as in `run`"
+    )
     parser.add_argument("--randomise", action="store_true", help="draw the robot anew for each episode")
     parser.add_argument("--seconds", type=float, help="instead of the task's own")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode's stream (default: %(default)s)")

@@ -41,7 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--backend", default="sim", help="body to run on: sim (default), virtual or dynamixel")
     parser.add_argument("--port", metavar="PATH", help="serial port of the robot (--backend dynamixel)")
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
-    parser.add_argument("--policy", default="diffusion", help="controller: diffusion (default), expert or gait")
+    parser.add_argument(
+        "--policy",
+        default="diffusion",
+        help="controller: diffusion (default), expert, gait, or a file: a checkpoint, or diffusion settings",
+    )
     parser.add_argument(
         "--randomise", action="store_true", help="draw the simulated robot's mass, friction, delays ..."
     )

@@ -19,7 +19,8 @@ ROBOT, SETTINGS = load_robot(), load_gait()
 LEGS = Legs(ROBOT)
 NOW = np.array([0])
 PHASES = np.linspace(0, 1, 48, endpoint=False)
-BOX = np.array(list(itertools.product(*((-limit, 0.0, limit) for limit in SETTINGS.max_velocity))))
+_GAIT = Gait(ROBOT, SETTINGS)
+BOX = np.array(list(itertools.product(*((low, 0.0, high) for low, high in zip(_GAIT.lower, _GAIT.upper, strict=True)))))
 
 
 def pose(phase: np.ndarray, velocity: np.ndarray, activity: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -30,7 +31,8 @@ def pose(phase: np.ndarray, velocity: np.ndarray, activity: float = 1.0) -> tupl
 def soles(phase: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     """Centres of the soles `(..., n_legs, 3)`, upright frame, without the sway that both share."""
     centre, _ = LEGS.soles(LEGS.pick(pose(phase, velocity)[0]))
-    c, s = np.cos(SETTINGS.lean), np.sin(SETTINGS.lean)
+    lean = SETTINGS.lean - SETTINGS.backward_lean * min(velocity[0], 0.0)
+    c, s = np.cos(lean), np.sin(lean)
     x, y, z = np.moveaxis(centre, -1, 0)
     return np.stack([c * x + s * z, y - SETTINGS.sway * np.sin(2 * np.pi * phase)[..., None], c * z - s * x], -1)
 

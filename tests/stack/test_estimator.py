@@ -13,7 +13,7 @@ from stack.attitude import rotate
 from stack.estimator import Estimator
 from stack.odometry import load_odometry
 from tools.train.fleet import Fleet
-from tools.train.odometry import drift
+from tools.train.odometry import drift, driver
 from tools.train.walker import Walker, load_tracker
 
 ROBOT = load_robot()
@@ -145,8 +145,7 @@ def test_standing_it_neither_moves_nor_sinks() -> None:
 # The correction was learned on the expert's walk, and most of what runs walks like it. The bare gait slips otherwise.
 @pytest.mark.parametrize(("policy", "share"), [("expert", 0.04), ("gait", 0.08)])
 def test_drift_of_twenty_walks_is_a_small_share_of_the_path(policy: str, share: float) -> None:
-    tracker = load_tracker(ROBOT) if policy == "expert" else None
-    result = drift(ROBOT, tracker, load_odometry(ROBOT), walks=20, seconds=30.0, seed=11)
+    result = drift(ROBOT, driver(ROBOT, policy), load_odometry(ROBOT), walks=20, seconds=30.0, seed=11)
     assert result.walks >= 15  # that stayed up and covered more than a metre
     assert result.p90 <= share
     assert result.yaw_p90 <= 0.1

@@ -220,7 +220,13 @@ def _ppo(env: Any) -> Any:
             "entropy_coef": 0.0,  # the noise follows a schedule
             "learning_rate": s.learning_rate,
             "schedule": "fixed",
-            "symmetry_cfg": {"data_augmentation_func": _with_mirrored, "use_data_augmentation": True},
+            # Mirrored samples alone teach an uneven policy little: they are far from what it would do, and clipped.
+            "symmetry_cfg": {
+                "data_augmentation_func": _with_mirrored,
+                "use_data_augmentation": True,
+                "use_mirror_loss": True,
+                "mirror_loss_coeff": s.mirror,
+            },
             "use_clipped_value_loss": False,  # its clip is absolute: with returns of tens the critic never gets there
         },
     }

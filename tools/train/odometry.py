@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import argparse
 import os
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hw.hal import Array
+
+if TYPE_CHECKING:
+    from tools.collect.recorder import Driver
+    from tools.train.fleet import Fleet
+
+    MakeDriver = Callable[[Fleet], Driver]
 
 _CHUNK = 50  # ticks whose mean error is penalised beside each tick's: the mean is what drifts
 _MEAN_WEIGHT = 20.0
@@ -18,7 +26,9 @@ _MEAN_WEIGHT = 20.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
-    parser.add_argument("--policy", default="expert", help="what walks beside the gait (default: expert)")
+    parser.add_argument(
+        "--policy", nargs="*", default=["expert", "diffusion"], metavar="NAME", help="what walks beside the gait"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/odometry.safetensors"), help="checkpoint to write")
     parser.add_argument("--worlds", type=int, default=192)
     parser.add_argument("--seconds", type=float, default=60.0, help="of walking a world (default: %(default)s)")
@@ -30,33 +40,35 @@ def main(args: argparse.Namespace) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # the worlds use the cores
     from hw.robot import load_robot
     from policy import checkpoint
-    from tools.train.walker import load_tracker
 
     robot = load_robot(args.robot)
-    tracker = None if args.policy == "gait" else load_tracker(robot, args.policy)
-    on_gait = args.worlds if tracker is None else args.worlds // 3
-    data = record(robot, None, on_gait, args.seconds, args.seed)
-    if tracker is not None:  # both ways of walking, and the tracker walking on the best odometry there is
-        known = _shipped(robot)
-        tracked = record(robot, tracker, args.worlds - on_gait, args.seconds, args.seed + 1, known)
-        data = mixed(data, tracked, args.seed)
+    names = ["gait", *(name for name in args.policy if name != "gait")]
+    drivers = {name: driver(robot, name) for name in names}
+    known = _shipped(robot)
+    data: dict[str, Array] | None = None
+    for i, name in enumerate(names):  # every way of walking slips in its own way
+        part = record(robot, drivers[name], args.worlds // len(names), args.seconds, args.seed + i, known)
+        data = part if data is None else mixed(data, part, args.seed)
+    assert data is not None
     network = fit(data, args.steps, args.seed)
-    before = drift(robot, tracker, None, walks=64, seconds=30.0, seed=args.seed + 1)
-    after = drift(robot, tracker, network, walks=64, seconds=30.0, seed=args.seed + 1)
-    baseline = drift(robot, None, network, walks=64, seconds=30.0, seed=args.seed + 1)
-    for name, result in (("legs alone", before), ("corrected", after), ("corrected, on the gait", baseline)):
-        print(
-            f"{name}: displacement error {100 * result.median:.1f} % of the path (median), "
-            f"{100 * result.p90:.1f} % (90th percentile), yaw drift {result.yaw_p90:.3f} rad a minute "
-            f"(90th percentile), {result.walks} walks"
-        )
+    results = {}
+    for name in names:
+        for title, odometry in (("legs alone", None), ("corrected", network)):
+            result = drift(robot, drivers[name], odometry, walks=64, seconds=30.0, seed=args.seed + 1)
+            key = f"drift_p90_{name}" + ("_legs_alone" if odometry is None else "")
+            results[key] = round(result.p90, 4)
+            print(
+                f"{name}, {title}: displacement error {100 * result.median:.1f} % of the path (median), "
+                f"{100 * result.p90:.1f} % (90th percentile), yaw drift {result.yaw_p90:.3f} rad a minute "
+                f"(90th percentile), {result.walks} walks"
+            )
     head = checkpoint.header(
         "odometry",
         robot,
         config={"hidden": [len(bias) for _, bias in network.layers[:-1]]},
-        data=f"{args.worlds} randomised worlds, {args.seconds:g} s of gait and {args.policy}, seed {args.seed}",
+        data=f"{args.worlds} randomised worlds, {args.seconds:g} s of {', '.join(names)}, seed {args.seed}",
         licence="Apache-2.0",
-        results={"drift_p90": round(after.p90, 4), "drift_p90_legs_alone": round(before.p90, 4)},
+        results=results,
     )
     args.out.parent.mkdir(parents=True, exist_ok=True)
     network.save(args.out, head)
@@ -75,21 +87,40 @@ def _shipped(robot: Any) -> Any:
         return None
 
 
+def driver(robot: Any, name: str) -> MakeDriver:
+    """What makes a fleet walk, by the policy's name or a checkpoint's file. Raises ConfigError."""
+    from policy.checkpoint import read_header, resolve
+    from tools.train.walker import Walker, load_tracker
+
+    if name == "gait":
+        return partial(Walker, tracker=None)
+    if read_header(resolve(name))["kind"] == "tracker":
+        return partial(Walker, tracker=load_tracker(robot, name))
+    from policy.diffusion.runtime import load_runtime
+    from policy.diffusion.settings import load_settings
+    from stack.tasks import load_task
+    from tools.train.planned import PlannedWalker
+
+    settings = replace(load_settings(), checkpoint=name)
+    return partial(PlannedWalker, runtime=load_runtime(robot, settings, load_task("walk", {}, robot.dt).cost))
+
+
 def mixed(a: dict[str, Array], b: dict[str, Array], seed: int) -> dict[str, Array]:
     """Worlds of two recordings in random order, so that those held out are of both."""
     order = np.random.default_rng(seed).permutation(len(a["rows"]) + len(b["rows"]))
     return {key: np.concatenate([a[key], b[key]])[order] for key in a}
 
 
-def record(robot: Any, tracker: Any, worlds: int, seconds: float, seed: int, odometry: Any = None) -> dict[str, Array]:
+def record(
+    robot: Any, drive: MakeDriver, worlds: int, seconds: float, seed: int, odometry: Any = None
+) -> dict[str, Array]:
     """Walk randomised worlds; returns rows `(n, ticks, features)`, starts `(n, ticks)` and errors `(n, ticks, 3)`."""
     from tqdm import trange
 
     from tools.train.fleet import Fleet
-    from tools.train.walker import Walker
 
     fleet = Fleet(robot, worlds, odometry, randomise=0.7, seed=seed + 1000)
-    walker = Walker(fleet, tracker)
+    walker = drive(fleet)
     ticks = round(seconds * robot.rate)
     rows = np.zeros((worlds, ticks, fleet.estimator.features.size), np.float32)
     errors = np.zeros((worlds, ticks, 3), np.float32)
@@ -185,7 +216,7 @@ class Drift:
 
 
 def drift(
-    robot: Any, tracker: Any, odometry: Any, *, walks: int, seconds: float, seed: int, randomise: float = 0.0
+    robot: Any, drive: MakeDriver, odometry: Any, *, walks: int, seconds: float, seed: int, randomise: float = 0.0
 ) -> Drift:
     """Walk with commands changed every 5 s and compare the estimate's end with the truth's.
 
@@ -194,10 +225,9 @@ def drift(
     """
     from policy.gait import load_gait
     from tools.train.fleet import Fleet
-    from tools.train.walker import Walker
 
     fleet = Fleet(robot, walks, odometry, randomise=randomise, seed=seed)
-    walker = Walker(fleet, tracker)
+    walker = drive(fleet)
     everything = np.ones(walks, bool)
     fleet.reset(everything)
     walker.reset(everything)

@@ -19,6 +19,7 @@ class ExpertSettings:
     horizon: int
     epochs: int
     mini_batches: int
+    mirror: float
     episode_seconds: float
     randomised: float
     push: float

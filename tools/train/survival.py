@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from hw.hal import Instruction
 from hw.robot import load_robot
 
 _CHANGE = 125  # ticks between commands
@@ -22,42 +20,27 @@ def closed_loop_survival(
     Returns `survival`, the share of worlds that never fell, and `velocity_error`, the mean planar error [m/s] of
     those, smoothed over a cycle, from 2 s after each command. Uses the settings of configs/policies/diffusion.yaml.
     """
-    from policy.diffusion.features import raw_row
     from policy.diffusion.runtime import load_runtime
     from policy.diffusion.settings import load_settings
     from stack.odometry import load_odometry
     from stack.tasks import load_task
     from tools.train.fleet import Fleet
+    from tools.train.planned import PlannedWalker
 
     robot, settings = load_robot(robot_name), replace(load_settings(), checkpoint=str(checkpoint))
     runtime = load_runtime(robot, settings, load_task("walk", {}, robot.dt).cost)
-    history, horizon = runtime.model.config.history, runtime.model.config.horizon
     fleet = Fleet(robot, worlds, load_odometry(robot), seed=seed)
-    everything = np.ones(worlds, bool)
+    walker, everything = PlannedWalker(fleet, runtime, seed), np.ones(worlds, bool)
     fleet.reset(everything)
-    states: deque[np.ndarray] = deque(maxlen=history)
-    applied: deque[np.ndarray] = deque(maxlen=history - 1)
+    walker.reset(everything)
     command = np.zeros((worlds, 3))
-    plan, made, waiting = np.repeat(fleet.applied[:, None], horizon, 1), 0, None
     alive, errors = everything.copy(), []
     smooth = np.zeros((worlds, 2))
     for tick in range(round(seconds * robot.rate)):
         if tick % _CHANGE == 25:
             command = np.array([rng.uniform([-0.1, -0.1, -0.8], [0.3, 0.1, 0.8]) for rng in fleet.rngs])
-        states.append(raw_row(fleet.observe()))
-        applied.append(fleet.applied.copy())
-        if waiting is not None and tick == waiting[0] + settings.delay:
-            plan, made, waiting = waiting[1], waiting[0], None
-        if tick % settings.replan == 0 and len(states) == history:
-            ahead = [plan[:, min(tick + i - made, horizon - 1)] for i in range(settings.delay)]
-            actions = np.stack([*applied, *ahead], 1)
-            seeds = [(seed + i, tick) for i in range(worlds)]
-            targets, _ = runtime.plan_batch(np.stack(list(states), 1), actions, Instruction(command), seeds)
-            if settings.delay:
-                waiting = (tick, targets)
-            else:
-                plan, made = targets, tick
-        fleet.step(plan[:, min(tick - made, horizon - 1)])
+        fleet.observe()
+        fleet.step(walker.act(command))
         alive &= ~fleet.truth.fallen
         smooth += robot.dt / 0.48 * (fleet.truth.velocity[:, :2] - smooth)
         if (tick - 25) % _CHANGE >= 100 and tick > 25:

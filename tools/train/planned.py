@@ -1,0 +1,75 @@
+"""A fleet driven by a diffusion model: all its robots are planned for as one batch, as the planner does for one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hw.hal import Array, Instruction
+from policy.diffusion.features import raw_row
+from tools.train.fleet import Fleet
+
+if TYPE_CHECKING:
+    from policy.diffusion.runtime import Runtime
+
+
+class PlannedWalker:
+    """Joint targets `(n, n_joints)` for a fleet under velocity commands, like `tools.train.walker.Walker`.
+
+    Plans are requested for all robots at the same ticks. A robot that is reset in between holds its pose until the next
+    plan, and stood still in the past that this plan sees.
+    """
+
+    def __init__(self, fleet: Fleet, runtime: Runtime, seed: int = 0) -> None:
+        self.fleet, self._runtime, self._seed = fleet, runtime, seed
+        config = runtime.model.config
+        self._history, self._horizon = config.history, config.horizon
+        self._tick = 0
+        self._states: Array | None = None  # (n, history, raw size), newest last
+        self._applied = np.repeat(fleet.applied[:, None], self._history - 1, 1)
+        self._plan, self._made = np.repeat(fleet.applied[:, None], self._horizon, 1), 0
+        self._waiting: Array | None = None  # the plans that are not adopted yet
+        self._requested = 0
+        self._fresh = np.ones(fleet.n, bool)
+
+    def reset(self, where: Array) -> None:
+        """New episodes in the worlds `where`."""
+        self._fresh = self._fresh | where
+
+    def act(self, command: Array) -> Array:
+        """Targets for the present state of the fleet under `command` `(n, 3)`."""
+        settings, tick = self._runtime.settings, self._tick
+        self._observe()
+        if self._waiting is not None and tick == self._requested + settings.delay:
+            self._plan, self._made, self._waiting = self._waiting, self._requested, None
+        if tick % settings.replan == 0 and self._states is not None:
+            ahead = np.stack([self._action(tick + i) for i in range(settings.delay)], 1) if settings.delay else None
+            actions = self._applied if ahead is None else np.concatenate([self._applied, ahead], 1)
+            seeds = [(self._seed + i, tick) for i in range(self.fleet.n)]
+            plan, _ = self._runtime.plan_batch(self._states, actions, Instruction(command), seeds)
+            self._requested = tick
+            if settings.delay:
+                self._waiting = plan
+            else:
+                self._plan, self._made = plan, tick
+        self._tick += 1
+        return self._action(tick)
+
+    def _observe(self) -> None:
+        """Take in the state, and what was applied at the tick before."""
+        row, applied = raw_row(self.fleet.state), self.fleet.applied
+        if self._states is None:
+            self._states = np.repeat(row[:, None], self._history, 1)
+        self._states = np.concatenate([self._states[:, 1:], row[:, None]], 1)
+        self._applied = np.concatenate([self._applied[:, 1:], applied[:, None]], 1)
+        if (fresh := self._fresh).any():
+            self._states[fresh], self._applied[fresh] = row[fresh, None], applied[fresh, None]
+            self._plan = self._plan.copy()
+            self._plan[fresh] = applied[fresh, None]
+            if self._waiting is not None:
+                self._waiting[fresh] = applied[fresh, None]
+            self._fresh = np.zeros_like(fresh)
+
+    def _action(self, tick: int) -> Array:
+        return self._plan[:, min(tick - self._made, self._horizon - 1)]
