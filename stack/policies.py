@@ -17,10 +17,8 @@ def _diffusion(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     from policy.diffusion.settings import load_settings
     from stack.diffusion_policy import diffusion_policy
 
-    if source.endswith(".safetensors"):
-        settings = replace(load_settings(), checkpoint=source)
-    else:
-        settings = load_settings(source)
+    trained = source.endswith(".safetensors")
+    settings = replace(load_settings(), checkpoint=source) if trained else load_settings(source)
     return diffusion_policy(robot, settings, task.cost, process=realtime)
 
 
