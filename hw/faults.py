@@ -19,9 +19,10 @@ STOP_BUTTON_AGAIN = 1 << 12  # let go and pressed once more
 IMU_SILENT = 1 << 13
 IMU_DEAD = 1 << 14
 IMU_FROZEN = 1 << 15
+LATE = 1 << 16
 
 IMU = IMU_SILENT | IMU_DEAD | IMU_FROZEN  # why there is no valid sample of it now
-ROBOT = STOP_BUTTON | STOP_BUTTON_AGAIN | IMU
+ROBOT = STOP_BUTTON | STOP_BUTTON_AGAIN | IMU | LATE
 
 NAMES = {
     0: "input voltage",
@@ -37,6 +38,7 @@ NAMES = {
     13: "it sends nothing",
     14: "it measures nothing",
     15: "its values stand still",
+    16: "answers that come late",
 }
 
 _REMEDIES = {

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hw.faults import IMU, INPUT_VOLTAGE, ROBOT, STOP_BUTTON, STOP_BUTTON_AGAIN, describe, remedy
+from hw.faults import IMU, INPUT_VOLTAGE, LATE, ROBOT, STOP_BUTTON, STOP_BUTTON_AGAIN, describe, remedy
 from hw.hal import Array, Observation, State
 from hw.robot import Robot
 from stack.coast import complete
@@ -58,7 +58,8 @@ class Health:
         found = [*self._samples(observation, state), *self._servos(observation)]
         if state is not None and upright and (tilt := tilt_of(observation, state)) > self._limits.tilt:
             found.append(Finding("now", "fall", f"tilted by {math.degrees(tilt):.0f} degrees"))
-        found += [*self._buttons(observation), *self._heat(observation), *self._voltage(observation)]
+        found += [*self._bus(observation), *self._buttons(observation)]
+        found += [*self._heat(observation), *self._voltage(observation)]
         found += self._load(observation, applied)
         return sorted(found, key=lambda finding: ("now", "lowered", "").index(finding.ends))
 
@@ -67,6 +68,9 @@ class Health:
         oldest = stale * self._robot.dt + 1e-9
         joints = np.isfinite(observation.position) & np.isfinite(observation.velocity) & (observation.age <= oldest)
         if not joints.all():
+            if not joints.any():
+                text = f"no fresh sample from any joint for {stale} ticks: check the adapter, its cable and the supply"
+                return [Finding("now", "stale", text)]
             name = self._names[int(np.flatnonzero(~joints)[0])]
             return [Finding("now", "stale", f"no fresh sample from {name} for {stale} ticks: check its cable", name)]
         tilt = tilt_of(observation, state)
@@ -96,6 +100,13 @@ class Health:
         if pressed & STOP_BUTTON:
             return [Finding("lowered", "button", "the stop button was pressed: lowering; once more to damp at once")]
         return []
+
+    def _bus(self, observation: Observation) -> list[Finding]:
+        """An adapter that gathers bytes for longer than the bus waits: some ticks have their samples, by luck."""
+        if not int(np.bitwise_or.reduce(observation.fault)) & LATE:
+            return []
+        text = "answers come too late: set the adapter's latency timer to 1 ms (`servoid doctor` tells how)"
+        return [Finding("lowered", "late", text)]
 
     def _heat(self, observation: Observation) -> list[Finding]:
         limits = self._limits

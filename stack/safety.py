@@ -38,7 +38,7 @@ from stack.limits import limit
 
 PATIENCE = 3  # targets in a row that may be not finite
 LOWER_SECONDS = 1.5
-DAMP_SECONDS = 0.5  # braked before torque goes off, so that the robot settles instead of dropping
+DAMP_SECONDS = 0.4  # braked before torque goes off, so that the robot settles instead of dropping; off within 0.5
 HOME_TOLERANCE = 0.35  # rad that a joint may be from home after homing: above any sag under the robot's own weight
 MIN_JERK_PEAK = 1.875  # peak over mean speed of a minimum-jerk motion (Flash and Hogan, 1985)
 

@@ -40,8 +40,8 @@ class Request:
         self._last = OVERHEAD + self.lengths[-1]  # bytes of the last status
 
     def looks_whole(self, stream: bytes) -> bool:
-        """Whether an answer has come to its end, as far as a glance can tell: nothing more is on its way, though what came
-        may be damaged."""
+        """Whether an answer has come to its end, as far as a glance can tell: nothing more is on its way, though what
+        came may be damaged."""
         if len(stream) != self.answer:
             return False
         if self.fast:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from hw.dynamixel.bus import Bus
@@ -11,11 +13,13 @@ from hw.dynamixel.survey import Found
 from hw.dynamixel.tables import table
 from hw.dynamixel.units import Units
 from hw.dynamixel.watch import Watch
+from hw.faults import LATE
 from hw.hal import Observation
 from hw.imu.mounting import Mounting
 from hw.imu.serial_imu import SerialImu
 from hw.robot import Robot
 
+LATE_TICKS, LATE_SPAN = 4, 8  # of so many ticks, answers came late in so many: that is no accident
 _PRESENT = np.dtype([("current", "<i2"), ("velocity", "<i4"), ("position", "<i4")])
 
 
@@ -36,10 +40,12 @@ class DynamixelSensors:
         self._block = BoardImu(table("opencr"), Mounting(robot.imu.signs, robot.imu.mounting))
         self._board = GroupRead([(robot.bus.board_id, self._block.address, self._block.length)])
         self._stop = sum({BUTTONS[name] for name in robot.bus.stop_buttons})
+        self._late: deque[bool] = deque(maxlen=LATE_SPAN)
 
     def read(self) -> Observation:
         """All joints, the IMU, and a few servos' slow registers. A value that did not come at this tick is NaN."""
         bus, group = self._bus, self._present
+        lost, stray = bus.counters.lost, bus.counters.stray
         bus.read_groups((group, self._board))
         position, velocity, current = self._decode()
         fresh = self._board.fresh[0]
@@ -48,6 +54,8 @@ class DynamixelSensors:
             reading = self._imu.read()
         self._watch.press(self._block.buttons & self._stop != 0)
         self._watch.look(group.alert, hurry=not all(group.fresh))
+        self._late.append(bus.counters.lost > lost and bus.counters.stray > stray)
+        late = LATE if sum(self._late) >= LATE_TICKS else 0
         now = bus.clock.now_ns()
         return Observation(
             time_ns=now,
@@ -57,7 +65,7 @@ class DynamixelSensors:
             temperature=self._watch.temperature.copy(),
             voltage=self._watch.voltage.copy(),
             age=np.array([_age(now, time) for time in group.time_ns]),
-            fault=self._watch.fault | reading.fault,
+            fault=self._watch.fault | reading.fault | late,
             orientation=reading.orientation,
             angular_velocity=reading.angular_velocity,
             specific_force=reading.specific_force,

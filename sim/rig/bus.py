@@ -129,7 +129,7 @@ class Bus:
             fault = self.dice.strikes(STATUS_KINDS, id, now_ns)
             if fault is not None:
                 answers = [self.dice.misspeak(fault, status) for status in answers]
-            block = _together([_block(status, crc) for status in answers])
+            block = _together([_block(status, crc, length) for status in answers])
             crc = crc16(block, crc)
             block, head = head + block, b""
             if self.dice.strikes(("garbage",), id, now_ns) is not None:
@@ -174,9 +174,9 @@ def _frame(status: Status) -> bytes:
     return codec.status(status.id, _error(status), status.data)
 
 
-def _block(status: Status, crc: int) -> bytes:
-    """What a servo adds to a fast frame whose bytes so far have checksum `crc`."""
-    body = bytes([_error(status), status.id]) + status.data
+def _block(status: Status, crc: int, length: int) -> bytes:
+    """What a servo adds to a fast frame whose bytes so far have checksum `crc`, of which each has its place."""
+    body = bytes([_error(status), status.id]) + status.data.ljust(length, b"\0")
     return body + crc16(body, crc).to_bytes(2, "little")
 
 

@@ -45,12 +45,13 @@ class Outcome(Enum):
 EXPECTED: dict[str, Outcome] = {
     **dict.fromkeys(STATUS_KINDS, Outcome.ABSORBED),
     **dict.fromkeys(("stuffed", "garbage", "echo", "split"), Outcome.ABSORBED),
-    **dict.fromkeys(("batching", "voltage", "encoder", "clock_step", "button", "heat"), Outcome.NAMED),
-    **dict.fromkeys(("reboot", "overheating", "shock", "overload", "torque_off", "watchdog"), Outcome.FATAL),
+    **dict.fromkeys(("voltage", "button", "heat"), Outcome.NAMED),
+    **dict.fromkeys(("reboot", "overheating", "encoder", "shock", "overload", "torque_off"), Outcome.FATAL),
+    **dict.fromkeys(("batching", "watchdog", "clock_step"), Outcome.FATAL),
     **dict.fromkeys(("id_conflict", "dead", "baud_mismatch", "babble", "imu_dead", "imu_frozen"), Outcome.FATAL),
     **dict.fromkeys(("vanish", "vanish_in_read", "stall", "brown_out"), Outcome.FATAL),
 }
-_NEEDS_SERVO = (*ALERTS, "reboot", "torque_off", "id_conflict", "dead", "baud_mismatch", "watchdog", "heat")
+NEEDS_SERVO = (*ALERTS, "reboot", "torque_off", "id_conflict", "dead", "baud_mismatch", "watchdog", "heat")
 # s of lateness, V at the servos, s of the step, s of the adapter's batch, error number, bits of the buttons, C
 _VALUES = {
     "late": 0.003, "brown_out": 5.5, "clock_step": 0.5, "batching": 0.016, "error_status": 1.0, "button": 1.0,
@@ -82,7 +83,7 @@ class Fault:
             raise ValueError(f"probability {self.probability} is not within 0 and 1")
         if self.at < 0 or (self.until is not None and self.until <= self.at):
             raise ValueError(f"fault {self.kind}: from {self.at} to {self.until} s is no span of time")
-        if self.kind in _NEEDS_SERVO and self.servo is None:
+        if self.kind in NEEDS_SERVO and self.servo is None:
             raise ValueError(f"fault {self.kind} needs a servo: its ID or its joint")
 
     @property
@@ -194,7 +195,7 @@ class Dice:
         if fault.kind == "wrong_id":
             return status._replace(id=(status.id + 1) % codec.MAX_ID)
         if fault.kind == "error_status":
-            return status._replace(error=int(fault.amount))
+            return status._replace(error=int(fault.amount), data=b"")
         return status
 
     def spoil(self, fault: Fault, frame: bytes) -> list[Chunk]:

@@ -24,6 +24,7 @@ from sim.rig.faults import ALERTS, Dice, Fault, Scenario
 from sim.rig.motors import STEP_NS, Motors
 from sim.rig.plant import Plant
 from sim.rig.servo import VirtualServo
+from sim.rig.spare import Spare
 from sim.rig.wire import Wire
 
 BROWN_OUT, BOARD_BROWN_OUT = 6.0, 4.5  # V below which a servo and the board lose power
@@ -179,13 +180,14 @@ class Rig:
                 self._switch(True)
 
     def _deliver(self) -> Iterator[bytes]:
-        data = self.wire.take_delivery(self.now_ns)
+        data, fresh = b"", self.wire.take_delivery(self.now_ns)
         while self._held_back and self._held_back[0][0] <= self.now_ns:
-            data = self._held_back.pop(0)[1] + data
-        if len(data) > 1 and self.dice.strikes(("split",), 0, self.now_ns) is not None:
-            middle = len(data) // 2
-            self._held_back.append((self.now_ns + 1_000_000, data[middle:]))
-            data = data[:middle]
+            data += self._held_back.pop(0)[1]
+        if len(fresh) > 1 and self.dice.strikes(("split",), 0, self.now_ns) is not None:
+            middle = len(fresh) // 2
+            self._held_back.append((self.now_ns + 1_000_000, fresh[middle:]))
+            fresh = fresh[:middle]
+        data += fresh
         if self._cut and data:
             data, self.port_open = data[: len(data) // 2], False
         if not self.stalled:
@@ -248,10 +250,11 @@ class Rig:
         elif kind == "baud_mismatch":
             other = next(c for c, baud in enumerate(servo.table.bauds) if baud != self.robot.bus.baud and baud >= 57600)
             servo.put("baud_rate", other if begins else servo.table.bauds.index(self.robot.bus.baud))
-        elif kind == "id_conflict":  # a neighbour answers to this servo's ID, as one from the spares box would
-            neighbour = (i + 1) % len(self.servos)
-            joint = self.robot.joints[i if begins else neighbour]
-            self.servos[neighbour].put("id", joint.id)
+        elif kind == "id_conflict":
+            self.bus.devices = [device for device in self.bus.devices if not isinstance(device, Spare)]
+            if begins:
+                eeprom = {name: servo.get(name) for name in ("id", "baud_rate", "return_delay_time")}
+                self.bus.devices.append(Spare(servo.table.number, eeprom))
         elif begins and kind == "heat":
             firmware.winding[i] = firmware.case[i] = fault.amount
         elif begins and kind == "reboot":

@@ -9,7 +9,7 @@ import pytest
 
 from hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
 from hw.dynamixel.motors import DynamixelMotors
-from hw.faults import TORQUE_LOST, WATCHDOG
+from hw.faults import LATE, TORQUE_LOST, WATCHDOG
 from hw.hal import Command, Mode, Observation
 from hw.robot import load_robot
 from sim.rig.faults import Fault
@@ -140,6 +140,16 @@ def test_an_imu_that_dies_is_seen_by_its_age(standing: Standing) -> None:
     o = standing.run(8)[-1]
     assert o.imu_age > STALE
     assert np.isnan(o.specific_force).all()
+
+
+@pytest.mark.parametrize("phase", range(0, 16, 3))
+def test_an_adapter_that_gathers_bytes_is_named_or_its_samples_are_old(standing: Standing, phase: int) -> None:
+    """At 16 ms some ticks have their samples by luck, so that no joint alone is ever old for long."""
+    standing.line.sleep_until(standing.line.now_ns() + phase * 1_000_000)
+    standing.rig.inject(Fault(kind="batching", at=standing.rig.seconds))
+    seen = standing.run(10)
+    assert any((o.fault & LATE).all() or o.age.max() > STALE or o.imu_age > STALE for o in seen)
+    assert not (seen[0].fault & LATE).any(), "one late answer is an accident"
 
 
 def test_a_host_that_stops_is_stopped_by_the_watchdog(standing: Standing) -> None:
