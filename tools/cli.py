@@ -32,6 +32,18 @@ VERBS: dict[str, Verb] = {
     "run": Verb("run a task on a robot", "tools.run"),
     "rollout": Verb("run a task many times in simulation and measure it", "tools.rollout"),
     "virtual": Verb("serve a virtual rig on a serial port", "tools.virtual"),
+    "bringup": Verb(
+        "bring hardware up, step by step",
+        verbs={
+            "find-port": Verb("find the robot's serial port", "tools.bringup.find_port"),
+            "scan": Verb("ask who is on the bus", "tools.bringup.scan"),
+            "setup": Verb("give a servo its ID and baud", "tools.bringup.setup"),
+            "check": Verb("compare every servo with the robot's file", "tools.bringup.check"),
+            "calibrate": Verb("measure zeros and directions, moved by hand", "tools.bringup.calibrate"),
+            "jog": Verb("move one joint, slowly and a little", "tools.bringup.jog"),
+            "watch": Verb("watch temperatures, voltages, loads and the bus", "tools.bringup.watch"),
+        },
+    ),
     "collect": Verb("record demonstrations of the expert as a dataset", "tools.collect"),
     "train": Verb(
         "train a network",
@@ -42,13 +54,17 @@ VERBS: dict[str, Verb] = {
         },
     ),
     "bench": Verb(
-        "measure speed on this machine",
+        "measure speed and what faults do, on this machine",
         verbs={
             "sim": Verb("batched simulation against the raw engine", "tools.bench.sim"),
             "policy": Verb("planning time", "tools.bench.policy"),
             "loop": Verb("lateness of the control loop", "tools.bench.loop"),
             "kill": Verb("what becomes of the servos when the controller is killed", "tools.bench.kill"),
             "interrupt": Verb("whether torque is off after Ctrl-C at any instant", "tools.bench.interrupt"),
+            "bus": Verb("time of a control cycle on the servo bus", "tools.bench.bus"),
+            "faults": Verb("what faults of the rig do to a walking robot", "tools.bench.faults"),
+            "soak": Verb("long walk over a line that loses packets", "tools.bench.soak"),
+            "fuzz": Verb("random bytes into everything that reads bytes", "tools.bench.fuzz"),
         },
     ),
     "replay": Verb("repeat a recorded run and compare", "tools.replay"),
