@@ -1,0 +1,185 @@
+"""`servoid bringup calibrate`: it finds how a rig was assembled, and refuses what a person got wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from hw.calibration import calibrated, calibration_path, load_calibration
+from hw.config import ConfigError
+from hw.hal import Array, BackendError
+from hw.robot import load_robot
+from sim.model import build
+from sim.rig.control import LockedClock, RigProcess
+from sim.rig.delivery import Delivery
+from tools.bringup.calibrate import MOVED, check_range, turned
+from tools.bringup.encoders import Encoders
+from tools.bringup.turning import describe_turns
+
+ROBOT = load_robot()
+TICK = math.tau / 4096
+
+
+def test_it_finds_the_assembly_of_a_rig_on_a_serial_port_and_check_then_uses_it(
+    bringup: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A rig whose horns sit off and whose servos are partly the other way round, as a person builds one."""
+    delivery = Delivery(assembly="random")
+    truth = delivery.assembled(ROBOT, 5)
+    with RigProcess(ROBOT, seed=5, delivery=delivery, linger=120.0) as rig:
+        link = Path(str(rig.control_path)).with_name("rig")
+        link.symlink_to(rig.port)
+        link.with_name("rig.control").symlink_to(rig.control_path)
+        # In the rig's time, so that a busy machine does not matter.
+        monkeypatch.setattr("hw.clock.WallClock", lambda: LockedClock(rig.control))
+        code, answer, err = bringup("calibrate", "--port", str(link), "--yes")
+        assert code == 0, err
+        found = calibrated(ROBOT)[0]
+        assert answer["path"] == str(calibration_path(ROBOT))
+        for joint, true in zip(found.joints, truth.joints, strict=True):
+            assert joint.direction == true.direction, joint.name
+            assert joint.zero == pytest.approx(true.zero, abs=3 * TICK), joint.name
+        assert {joint.direction for joint in truth.joints} == {1, -1}, "a test of one direction would be none"
+        assert "the other way round" in err
+
+        code, answer, err = bringup("check", "--port", str(link), "--fix")
+        assert code == 0, err
+        assert "calibrated on 20" in err
+        limits = {(d["joint"], d["register"]): d["wanted"] for d in answer["differences"]}
+        head = found.joints[0]
+        ends = sorted(2048 + head.direction * (end - head.zero) / TICK for end in head.range)
+        assert limits["head_pan", "min_position_limit"] == math.floor(ends[0])
+        assert limits["head_pan", "max_position_limit"] == math.ceil(ends[1])
+
+        before = load_calibration(calibration_path(ROBOT)).joints
+        code, answer, _ = bringup("calibrate", "--port", str(link), "--joint", "l_knee", "--pose", "home", "--yes")
+        assert code == 0
+        after = load_calibration(calibration_path(ROBOT)).joints
+        assert {name for name in after if after[name] != before[name]} <= {"l_knee"}
+        assert after["l_knee"].zero == pytest.approx(before["l_knee"].zero, abs=3 * TICK)
+
+
+def test_torque_and_registers_that_bend_angles_are_refused(rig: RigProcess, bringup: Any) -> None:
+    from test_bringup_scan import write
+
+    write(rig, 14, torque_enable=1)
+    code, answer, _ = bringup("calibrate", "--port", "virtual")
+    assert code == 3
+    assert "l_knee has torque on" in answer["error"]
+    write(rig, 14, torque_enable=0)
+    write(rig, 14, drive_mode=1)
+    code, answer, _ = bringup("calibrate", "--port", "virtual")
+    assert code == 3
+    assert "l_knee has a drive_mode that is not 0" in answer["error"]
+
+
+def test_on_a_virtual_rig_of_its_own_nothing_is_kept(rig: RigProcess, bringup: Any, configuration: Path) -> None:
+    """Or practising would replace the calibration of the real robot."""
+    code, answer, err = bringup("calibrate", "--port", "virtual", "--keep-directions")
+    assert code == 0, err
+    assert answer["path"] is None
+    assert not list(configuration.rglob("*.yaml"))
+    assert all(abs(joint["zero"]) < 3 * TICK for joint in answer["joints"].values())
+
+
+def test_mistakes_on_the_command_line(bringup: Any) -> None:
+    code, answer, _ = bringup("calibrate", "--port", "virtual", "--joint", "l_kneee")
+    assert (code, "did you mean 'l_knee'" in answer["error"]) == (2, True)
+
+
+# What a person does --------------------------------------------------------------------------------------------------
+
+
+class ByHand(Encoders):
+    """Servo angles that a function of the sample's number gives."""
+
+    def __init__(self, angles: Callable[[int], Array]) -> None:
+        self.names, self._angles, self._count = ROBOT.names, angles, 0
+        self._clock = self  # type: ignore[assignment]
+
+    def now_ns(self) -> int:
+        return self._count * 30_000_000
+
+    def read(self) -> Array:
+        self._count += 1
+        return (self._angles(self._count) + np.pi) % (2 * np.pi) - np.pi
+
+
+def moving(**rates: float) -> Callable[[int], Array]:
+    """Joints that turn by so much in half a second and then hold, from just before the servo's seam."""
+    by = np.array([rates.get(name, 0.0) for name in ROBOT.names])
+    return lambda count: np.full(20, np.pi - 0.01) + by * min(count / 15, 1.0)
+
+
+KNEE = ROBOT.names.index("l_knee")
+START = np.full(20, np.pi - 0.01)
+
+
+@pytest.mark.parametrize("by", [0.4, -0.4])
+def test_a_turn_is_seen_across_the_seam_and_with_other_joints_hanging_loose(by: float) -> None:
+    """0.01 rad before the 4095/0 seam: taken as it reads, the joint would have turned by almost a whole turn."""
+    assert turned(ByHand(moving(l_knee=by, l_ank_pitch=0.5)), START, KNEE, ROBOT) == pytest.approx(by, abs=0.01)
+
+
+def test_another_joint_than_asked_is_named_with_both_ids() -> None:
+    with pytest.raises(BackendError, match=r"r_knee \(ID 13\) turned, not l_knee \(ID 14\)") as error:
+        turned(ByHand(moving(r_knee=0.5)), START, KNEE, ROBOT)
+    assert "servoid bringup setup" in str(error.value)
+
+
+def test_a_joint_that_nobody_turns_is_an_error_and_not_a_wait_for_ever() -> None:
+    with pytest.raises(BackendError, match="l_knee was not turned within"):
+        turned(ByHand(moving(l_knee=MOVED / 2)), START, KNEE, ROBOT)
+
+
+def test_a_pose_that_is_not_held_still_is_refused_by_name() -> None:
+    swinging = ByHand(lambda count: np.eye(20)[KNEE] * 0.1 * math.sin(count))
+    with pytest.raises(BackendError, match=r"l_knee still moves by 0\.2"):
+        swinging.still(2.0)
+
+
+def test_a_joint_beyond_its_range_is_refused_by_name() -> None:
+    check_range(ROBOT, KNEE, 2.2)
+    with pytest.raises(BackendError, match=r"l_knee would be at 2\.50 rad now, beyond its range"):
+        check_range(ROBOT, KNEE, 2.5)
+
+
+def test_the_reference_pose_must_be_within_every_range() -> None:
+    from dataclasses import replace
+
+    from tools.bringup.calibrate import _reference
+
+    bent = replace(ROBOT, joints=(replace(ROBOT.joints[0], range=(0.2, 1.0)), *ROBOT.joints[1:]))
+    with pytest.raises(ConfigError, match="head_pan cannot be at 0: give --pose home"):
+        _reference("zero", bent)
+
+
+def test_the_words_for_a_turn_are_what_physics_does() -> None:
+    """A person who turns a knee the wrong way because the text is wrong calibrates a robot that kicks."""
+    model = build(ROBOT)
+    data = mujoco.MjData(model)
+    words = {"forward": (0, 1), "backward": (0, -1), "left": (1, 1), "right": (1, -1), "up": (2, 1), "down": (2, -1)}
+    texts = describe_turns(ROBOT, np.zeros(20), np.ones(20))
+    said = 0
+    for name, text in zip(ROBOT.names, texts, strict=True):
+        if not text.startswith("what it carries goes "):
+            continue
+        said += 1
+        body = model.joint(name).bodyid[0]
+        places = []
+        for angle in (0.0, 0.05):
+            data.qpos[:] = model.qpos0
+            data.joint(name).qpos = angle
+            mujoco.mj_forward(model, data)
+            places.append(data.subtree_com[body] - data.body(ROBOT.base).xpos)
+        axis, sign = words[text.split()[4]]
+        moved = places[1] - places[0]
+        assert int(np.abs(moved).argmax()) == axis, text
+        assert np.sign(moved[axis]) == sign, text
+    assert said >= 12

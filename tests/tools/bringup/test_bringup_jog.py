@@ -1,0 +1,235 @@
+"""`servoid bringup jog` and `watch`: what reaches a servo is judged by the goals that the rig accepted."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hw.robot import load_robot
+from sim.rig.control import RigProcess
+from tools.bringup.jogging import IDLE_SECONDS, KEY_SECONDS, SPAN, SPEED, There, Wish, reach, restrict
+from tools.cli import main
+
+ROBOT = load_robot()
+KNEE = ROBOT.names.index("l_knee")
+VIRTUAL = ("--port", "virtual")
+TICK = 2 * np.pi / 4096
+
+
+def goals(rig: RigProcess) -> np.ndarray:
+    """Accepted goals of the joints `(n_joints, ticks)` rad, each as often as it was written."""
+    accepted = [entry for entry in rig.control.accepted() if entry["register"] == "goal_position"]
+    by_joint = [[entry["position"] for entry in accepted if entry["joint"] == i] for i in range(20)]
+    return np.array([joint[: min(map(len, by_joint))] for joint in by_joint])
+
+
+def torque(rig: RigProcess) -> int:
+    return sum(servo["torque"] for servo in rig.control.servos())
+
+
+def test_one_joint_moves_slowly_and_comes_back_and_all_others_stay(rig: RigProcess, bringup: Any) -> None:
+    code, answer, err = bringup("jog", "l_knee", "--by", "0.2", *VIRTUAL, "--start")
+    assert code == 0, err
+    assert answer["cause"] == "task"
+    assert answer["highest"] - answer["start"] == pytest.approx(0.2, abs=0.05)
+    assert answer["others_moved"] < 0.02
+    sent = goals(rig)
+    assert sent.shape[1] > 100
+    assert np.ptp(np.delete(sent, KNEE, axis=0), axis=1).max() <= TICK * 1.01, "another joint was sent somewhere else"
+    assert np.ptp(sent[KNEE]) == pytest.approx(0.2, abs=0.01)
+    assert sent[KNEE][-1] == pytest.approx(sent[KNEE][0], abs=0.01)
+    assert np.abs(np.diff(sent[KNEE])).max() <= SPEED * ROBOT.dt + 1.01 * TICK
+    assert torque(rig) == 0
+
+
+def test_what_will_happen_is_told_before_anything_moves(
+    rig: RigProcess, bringup: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Any
+) -> None:
+    (tmp_path / "nobody").write_text("")
+    with (tmp_path / "nobody").open() as nobody:
+        monkeypatch.setattr("sys.stdin", nobody)
+        code, answer, err = bringup("jog", "l_knee", "--by", "0.2", *VIRTUAL)
+    assert code == 2
+    assert "Torque will come on at all 20 joints" in err
+    assert "give --start" in answer["error"]
+    assert rig.control.accepted() == [], "nobody pressed Enter"
+
+
+def test_a_servo_that_reports_an_error_ends_it(rig: RigProcess, bringup: Any) -> None:
+    rig.control.inject("overload", servo="l_knee", at=1.5)
+    code, answer, err = bringup("jog", "l_knee", "--by", "0.3", *VIRTUAL, "--start")
+    assert code == 4
+    assert "l_knee" in err
+    assert "overload" in err
+    assert torque(rig) == 0
+    assert answer["cause"] != "task"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("l_kneee", "--by", "0.1"), "did you mean 'l_knee'"),
+        (("l_knee", "--by", "0.5"), "up to 0.35 rad"),
+        (("l_knee", "--by", "0"), "it is not 0"),
+    ],
+)
+def test_wrong_words(bringup: Any, words: tuple[str, ...], said: str) -> None:
+    code, answer, _ = bringup("jog", *words, *VIRTUAL, "--start")
+    assert code == 2
+    assert said in answer["error"]
+
+
+def test_beyond_the_range_is_refused_before_torque(rig: RigProcess, bringup: Any) -> None:
+    rig.control.move({"l_knee": 2.1})
+    code, answer, _ = bringup("jog", "l_knee", "--by", "0.2", *VIRTUAL, "--start")
+    assert code == 2
+    assert "l_knee can go from -0.350 to +0.0" in answer["error"]
+    assert rig.control.accepted() == []
+
+
+def test_a_held_key_moves_and_letting_go_stops(
+    rig: RigProcess, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """On a terminal, with keys that repeat as a held one does, then silence, then the other way, then q."""
+    master, slave = os.openpty()
+    ready = threading.Event()
+
+    def person() -> None:
+        ready.wait()
+        time.sleep(1.0)
+        for key, count in ((b"\x1b[C", 30), (b"", 40), (b"\x1b[D", 15), (b"", 40)):
+            for _ in range(count):
+                os.write(master, key)
+                time.sleep(0.04)
+        os.write(master, b"q")
+
+    class Terminal:
+        def isatty(self) -> bool:
+            return True
+
+        def fileno(self) -> int:
+            return slave
+
+        def readline(self) -> str:
+            ready.set()
+            return "\n"
+
+    monkeypatch.setattr("sys.stdin", Terminal())
+    hands = threading.Thread(target=person)
+    hands.start()
+    try:
+        code = main(["bringup", "jog", "l_knee", *VIRTUAL])
+    finally:
+        ready.set()
+        hands.join()
+        os.close(master)
+        os.close(slave)
+    assert code == 0, capfd.readouterr().err
+    knee = goals(rig)[KNEE]
+    changes = np.sign(np.where(np.abs(np.diff(knee)) > TICK / 2, np.diff(knee), 0.0))
+    moving = np.flatnonzero(changes)
+    assert knee.max() - knee[0] > 0.1, "it followed the key"
+    top = int(knee.argmax())
+    down = moving[moving > top]
+    assert down.size, "and went back"
+    assert down[0] - top > 20, "it stood still while no key was pressed"
+    assert len(knee) - 1 - moving[-1] > 20, "and after the last one"
+    assert torque(rig) == 0
+    assert "torque is off" in capfd.readouterr().out
+
+
+# The limits, and what keys mean --------------------------------------------------------------------------------------
+
+
+def test_limits_of_a_jog_leave_one_joint_a_little_room_and_the_others_none() -> None:
+    here = ROBOT.home.copy()
+    here[KNEE] = ROBOT.joints[KNEE].range[1] - 0.1
+    here[0] = 1.7  # beyond its range: it stays there
+    robot = restrict(ROBOT, here, KNEE)
+    for i in range(20):
+        low, high = reach(robot, i)
+        if i == KNEE:
+            assert (low, high) == pytest.approx((here[i] - SPAN, here[i] + 0.1 - ROBOT.limits.margin))
+        else:
+            assert (low, high) == pytest.approx((here[i], here[i]))
+    assert robot.limits.joint_speed == SPEED
+
+
+def test_there_and_back_ends_where_it_began() -> None:
+    source, angle, path = There(-0.1), 0.5, []
+    for tick in range(500):
+        wish = source.wish(tick * 0.02, angle)
+        if wish is Wish.END:
+            break
+        angle += wish.value * SPEED * 0.02
+        path.append(angle)
+    assert wish is Wish.END
+    assert min(path) == pytest.approx(0.4, abs=0.005)
+    assert path[-1] == pytest.approx(0.5, abs=0.005)
+
+
+def test_a_burst_of_keys_moves_no_further_than_one_and_idleness_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thirty repeats that a slow line held up and delivered at once must not become a second of motion."""
+    from tools.bringup import jogging
+
+    master, slave = os.openpty()
+    monkeypatch.setattr("sys.stdin", os.fdopen(slave, "r", closefd=False))
+    try:
+        with jogging.Keys() as keys:
+            assert keys.wish(0.0, 0.0) is Wish.HOLD
+            os.write(master, b"\x1b[C" * 30)
+            time.sleep(0.05)
+            assert keys.wish(1.0, 0.0) is Wish.UP
+            assert keys.wish(1.0 + 0.9 * KEY_SECONDS, 0.0) is Wish.UP
+            assert keys.wish(1.0 + 1.1 * KEY_SECONDS, 0.0) is Wish.HOLD
+            os.write(master, b"+\x1b[B")
+            time.sleep(0.05)
+            assert keys.wish(3.0, 0.0) is Wish.DOWN, "the newest counts"
+            assert keys.wish(3.0 + IDLE_SECONDS, 0.0) is Wish.END
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+# Watch ---------------------------------------------------------------------------------------------------------------
+
+
+def test_watch_shows_every_servo_and_what_the_bus_lost(rig: RigProcess, bringup: Any) -> None:
+    rig.control.inject("corrupt", probability=0.02)
+    rig.control.inject("encoder", servo="r_knee", at=3.0)
+    code, answer, err = bringup("watch", "--seconds", "4", *VIRTUAL)
+    assert code == 0, err
+    servos = {servo["joint"]: servo for servo in answer["servos"]}
+    assert list(servos) == list(ROBOT.names)
+    assert servos["l_knee"]["position"] == pytest.approx(ROBOT.home[KNEE], abs=0.01)
+    assert 11.5 < servos["l_knee"]["voltage_min"] <= servos["l_knee"]["voltage"] < 12.5
+    assert servos["l_knee"]["state"] == "ok"
+    assert servos["r_knee"]["state"] == "encoder"
+    assert answer["bus"]["reads"] >= 80
+    assert answer["bus"]["bad_crc"] > 0
+    assert answer["bus"]["recovered"] > 0
+    assert "encoder" in err
+    assert torque(rig) == 0
+
+
+def test_watch_says_which_servo_went_silent(rig: RigProcess, bringup: Any) -> None:
+    rig.control.inject("dead", servo="l_el", at=3.0)
+    code, answer, _ = bringup("watch", "--seconds", "5", *VIRTUAL)
+    assert code == 0
+    states = {servo["joint"]: servo["state"] for servo in answer["servos"]}
+    assert "silent for" in states["l_el"]
+    assert states["l_knee"] == "ok"
+
+
+def test_watching_leaves_torque_as_it_is(rig: RigProcess, bringup: Any) -> None:
+    """A robot that stands must not fall because somebody looked at it."""
+    from test_bringup_scan import write
+
+    write(rig, 14, torque_enable=1)
+    assert bringup("watch", "--seconds", "1", *VIRTUAL)[0] == 0
+    assert torque(rig) == 1
