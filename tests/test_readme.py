@@ -62,7 +62,9 @@ def look_up(args: Namespace, verb: Verb) -> None:
     """Names that are not placeholders must exist."""
     task = getattr(args, "task", None)
     if task and task != "TASK":
-        tasks.load_settings(task, settings(args) if hasattr(args, "set") else {})
+        given = settings(args) if hasattr(args, "set") else {}
+        given.pop("gain", None)  # the run's own, not the task's
+        tasks.load_settings(task, given)
     if verb.module in ("tools.run", "tools.rollout"):
         assert args.policy in POLICIES
         assert args.backend in BACKENDS

@@ -13,7 +13,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,19 @@ from hw.hal import BackendError
 from sim.rig.control import Control, RigProcess
 
 STAND_SECONDS = 2.5  # from torque to the first step: homing a robot that is at home, and standing still
+PRIORITY = 70  # of the rig by SCHED_FIFO, above the controller's: real servos do not wait for the host's processor
 _START_SECONDS = 60.0
 _END_SECONDS = 60.0
+_GUARDIAN_SECONDS = 5.0
+
+
+@contextmanager
+def free_rig() -> Iterator[RigProcess]:
+    """A rig in real time. Without the right to SCHED_FIFO it lags where the machine is busy, and so do its answers."""
+    with RigProcess(clock="real") as rig:
+        with contextlib.suppress(PermissionError):
+            os.sched_setscheduler(rig.process.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        yield rig
 
 
 class Controller:
@@ -30,10 +42,11 @@ class Controller:
 
     def __init__(self, rig: RigProcess, log: Path) -> None:
         self.rig, self.log = rig, log
+        self._guardian = -1  # process ID, once it is on its own
         words = ["run", "walk", "--policy", "gait", "--set", "vx=0.1", "--set", "vy=0", "--set", "yaw_rate=0"]
         words += ["--seconds", "600", "--backend", "dynamixel", "--port", rig.port, "--start"]
         words += ["--record", str(log), "--json"]
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - a pipe would fill up while nobody reads
+        self._errors = tempfile.TemporaryFile("a+b")  # noqa: SIM115 - a pipe would fill up while nobody reads
         self.process = subprocess.Popen(
             [sys.executable, "-m", "tools", *words],
             stdin=subprocess.DEVNULL,
@@ -68,9 +81,12 @@ class Controller:
                 return int(child)
         raise BackendError(f"process {self.process.pid} has no guardian")
 
-    def kill(self) -> int:
-        """kill -9. Returns the rig's time just before [ns]."""
+    def kill(self, *, guarded: bool) -> int:
+        """kill -9, of its guardian first if it is not to be `guarded`. Returns the rig's time just before [ns]."""
+        self._guardian = self.guardian()
         mark = rig_time(self.rig)
+        if not guarded:
+            os.kill(self._guardian, signal.SIGKILL)  # with no time to be replaced
         self.process.kill()
         return mark
 
@@ -82,9 +98,13 @@ class Controller:
         return mark
 
     def wait(self) -> int:
-        """Its exit code. Raises BackendError when it does not end."""
+        """Its exit code, when it and its guardian have ended. Raises BackendError when it does not end."""
         try:
-            return self.process.wait(_END_SECONDS)
+            code = self.process.wait(_END_SECONDS)
+            deadline = time.monotonic() + _GUARDIAN_SECONDS
+            while Path(f"/proc/{self._guardian}").exists() and time.monotonic() < deadline:
+                time.sleep(0.005)
+            return code
         except subprocess.TimeoutExpired:
             raise BackendError(f"the run did not end within {_END_SECONDS:g} s: {self.last_words()}") from None
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import random
+import signal
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -47,10 +48,10 @@ def measure(report: Report, times: int, workers: int, seed: int) -> list[dict[st
     """A row for each interrupt. An instant depends on its number alone, and not on the number of workers."""
 
     def work(first: int) -> list[dict[str, Any]]:
-        from sim.rig.control import RigProcess
+        from tools.bench.controller import free_rig
 
         rows = []
-        with RigProcess(clock="real") as rig, tempfile.TemporaryDirectory(prefix="servoid-interrupt-") as folder:
+        with free_rig() as rig, tempfile.TemporaryDirectory(prefix="servoid-interrupt-") as folder:
             for i in range(first, times, workers):
                 for attempt in range(TRIES):
                     log, dice = Path(folder) / f"{i}-{attempt}.mcap", random.Random(f"{seed} {i}")
@@ -78,10 +79,12 @@ def interrupt(rig: Any, log: Path, dice: random.Random, again: bool) -> dict[str
         begun = controller.wait_for(lambda control: control.statistics()["instructions"] > 0)
         if not (begun and controller.wait_on(at)):
             return {"void": controller.last_words(), "off": has_none(rig.control)}
-        powered = not has_none(rig.control)
+        ended = has_none(rig.control)
+        powered = not ended
         mark = controller.interrupt()
         if again:
             time.sleep(dice.uniform(0.0, AGAIN_SECONDS))
+            ended = has_none(rig.control)
             mark = controller.interrupt()
         code, guardian = controller.wait(), "servoid guardian" in controller.errors()
     off = first_taken(rig.control.accepted(), "torque_enable", 0, mark)
@@ -90,6 +93,7 @@ def interrupt(rig: Any, log: Path, dice: random.Random, again: bool) -> dict[str
         "torque": powered,
         "off": has_none(rig.control),
         "acknowledged": code == exit_codes.INTERRUPTED,
+        "late": ended and code == -signal.SIGINT,  # torque was off, and the process on its way out
         "code": code,
         "guardian": guardian,
         "ms": round(max(off.values()), 1) if off else None,
@@ -104,10 +108,11 @@ def summarise(every: list[dict[str, Any]]) -> dict[str, Any]:
         "with_torque": sum(row["torque"] for row in rows),
         "all_off": sum(row["off"] for row in rows),
         "acknowledged": sum(row["acknowledged"] for row in rows),
+        "late": sum(row["late"] for row in rows),
         "guardian_needed": sum(row["guardian"] for row in rows),
         "median_ms": sorted(spent)[len(spent) // 2] if spent else None,
         "worst_ms": max(spent, default=None),
         "void": len(every) - len(rows),
         "void_all_off": sum(row["off"] for row in every if "void" in row),
-        "other_codes": sorted({row["code"] for row in rows if not row["acknowledged"]}),
+        "other_codes": sorted({row["code"] for row in rows if not (row["acknowledged"] or row["late"])}),
     }

@@ -7,9 +7,7 @@ flight log must read back. Then the same with the guardian killed too: the servo
 from __future__ import annotations
 
 import argparse
-import os
 import random
-import signal
 import tempfile
 import time
 from pathlib import Path
@@ -46,11 +44,11 @@ def main(args: argparse.Namespace) -> int:
 
 def measure(report: Report, kills: int, unguarded: int, dice: random.Random) -> dict[str, Any]:
     """All kills, one after the other on one rig."""
-    from sim.rig.control import RigProcess
+    from tools.bench.controller import free_rig
 
     rows: list[dict[str, Any]] = []
     void = 0
-    with RigProcess(clock="real") as rig, tempfile.TemporaryDirectory(prefix="servoid-kill-") as folder:
+    with free_rig() as rig, tempfile.TemporaryDirectory(prefix="servoid-kill-") as folder:
         for i in range(kills + unguarded):
             for attempt in range(TRIES):
                 row = kill(rig, Path(folder) / f"{i}-{attempt}.mcap", guarded=i < kills, dice=dice)
@@ -89,9 +87,7 @@ def kill(rig: Any, log: Path, *, guarded: bool, dice: random.Random) -> dict[str
             controller.wait()
             return {"void": controller.last_words()}
         rig.control.accepted()
-        if not guarded:
-            os.kill(controller.guardian(), signal.SIGKILL)
-        mark = controller.kill()
+        mark = controller.kill(guarded=guarded)
         row = _off(rig, mark) if guarded else _stopped(rig, mark)
         controller.wait()
     phase, reads = _last_phase(log)
