@@ -305,6 +305,7 @@ class Trace:
     command: Array  # (ticks, 3) instructed velocity
     fallen: bool
     joints: Array | None = None  # (ticks, n_joints) rad
+    goal: Array | None = None  # (ticks, 2) m, where the robot saw it; None: where the task has it
     obstacles: Array | None = None  # (ticks, n, 3) m: x, y, radius
     robots: Array | None = None  # (ticks, n, 3) the others: x, y m and heading rad
     touched: bool | None = None  # whether the robot touched an obstacle or another robot; None: it cannot know

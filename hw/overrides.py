@@ -17,7 +17,8 @@ T = TypeVar("T")
 def override(base: T, settings: dict[str, str], where: str = "--set") -> T:
     """The dataclass instance `base` with some fields read from text, as typed on a command line.
 
-    A field of a field is named with a dot. A pair of numbers is written `low:high`, or as one number for both.
+    A field of a field is named with a dot. A pair of numbers is written `low:high`, or as one number for both; a list
+    of points as `x,y:x,y`.
     Raises ConfigError naming the setting for an unknown key or a value that does not parse.
     """
     for key, text in settings.items():
@@ -63,7 +64,8 @@ def _parse(text: str, hint: Any) -> Any:
                 expected.append(str(error))
         raise ValueError(" or ".join(expected))
     if origin is tuple:
-        parts = re.split("[:,]", text)
+        inner = typing.get_origin(arguments[0]) is tuple
+        parts = re.split(":" if inner else "[:,]", text) if text else []
         if arguments[-1] is Ellipsis:
             return tuple(_parse(part.strip(), arguments[0]) for part in parts)
         if len(parts) == 1 and arguments == (float, float):

@@ -14,6 +14,7 @@ import numpy as np
 from hw.hal import Array
 from hw.robot import Robot
 from sim.model import build
+from sim.scene import PILLAR_COLOUR, PILLAR_HEIGHT, SPHERE_COLOUR
 
 AZIMUTH, ELEVATION, DISTANCE = 140.0, -20.0, 1.3  # degrees and m, of the camera that follows the robot
 ASIDE = 30.0  # degrees that it looks past the goal, where there is one: both are in the picture all the way
@@ -37,6 +38,8 @@ class Frame:
     joints: Array  # (n_joints,) rad
     goal: Array | None = None  # (2,) m
     plan: Array | None = None  # (n, 2) m: where the robot means to go
+    pillars: Array | None = None  # (n, 3) m: x, y, radius
+    spheres: Array | None = None  # (n, 3) m: x, y, radius; they lie on the ground
 
 
 def render(robot: Robot, frames: list[Frame], width: int = 640, height: int = 480) -> Iterator[Array]:
@@ -77,6 +80,11 @@ def _draw(scene: mujoco.MjvScene, frame: Frame, trail: list[Array]) -> None:
     if frame.goal is not None:
         _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (0.05, 0.002, 0), frame.goal, 0.003, GOAL_COLOUR)
         _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (0.004, 0.12, 0), frame.goal, 0.12, GOAL_COLOUR)
+    for x, y, radius in frame.pillars if frame.pillars is not None else ():
+        size, half = (radius, PILLAR_HEIGHT / 2, 0.0), PILLAR_HEIGHT / 2
+        _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, np.array([x, y]), half, PILLAR_COLOUR)
+    for x, y, radius in frame.spheres if frame.spheres is not None else ():
+        _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (radius, 0, 0), np.array([x, y]), radius, SPHERE_COLOUR)
     for point in frame.plan if frame.plan is not None else ():
         _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (0.006, 0, 0), point, 0.012, PLAN_COLOUR)
     for point in trail[-(_ROOM // 2) :]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -12,7 +12,7 @@ from hw.hal import Array, Percept, Scene, State, Truth
 
 PREFIX = "scene/"  # of the names of a scene's bodies, which follow the robot's
 PILLAR_HEIGHT = 0.4  # m: taller than the robot's shoulders
-_PILLAR_COLOUR, _SPHERE_COLOUR = (0.55, 0.42, 0.32, 1.0), (0.80, 0.20, 0.20, 1.0)
+PILLAR_COLOUR, SPHERE_COLOUR = (0.55, 0.42, 0.32, 1.0), (0.80, 0.20, 0.20, 1.0)
 _FOUND = 1  # data bit of MuJoCo's contact sensor
 
 
@@ -23,10 +23,10 @@ def add_scene(model: mujoco.MjSpec, scene: Scene) -> None:
     if len(scene.pillars):
         bodies.append(model.worldbody.add_body(name=f"{PREFIX}pillars"))
         for x, y, radius in scene.pillars:
-            _add_geom(bodies[0], mujoco.mjtGeom.mjGEOM_CYLINDER, [radius, PILLAR_HEIGHT / 2, 0], _PILLAR_COLOUR, [x, y])
+            _add_geom(bodies[0], mujoco.mjtGeom.mjGEOM_CYLINDER, [radius, PILLAR_HEIGHT / 2, 0], PILLAR_COLOUR, [x, y])
     for number, (x, y, radius, _) in enumerate(scene.spheres):
         body = model.worldbody.add_body(name=f"{PREFIX}sphere{number}", mocap=True, pos=[x, y, radius])
-        _add_geom(body, mujoco.mjtGeom.mjGEOM_SPHERE, [radius, 0, 0], _SPHERE_COLOUR)
+        _add_geom(body, mujoco.mjtGeom.mjGEOM_SPHERE, [radius, 0, 0], SPHERE_COLOUR)
         bodies.append(body)
     for body in bodies:
         model.add_sensor(
@@ -38,7 +38,9 @@ def add_scene(model: mujoco.MjSpec, scene: Scene) -> None:
         )
 
 
-def _add_geom(body: Any, kind: mujoco.mjtGeom, size: list[float], colour: tuple[float, ...], at: Any = (0, 0)) -> None:
+def _add_geom(
+    body: Any, kind: mujoco.mjtGeom, size: list[float], colour: tuple[float, ...], at: Sequence[float] = (0.0, 0.0)
+) -> None:
     height = size[1] if kind == mujoco.mjtGeom.mjGEOM_CYLINDER else 0.0
     body.add_geom(
         type=kind, size=size, pos=[*at, height], rgba=colour, contype=1, conaffinity=0, condim=3, solref=[0.008, 1.0]

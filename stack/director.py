@@ -15,6 +15,7 @@ from stack.safety import Guard, Phase
 
 WAIT_SECONDS = 1.0  # for a first sample from every sensor
 STILL_SECONDS = 0.5  # after homing, when the body has stopped swinging: gravity is taken from there, not from the way
+DONE = "the task is done"
 SETTLE_SECONDS = 1.5  # standing still at home, in which the estimator learns the gyro's bias
 
 
@@ -76,6 +77,7 @@ class Director:
             command=np.array([instruction.velocity for _, instruction, _ in self._rows]).reshape(-1, 3),
             fallen=self._guard.phase is Phase.FAULT and self._guard.cause == "fall" and self.ended is None,
             joints=np.array([state.position for state in states]).reshape(-1, len(self._robot.joints)),
+            goal=_stacked([percept.goal for percept in percepts]),
             obstacles=_stacked([percept.obstacles for percept in percepts]),
             robots=_stacked([percept.robots for percept in percepts]),
         )
@@ -94,7 +96,7 @@ class Director:
         self._rows.append((state, instruction, percept))
         shown = Proposal(instruction=instruction, percept=percept)
         if self._task.done(state):
-            self._end("done", "the task is done")
+            self._end("done", DONE)
             return shown
         if tick * self._robot.dt >= self._task.seconds:
             self._end("time", f"{self._task.seconds:g} s are over")
@@ -127,6 +129,6 @@ class Director:
 
 
 def _stacked(rows: list[Array | None]) -> Array | None:
-    """Rows `(ticks, n, 3)` of what was perceived; None where there was nothing to perceive."""
+    """Rows `(ticks, ...)` of what was perceived; None where there was nothing to perceive."""
     present = [row for row in rows if row is not None]
     return np.array(present) if present and len(present) == len(rows) else None

@@ -12,7 +12,7 @@ import numpy as np
 
 from hw.calibration import calibrated
 from hw.config import ConfigError
-from hw.hal import Backend, Policy, Scene, Task, Trace
+from hw.hal import Array, Backend, Policy, Scene, Task, Trace
 from hw.robot import Robot, load_robot
 from stack.backends import backend_kind, make_backend
 from stack.clock import RealTime, Schedule, WallClock
@@ -55,6 +55,8 @@ class Script:
 
     stops: tuple[Event, ...] = ()  # what ended it: Ctrl-C, a full disk
     plans: frozenset[int] | None = None  # ticks of the plan requests that were answered in time
+    velocities: Array | None = None  # (ticks, 3) that a person steered by,
+    ended: bool = False  # and whether the person ended the run
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,8 @@ def run(
         raise ConfigError(
             "nothing moves by itself on a real robot: give start=True (--start), or confirm at the prompt"
         )
+    if script.velocities is not None and hasattr(task, "steer_by"):
+        task.steer_by(script.velocities, script.ended)
     scene = start_task(task, settings.seed)
     assembled, assembly = (robot, None) if simulated or backend is not None else calibrated(robot)
     body = backend or make_backend(
@@ -120,6 +124,8 @@ def run(
     if scene is not None and simulated and getattr(body, "stage", None) is None:
         raise ConfigError(f"task '{task.name}' has a scene: make the backend with it (stack.session.prepare does)")
     with ExitStack() as stack:
+        if hasattr(task, "close"):
+            stack.callback(task.close)
         interrupt = stack.enter_context(Interrupt(eager=True))
         pilot = make_policy(settings.policy, robot, task, realtime) if policy is None else policy
         if script.plans is not None and hasattr(pilot, "only"):

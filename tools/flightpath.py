@@ -28,6 +28,12 @@ def goal(log: FlightLog) -> Array | None:
     return unpack(places[-1]) if places else None
 
 
+def obstacles(log: FlightLog) -> Array | None:
+    """What was seen in the way at each tick of the task, `(ticks, n, 3)` m: x, y, radius, odometry frame."""
+    seen = [message["obstacles"] for message in log.messages["/instruction"] if "obstacles" in message]
+    return np.array([unpack(value) for value in seen]) if seen and len(seen) == len(task_ticks(log)) else None
+
+
 def plans(log: FlightLog) -> list[DrawnPlan]:
     """Predicted paths. Their ticks count calls of the policy, one for each tick of the task."""
     ticks = task_ticks(log)

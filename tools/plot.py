@@ -17,7 +17,7 @@ from tools.output import add_json_argument, reporting
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-ROBOT, PLAN, GOAL = "#3459b8", "#f28e1c", "#26a65b"
+ROBOT, PLAN, GOAL, OBSTACLE = "#3459b8", "#f28e1c", "#26a65b", "#8c6b51"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -100,6 +100,10 @@ def _path(axes: Axes, log: FlightLog) -> None:
         axes.plot(*plan.path.T, color=PLAN, lw=0.8, alpha=0.6, label="plans" if number == 0 else None)
     axes.plot(place[:, 0], place[:, 1], color=ROBOT, lw=1.6, label="robot")
     axes.plot(*place[0, :2], "o", color=ROBOT, ms=5)
+    obstacles = flightpath.obstacles(log)
+    for x, y, size in obstacles[-1] if obstacles is not None else ():
+        turn = np.linspace(0.0, 2.0 * np.pi, 40)
+        axes.fill(x + size * np.cos(turn), y + size * np.sin(turn), color=OBSTACLE)
     goal = flightpath.goal(log)
     if goal is not None:
         axes.plot(*goal, "*", color=GOAL, ms=14, label="goal")

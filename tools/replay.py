@@ -14,6 +14,7 @@ from typing import Any
 
 from hw.config import ConfigError
 from stack.backends import BACKENDS
+from stack.director import DONE
 from stack.event import Event
 from stack.flightlog import FlightLog, read_log
 from stack.logformat import MACHINE_DEPENDENT, messages, plain
@@ -84,7 +85,9 @@ def replay(log: FlightLog) -> tuple[int, Difference | None]:
             tick[channel].append(plain(message))
         repeated[record.tick] = tick
 
-    run(settings, on_tick=compare, script=Script(tuple(stops), plans if plans else None))
+    velocities = log.column("/instruction", "velocity").reshape(-1, 3)
+    ended = any(event["kind"] == "task" and event["text"] == DONE for event in log.messages["/event"])
+    run(settings, on_tick=compare, script=Script(tuple(stops), plans if plans else None, velocities, ended))
     for number in sorted(recorded.keys() | (repeated.keys() if log.complete else set())):
         difference = _difference(number, recorded.get(number), repeated.get(number))
         if difference is not None:

@@ -32,8 +32,7 @@ def main(args: argparse.Namespace) -> int:
 
 def describe(name: str) -> dict[str, Any]:
     """Name, description and settings of a task. Raises ConfigError."""
-    cls = tasks.task_class(name)
-    return {"name": name, "description": cls.description, "settings": _settings(tasks.load_settings(name))}
+    return {"name": name, "description": tasks.description(name), "settings": _settings(tasks.load_settings(name))}
 
 
 def _settings(value: Any, prefix: str = "") -> list[dict[str, str]]:
@@ -45,7 +44,16 @@ def _settings(value: Any, prefix: str = "") -> list[dict[str, str]]:
         if is_dataclass(item):
             rows += _settings(item, f"{prefix}{f.name}.")
         else:
-            text = ":".join(f"{v:g}" for v in item) if isinstance(item, tuple) else "" if item is None else f"{item:g}"
             help_text = getattr(hints[f.name], "__metadata__", ("",))[0]
-            rows.append({"key": prefix + f.name, "value": text, "help": help_text})
+            rows.append({"key": prefix + f.name, "value": _text(item), "help": help_text})
     return rows
+
+
+def _text(value: Any) -> str:
+    """A value as it is typed after `key=`."""
+    if isinstance(value, tuple):
+        nested = any(isinstance(item, tuple) for item in value)
+        return ":".join(_text(item).replace(":", ",") if nested else _text(item) for item in value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "" if value is None else f"{value:g}" if isinstance(value, (int, float)) else str(value)

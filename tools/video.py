@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +32,20 @@ def make_video(log: FlightLog, path: Path, width: int = 640, height: int = 480) 
     ticks, first = log.ticks("/state"), flightpath.task_ticks(log)
     place, orientation = log.column("/state", "displacement"), log.column("/state", "orientation")
     joints, goal, plans = log.column("/state", "position"), flightpath.goal(log), flightpath.plans(log)
+    obstacles = flightpath.obstacles(log)
+    rolling = len((log.header.get("scene") or {"spheres": ()})["spheres"])  # the last ones of the obstacles
+    pillars = 0 if obstacles is None else obstacles.shape[1] - rolling
     step = max(1, round(robot.rate / FPS))
     frames = []
     # Before the task the odometry frame is another one: the run is shown from where the task begins.
     for row in np.flatnonzero(ticks >= first[0])[::step] if len(first) else range(0, len(ticks), step):
         running = [plan for plan in plans if plan.adopted <= ticks[row]]
         shown = running[-1].path if running and ticks[row] <= first[-1] else None
-        frames.append(Frame(place[row], orientation[row], joints[row], goal, shown))
+        frame = Frame(place[row], orientation[row], joints[row], goal, shown)
+        if obstacles is not None and len(first):
+            around = obstacles[np.clip(np.searchsorted(first, ticks[row]), 0, len(first) - 1)]
+            frame = replace(frame, pillars=around[:pillars], spheres=around[pillars:])
+        frames.append(frame)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with av.open(str(path), "w") as container:

@@ -7,11 +7,28 @@ from hw.hal import Task
 from hw.overrides import override
 from hw.robot import Robot
 from stack.tasks.base import BaseTask, Settings
+from stack.tasks.forest import Forest
 from stack.tasks.goal import Goal
+from stack.tasks.inbetween import Inbetween
+from stack.tasks.obstacle import Obstacle
+from stack.tasks.path import Path
 from stack.tasks.stand import Stand
+from stack.tasks.steer import Steer
+from stack.tasks.survive import Survive
+from stack.tasks.text import Text
+from stack.tasks.velocity import Velocity
 from stack.tasks.walk import Walk
 
-_TASKS: dict[str, type[BaseTask]] = {task.name: task for task in (Stand, Walk, Goal)}
+_CLASSES: tuple[type[BaseTask], ...] = (
+    Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Inbetween, Survive, Text, Steer,
+)  # fmt: skip
+_TASKS: dict[str, tuple[type[BaseTask], str]] = {
+    **{task.name: (task, task.description) for task in _CLASSES},
+    # The same classes by other files of settings.
+    "goal-near": (Goal, "walk to a near point"),
+    "goal-far": (Goal, "walk to a far point"),
+    "perturb": (Walk, "walk ahead while being pushed once a second"),
+}
 
 
 def names() -> tuple[str, ...]:
@@ -23,7 +40,13 @@ def task_class(name: str) -> type[BaseTask]:
     """The class of a task. Raises ConfigError with the nearest name."""
     if name not in _TASKS:
         raise ConfigError(f"unknown task '{name}': {nearest(name, _TASKS)}")
-    return _TASKS[name]
+    return _TASKS[name][0]
+
+
+def description(name: str) -> str:
+    """What a task asks, in a few words. Raises ConfigError with the nearest name."""
+    task_class(name)
+    return _TASKS[name][1]
 
 
 def load_settings(name: str, settings: dict[str, str] | None = None) -> Settings:
@@ -33,9 +56,7 @@ def load_settings(name: str, settings: dict[str, str] | None = None) -> Settings
     return override(base, cls.complete(settings or {}))
 
 
-def load_task(
-    name: str, settings: dict[str, str] | None = None, dt: float = 0.02, robot: Robot | None = None
-) -> Task:
+def load_task(name: str, settings: dict[str, str] | None = None, dt: float = 0.02, robot: Robot | None = None) -> Task:
     """A task for one robot, to be `reset` before each episode. `dt` is the length of a control tick [s].
 
     Raises ConfigError for an unknown task or setting, a value that does not parse, or what `robot` cannot do.
@@ -47,4 +68,4 @@ def load_task(
     return task
 
 
-__all__ = ["BaseTask", "Settings", "load_settings", "load_task", "names", "task_class"]
+__all__ = ["BaseTask", "Settings", "description", "load_settings", "load_task", "names", "task_class"]

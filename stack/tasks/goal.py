@@ -9,10 +9,11 @@ from typing import Annotated
 
 import numpy as np
 
-from hw.hal import Array, Instruction, Percept, State, Trace
+from hw.hal import Array, Instruction, Percept, Scene, State, Trace
 from stack.tasks import measures
 from stack.tasks.approach import Approach, approach
 from stack.tasks.base import BaseTask, Range, Settings, require_positive, require_ranges
+from stack.tasks.frames import to_heading
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,8 @@ class GoalSettings(Settings):
     x: Annotated[float | None, "m ahead of the start: fixes the goal (y is 0 unless given)"] = None
     y: Annotated[float | None, "m to the left of the start: fixes the goal (x is 0 unless given)"] = None
     radius: Annotated[float, "m from the goal that count as reached"] = 0.1
+    stand: Annotated[bool, "whether it must also stand there, or coming there is enough"] = True
+    seen: Annotated[bool, "whether the robot sees the goal, as by a camera, or goes by its odometry alone"] = False
     arrive: Annotated[float, "m from the goal at which to stop"] = 0.09
     leave: Annotated[float, "m from the goal at which to start again"] = 0.13
     approach: Annotated[Approach, "speed profile"] = field(default_factory=Approach)
@@ -52,28 +55,30 @@ class Goal(BaseTask):
         self._stopped = False
         self._standing = _Standing()
 
+    def scene(self) -> Scene | None:
+        """The goal as a mark on the floor, where it shall be seen."""
+        return Scene(np.zeros((0, 3)), np.zeros((0, 4)), self.goal.copy()) if self.settings.seen else None
+
     def percept(self, state: State) -> Percept:
         return Percept(source="task", age=0.0, goal=self.goal.copy())
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
         """The velocity of the speed profile; zero once arrived, until the robot has drifted off."""
-        if percept.goal is not None:
-            self.goal = percept.goal  # an external feed may move it
-        offset = self.goal - state.displacement[:2]
-        cos, sin = math.cos(state.yaw), math.sin(state.yaw)
-        ahead = np.array([cos * offset[0] + sin * offset[1], cos * offset[1] - sin * offset[0]])
+        ahead = to_heading(self.goal if percept.goal is None else percept.goal, state)
         distance = float(np.linalg.norm(ahead))
         self._stopped = distance <= (self.settings.leave if self._stopped else self.settings.arrive)
         velocity = np.zeros(3) if self._stopped else approach(ahead, self.settings.approach)
         return Instruction(velocity=velocity, goal=ahead)
 
     def done(self, state: State) -> bool:
-        """Arrived, and standing for 1 s."""
-        return self._standing.update(state) and self._stopped
+        """Arrived, and standing for 1 s where that is asked."""
+        standing = self._standing.update(state) or not self.settings.stand
+        return standing and self._stopped
 
     def success(self, trace: Trace) -> bool:
-        """Within the radius of the goal and standing at the end. The trace is in the odometry frame."""
-        return not trace.fallen and self._distances(trace)[-1] <= self.settings.radius and measures.standing(trace)
+        """Within the radius of the goal, and standing there, at the end. The trace is in the odometry frame."""
+        there = not trace.fallen and bool(self._distances(trace)[-1] <= self.settings.radius)
+        return there and (not self.settings.stand or measures.standing(trace))
 
     def metrics(self, trace: Trace) -> dict[str, float]:
         distances = self._distances(trace)
@@ -89,7 +94,7 @@ class Goal(BaseTask):
         """Distance to the goal [m] at each tick; infinite for a run that never started."""
         if len(trace.displacement) == 0:
             return np.array([np.inf])
-        return np.linalg.norm(trace.displacement[:, :2] - self.goal, axis=1)
+        return np.linalg.norm(trace.displacement[:, :2] - (self.goal if trace.goal is None else trace.goal), axis=1)
 
 
 class _Standing:

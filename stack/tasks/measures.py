@@ -49,6 +49,20 @@ def path_length(trace: Trace, step: float) -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
+def clearance(trace: Trace, ticks: slice = slice(None)) -> float:
+    """Least distance [m] of the base from the surface of an obstacle; NaN where there is none."""
+    if trace.obstacles is None or not trace.obstacles.size:
+        return float("nan")
+    obstacles = trace.obstacles[ticks]
+    apart = np.linalg.norm(obstacles[..., :2] - trace.displacement[ticks, None, :2], axis=-1)
+    return float((apart - obstacles[..., 2]).min())
+
+
+def touched(trace: Trace) -> bool:
+    """Whether the robot touched an obstacle. One that cannot feel it believes so where its base is inside one."""
+    return clearance(trace) < 0.0 if trace.touched is None else trace.touched
+
+
 def standing(trace: Trace) -> bool:
     """Whether the run ended standing: smoothed planar speed below 0.05 m/s over all of its last second."""
     ticks, smooth = round(STANDING_TIME / trace.dt), max(round(SMOOTHING / trace.dt), 1)

@@ -1,0 +1,112 @@
+"""Walk along a path over the ground: an S, a circle, or a line through points."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+
+from hw.hal import Array, Instruction, Percept, State, Trace
+from stack.tasks import measures
+from stack.tasks.base import BaseTask, Settings, require_positive
+from stack.tasks.frames import to_heading
+
+Point = tuple[float, float]
+_SPACING = 0.01  # m between the points of a path
+
+
+@dataclass(frozen=True)
+class PathSettings(Settings):
+    shape: Annotated[Literal["s", "circle", "waypoints"], "s, circle or waypoints"] = "s"
+    radius: Annotated[float, "m, of the arcs of an S or a circle"] = 0.4
+    waypoints: Annotated[tuple[Point, ...], "m, points after the start: x,y:x,y:..."] = ((0.8, 0.0), (0.8, 0.8))
+    speed: Annotated[float, "m/s along the path"] = 0.15
+    lookahead: Annotated[float, "m along the path, of the point that the asked velocity heads for"] = 0.15
+    horizon: Annotated[int, "ticks ahead for which places on the path are given to a planner"] = 64
+    yaw_rate: Annotated[float, "rad/s at most"] = 0.8
+    tolerance: Annotated[float, "m of mean distance from the path, and from its end, that count as followed"] = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive(self, "radius", "speed", "lookahead", "horizon", "yaw_rate", "tolerance")
+        if self.shape == "waypoints":
+            points = np.vstack([np.zeros(2), np.reshape(self.waypoints, (-1, 2))])
+            if len(points) < 2 or (np.linalg.norm(np.diff(points, axis=0), axis=1) < _SPACING).any():
+                raise ValueError("waypoints: give one or more, each away from the one before (the start is 0,0)")
+
+
+class Path(BaseTask):
+    name = "path"
+    description = "walk along a path: an S, a circle, or a line through points"
+    settings_type = PathSettings
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Lay out the path, which starts at the robot."""
+        self.points: Array = _layout(self.settings)
+        self._at = 0  # index of the point that the robot has come to
+
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
+        """Where to be at the next ticks, and a velocity toward a point ahead on the path (pure pursuit)."""
+        s, points = self.settings, self.points
+        # The robot is at the nearest point of the stretch that comes next: a path may cross itself.
+        stretch = points[self._at : self._at + round(2.0 * s.lookahead / _SPACING) + 1]
+        self._at += int(np.argmin(np.linalg.norm(stretch - state.displacement[:2], axis=1)))
+        along = self._at + np.round(s.speed * self.dt * np.arange(1, s.horizon + 1) / _SPACING).astype(int)
+        path = to_heading(points[np.minimum(along, len(points) - 1)], state)
+        target = to_heading(points[min(self._at + round(s.lookahead / _SPACING), len(points) - 1)], state)
+        distance, bearing = float(np.linalg.norm(target)), math.atan2(target[1], target[0])
+        forward = s.speed * max(math.cos(bearing), 0.0)
+        turn = 2.0 * s.speed * math.sin(bearing) / max(distance, 0.05)
+        if abs(bearing) > 0.5 * math.pi:
+            turn = math.copysign(s.yaw_rate, bearing)
+        turn = min(max(turn, -s.yaw_rate), s.yaw_rate)
+        return Instruction(velocity=np.array([forward, 0.0, turn]), goal=to_heading(points[-1], state), path=path)
+
+    def percept(self, state: State) -> Percept:
+        return Percept(source="task", age=0.0, goal=self.points[-1].copy())
+
+    def done(self, state: State) -> bool:
+        """At the end of the path."""
+        return self._at >= len(self.points) - round(0.4 * self.settings.tolerance / _SPACING)
+
+    def success(self, trace: Trace) -> bool:
+        """Never fallen, near the path on average, and at its end. The trace is in the odometry frame."""
+        error, end = self._errors(trace)
+        return not trace.fallen and max(error, end) <= self.settings.tolerance
+
+    def metrics(self, trace: Trace) -> dict[str, float]:
+        error, end = self._errors(trace)
+        return {
+            "path_error_m": error,
+            "final_distance_m": end,
+            "length_m": _SPACING * (len(self.points) - 1),
+            "path_m": measures.path_length(trace, step=0.48),
+        }
+
+    def _errors(self, trace: Trace) -> tuple[float, float]:
+        """Mean distance from the nearest point of the path, and distance from its end at the end [m]."""
+        if len(trace.displacement) == 0:
+            return float("inf"), float("inf")
+        places = trace.displacement[:, :2]
+        nearest = [float(np.linalg.norm(self.points - place, axis=1).min()) for place in places]
+        return float(np.mean(nearest)), float(np.linalg.norm(places[-1] - self.points[-1]))
+
+
+def _layout(settings: PathSettings) -> Array:
+    """Points `(n, 2)` m, a centimetre apart; the path begins at the origin, an S or a circle along x."""
+    if settings.shape == "waypoints":
+        corners = np.vstack([np.zeros(2), np.reshape(settings.waypoints, (-1, 2))])
+        legs = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+        at = np.concatenate([[0.0], np.cumsum(legs)])
+        along = np.linspace(0.0, at[-1], max(round(at[-1] / _SPACING), 1) + 1)
+        return np.stack([np.interp(along, at, corners[:, axis]) for axis in (0, 1)], axis=-1)
+    radius = settings.radius
+    turn = np.linspace(0.0, 2.0 * math.pi, max(round(2.0 * math.pi * radius / _SPACING), 2) + 1)
+    circle = radius * np.stack([np.sin(turn), 1.0 - np.cos(turn)], axis=-1)
+    if settings.shape == "circle":
+        return circle
+    # The second half of an S turns the other way: it is the first one, turned by half a turn about its end.
+    half = circle[: len(circle) // 2 + 1]
+    return np.vstack([half, 2.0 * half[-1] - half[-2::-1]])

@@ -1,0 +1,91 @@
+"""Do what a sentence says; the sentence changes every few seconds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+
+from hw.config import ConfigError
+from hw.hal import Instruction, Percept, State, Trace
+from policy.text.captions import MOTIONS, followed, twist_of
+from stack.tasks import measures
+from stack.tasks.base import BaseTask, Settings, require_positive
+
+
+@dataclass(frozen=True)
+class TextSettings(Settings):
+    every: Annotated[float, "s between changes of the sentence"] = 5.0
+    settle: Annotated[float, "s after each change that do not count"] = measures.SETTLING
+    phrasings: Annotated[Literal["held_out", "training"], "held_out, which no training saw, or training"] = "held_out"
+    sentence: Annotated[str | None, "says what to do all the time, instead of sentences that are drawn"] = None
+    cycle: Annotated[float, "s, length of a gait cycle, over whole ones of which motion is measured"] = 0.48
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive(self, "every", "cycle")
+        if not 0.0 <= self.settle <= self.every - self.cycle:
+            raise ValueError(f"settle: {self.settle:g} leaves no gait cycle of every ({self.every:g})")
+
+
+class Text(BaseTask):
+    name = "text"
+    description = "do what a sentence says; it changes every few seconds"
+    settings_type = TextSettings
+
+    def __init__(self, settings: TextSettings, dt: float) -> None:
+        """Raises ConfigError for a sentence that names no motion."""
+        super().__init__(settings, dt)
+        self._asked: int | None = None if settings.sentence is None else _understood(settings.sentence)
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Draw motions, each another one than before, and a sentence for each."""
+        self._motions: list[int] = []
+        self._sentences: list[str] = []
+        for _ in range(math.ceil(self.seconds / self.settings.every)):
+            others = [i for i in range(len(MOTIONS)) if not self._motions or i != self._motions[-1]]
+            motion = others[int(rng.integers(len(others)))]
+            choices = MOTIONS[motion].held_out if self.settings.phrasings == "held_out" else MOTIONS[motion].phrasings
+            sentence = choices[rng.integers(len(choices))]
+            if self._asked is not None:
+                motion, sentence = self._asked, self.settings.sentence
+            self._motions.append(motion)
+            self._sentences.append(sentence)
+
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
+        """The sentence; with it the motion's typical velocity, for policies that do not read."""
+        number = min(tick // max(round(self.settings.every / self.dt), 1), len(self._motions) - 1)
+        return Instruction(velocity=twist_of(self._motions[number]), text=self._sentences[number])
+
+    def success(self, trace: Trace) -> bool:
+        """Never fallen, and every sentence followed."""
+        return not trace.fallen and self._followed(trace) == 1.0
+
+    def metrics(self, trace: Trace) -> dict[str, float]:
+        return {"followed_share": self._followed(trace)}
+
+    def _followed(self, trace: Trace) -> float:
+        """Share of the sentences that the mean measured motion followed; NaN for a run too short to tell."""
+        every, cycle = round(self.settings.every / self.dt), round(self.settings.cycle / self.dt)
+        verdicts = []
+        for number, motion in enumerate(self._motions):
+            first = number * every + round(self.settings.settle / self.dt)
+            cycles = (min((number + 1) * every, len(trace.yaw)) - first) // cycle
+            if cycles >= 1:
+                rows = slice(first, first + cycles * cycle)
+                twist = np.array([*trace.velocity[rows, :2].mean(0), trace.yaw_rate[rows].mean()])
+                verdicts.append(followed(motion, twist))
+        return float(np.mean(verdicts)) if verdicts else float("nan")
+
+
+def _understood(sentence: str) -> int:
+    """Number of the motion that a sentence asks for. Raises ConfigError where it is empty or in no known words."""
+    from policy.text.encoder import load_encoder
+    from policy.text.understanding import Phrasebook
+
+    try:
+        return Phrasebook(load_encoder()).understand(sentence)
+    except ConfigError as error:
+        raise ConfigError(f"--set sentence={sentence}: {error}") from None

@@ -1,0 +1,89 @@
+"""Walk with a velocity that is given over the ground and changes in steps; turn to face where it points."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from hw.hal import Array, Instruction, Percept, State, Trace
+from stack.tasks import measures
+from stack.tasks.base import BaseTask, Range, Settings, require_positive, require_ranges
+from stack.tasks.frames import turned
+
+
+@dataclass(frozen=True)
+class VelocitySettings(Settings):
+    seconds: Annotated[float, "s, length of the episode"] = 183.0
+    speed: Annotated[Range, "m/s, one value or low:high"] = (0.0, 0.25)
+    turn: Annotated[Range, "rad by which the direction changes each time, one value or low:high"] = (-1.0, 1.0)
+    every: Annotated[float, "s between changes"] = 8.7
+    settle: Annotated[float, "s after each change that do not count"] = 2.1
+    cycle: Annotated[float, "s, length of a gait cycle, over which the measured velocity is averaged"] = 0.48
+    tolerance: Annotated[float, "m/s of mean error that count as followed"] = 0.04
+    turn_gain: Annotated[float, "rad/s per rad of wrong heading"] = 1.5
+    yaw_rate: Annotated[float, "rad/s at most"] = 0.8
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive(self, "every", "cycle", "tolerance", "turn_gain", "yaw_rate")
+        require_ranges(self, "speed", "turn")
+        if self.speed[0] < 0.0:
+            raise ValueError("speed: must not be negative; its direction is drawn")
+        if not 0.0 <= self.settle < self.every:
+            raise ValueError(f"settle: {self.settle:g} must be below every ({self.every:g})")
+
+
+class Velocity(BaseTask):
+    name = "velocity"
+    description = "walk with a velocity over the ground that changes in steps"
+    settings_type = VelocitySettings
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Draw all velocities of the episode; the first points ahead."""
+        changes = math.ceil(self.seconds / self.settings.every)
+        speed = rng.uniform(self.settings.speed[0], self.settings.speed[1], changes)
+        turn = rng.uniform(self.settings.turn[0], self.settings.turn[1], changes)
+        turn[0] = 0.0
+        self._direction: Array = np.cumsum(turn)
+        self._velocity: Array = speed[:, None] * np.stack([np.cos(self._direction), np.sin(self._direction)], axis=-1)
+
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
+        number = self._segment(tick)
+        ahead = turned(self._velocity[number], -float(state.yaw))
+        off = (self._direction[number] - float(state.yaw) + math.pi) % (2.0 * math.pi) - math.pi
+        turn = min(max(self.settings.turn_gain * off, -self.settings.yaw_rate), self.settings.yaw_rate)
+        if not self._velocity[number].any() and abs(off) < 0.05:
+            turn = 0.0  # asked to stand, and facing the right way: no stepping on the spot
+        # Until it faces the way, it walks by the part of the velocity that lies ahead: sideways it can hardly go.
+        return Instruction(velocity=np.array([max(float(ahead[0]), 0.0), 0.0, turn]))
+
+    def success(self, trace: Trace) -> bool:
+        return not trace.fallen and self._error(trace) <= self.settings.tolerance
+
+    def metrics(self, trace: Trace) -> dict[str, float]:
+        return {
+            "velocity_error_mps": self._error(trace),
+            "top_speed_mps": measures.top_speed(trace),
+            "distance_m": measures.path_length(trace, self.settings.cycle),
+        }
+
+    def _segment(self, tick: int) -> int:
+        return min(tick // max(round(self.settings.every / self.dt), 1), len(self._velocity) - 1)
+
+    def _error(self, trace: Trace) -> float:
+        """Mean |measured - asked| planar velocity over the ground [m/s], over whole gait cycles of what counts."""
+        every, cycle = max(round(self.settings.every / self.dt), 1), max(round(self.settings.cycle / self.dt), 1)
+        bounds = [*range(0, len(trace.yaw), every), len(trace.yaw)]
+        errors = []
+        for start, end in itertools.pairwise(bounds):
+            for first in range(start + round(self.settings.settle / self.dt), end - cycle + 1, cycle):
+                rows = slice(first, first + cycle)
+                cos, sin = np.cos(trace.yaw[rows]), np.sin(trace.yaw[rows])
+                forward, left = trace.velocity[rows, 0], trace.velocity[rows, 1]
+                ground = np.stack([cos * forward - sin * left, sin * forward + cos * left], axis=-1).mean(0)
+                errors.append(np.linalg.norm(ground - self._velocity[self._segment(start)]))
+        return float(np.mean(errors)) if errors else float("nan")
