@@ -174,6 +174,7 @@ class RigProcess:
             save_robot(self.robot, robot)
         command = [
             sys.executable,
+            "-P",  # or a file in the present folder could stand for a module
             "-m",
             "sim.rig.server",
             "--robot",
