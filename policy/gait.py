@@ -15,6 +15,7 @@ from hw.hal import Array, ReferenceFrames
 from hw.legs import LegInverse, Legs
 from hw.robot import Robot
 
+_SMOOTH = 0.3  # of a smooth swing's easing that is left at full speed
 _ACROSS = 5.0  # rad/s of turning that weigh as much as 1 m/s sideways
 
 
@@ -37,7 +38,7 @@ class GaitSettings:
     backward_shift: float  # m that the feet trail for each m/s backward
     max_velocity: tuple[float, float, float]  # forward, sideways, turning
     max_backward: float  # m/s
-    max_stride: float  # m/s forward that steps are made for: soft legs cannot follow longer ones
+    even_swing: tuple[float, float]  # m/s forward between which swings grow even: smooth ones ask for too fast joints
     acceleration: tuple[float, float, float]  # a second
     ankle_pitch_gain: float
     ankle_roll_gain: float
@@ -122,15 +123,12 @@ class Gait:
         u = np.clip((local - start) / swing_share, 0.0, 1.0)  # 0..1 through the swing
         swinging = (u > 0) & (u < 1)
         stance = (local - start - swing_share) % 1.0 / (1.0 - swing_share)  # 0..1 through the stance
-        travel = np.where(swinging, -0.5 + u - np.sin(2 * np.pi * u) / (2 * np.pi), 0.5 - stance)  # back..front
+        even = np.interp(velocity[..., 0], s.even_swing, [1.0, _SMOOTH])[..., None]
+        travel = np.where(swinging, -0.5 + u - even * np.sin(2 * np.pi * u) / (2 * np.pi), 0.5 - stance)  # back..front
         lift = np.where(swinging, np.sin(np.pi * u) ** 2, 0.0) * activity[..., None]
 
         period = (1.0 - swing_share) * s.cycle  # that a foot stands
-        vx, vy, wz = (
-            np.minimum(velocity[..., None, 0], s.max_stride),
-            s.sideways_gain * velocity[..., None, 1],
-            velocity[..., None, 2],
-        )
+        vx, vy, wz = velocity[..., None, 0], s.sideways_gain * velocity[..., None, 1], velocity[..., None, 2]
         backward = np.minimum(vx, 0.0)
         vx = vx + (s.backward_gain - 1.0) * backward
         yaw = wz * period * travel
