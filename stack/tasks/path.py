@@ -103,10 +103,8 @@ def _layout(settings: PathSettings) -> Array:
         along = np.linspace(0.0, at[-1], max(round(at[-1] / _SPACING), 1) + 1)
         return np.stack([np.interp(along, at, corners[:, axis]) for axis in (0, 1)], axis=-1)
     radius = settings.radius
-    turn = np.linspace(0.0, 2.0 * math.pi, max(round(2.0 * math.pi * radius / _SPACING), 2) + 1)
-    circle = radius * np.stack([np.sin(turn), 1.0 - np.cos(turn)], axis=-1)
-    if settings.shape == "circle":
-        return circle
+    whole = 2.0 * math.pi if settings.shape == "circle" else math.pi
+    turn = np.linspace(0.0, whole, max(round(whole * radius / _SPACING), 2) + 1)
+    arc = radius * np.stack([np.sin(turn), 1.0 - np.cos(turn)], axis=-1)
     # The second half of an S turns the other way: it is the first one, turned by half a turn about its end.
-    half = circle[: len(circle) // 2 + 1]
-    return np.vstack([half, 2.0 * half[-1] - half[-2::-1]])
+    return arc if settings.shape == "circle" else np.vstack([arc, 2.0 * arc[-1] - arc[-2::-1]])

@@ -40,6 +40,13 @@ class Text(BaseTask):
         super().__init__(settings, dt)
         self._asked: int | None = None if settings.sentence is None else _understood(settings.sentence)
 
+    @staticmethod
+    def complete(settings: dict[str, str]) -> dict[str, str]:
+        """Raises ConfigError for a sentence without a word, which would otherwise count as none given."""
+        if not settings.get("sentence", "some").strip():
+            raise ConfigError("--set sentence=: is empty; write one such as 'walk forward'")
+        return settings
+
     def reset(self, rng: np.random.Generator) -> None:
         """Draw motions, each another one than before, and a sentence for each."""
         self._motions: list[int] = []

@@ -13,7 +13,7 @@ import torch
 
 from hw.config import ConfigError
 from hw.hal import Array, Percept, State, Trace
-from stack.tasks import load_settings, load_task, measures, names
+from stack.tasks import load_settings, load_task, measures, names, task_class
 from stack.tasks.approach import Approach
 from stack.tasks.guidance import Weights, integrate_twist, twist_cost
 
@@ -67,11 +67,13 @@ def test_tasks_load_without_torch_or_mujoco() -> None:
 
 def test_every_task_has_a_file_that_agrees_with_its_defaults() -> None:
     """A default that differs from the file would be a figure that a reader of either believes wrongly."""
-    assert names() == ("stand", "walk", "goal")
+    assert names()[:3] == ("stand", "walk", "goal")
     for name in names():
         settings = load_settings(name)
-        assert settings == type(settings)(seconds=settings.seconds)
-    assert [load_task(name).seconds for name in names()] == [10.0, 30.0, 60.0]
+        if task_class(name).name == name:  # the others are the same class with other settings
+            assert settings == type(settings)(seconds=settings.seconds, cost=settings.cost), name
+    assert [load_task(name).seconds for name in names()[:3]] == [10.0, 30.0, 60.0]
+    assert {load_task(name).name for name in names()} == set(names())
 
 
 def test_unknown_task_and_setting_offer_the_nearest() -> None:
