@@ -57,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
         report.result(
             {
                 "ports": [asdict(port) for port in before.values()],
-                "changed": None if changed is None else {"what": changed[0], **asdict(changed[1])},
+                "changed": None if changed is None else {"how": changed[0], **asdict(changed[1])},
             }
         )
     return exit_codes.DONE
