@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 
 from hw.hal import Array
 from hw.robot import Robot
-from sim.model import build
 
 _LEVER = 0.015  # m: what lies closer to the axis hardly moves
 _WORDS = (("forward", "backward"), ("left", "right"), ("up", "down"))  # of the base's axes
@@ -18,6 +16,10 @@ def describe_turns(robot: Robot, pose: Array, signs: Array) -> list[str]:
 
     Directions are those of a robot that stands upright. Raises ConfigError when its model does not fit its file.
     """
+    import mujoco
+
+    from sim.model import build
+
     model = build(robot)
     data = mujoco.MjData(model)
     for name, angle in zip(robot.names, pose.tolist(), strict=True):
