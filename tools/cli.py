@@ -53,6 +53,14 @@ VERBS: dict[str, Verb] = {
             "diffusion": Verb("the diffusion planner-controller", "tools.train.diffusion"),
         },
     ),
+    "evaluate": Verb(
+        "measure a policy the way that papers do",
+        verbs={
+            "papers": Verb(
+                "the tables of UniPhys and Diffuse-CLoC, with a column of one's own", "tools.evaluate.papers"
+            )
+        },
+    ),
     "bench": Verb(
         "measure speed and what faults do, on this machine",
         verbs={

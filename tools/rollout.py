@@ -7,15 +7,25 @@ and any episode can be repeated with `servoid run TASK --seed S`.
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import time
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from hw.config import ConfigError
-from hw.hal import Backend, Truth
+from hw.hal import Backend, Task, Trace, Truth
+from tools.intervals import wilson
 from tools.output import add_json_argument, reporting
 from tools.parser import add_set_argument, settings
+
+if TYPE_CHECKING:
+    from stack.session import Settings
+    from tools.witness import Witness
+
+Job = TypeVar("Job")
+Answer = TypeVar("Answer")
 
 _ENDED = ("succeeded", "failed", "timed_out")  # outcomes of runs whose task ended by itself
 
@@ -64,8 +74,6 @@ def episode_seed(seed: int, episode: int) -> int:
 
 def run_all(args: argparse.Namespace, values: dict[str, str], report: Any) -> list[dict[str, Any]]:
     """All episodes' rows, in order, on `--workers` processes. Bad settings are refused before any starts."""
-    import multiprocessing as mp
-
     from tqdm import tqdm
 
     from stack.session import Settings
@@ -85,11 +93,64 @@ def run_all(args: argparse.Namespace, values: dict[str, str], report: Any) -> li
         for seed in seeds
     ]
     workers = min(args.workers or os.cpu_count() or 1, len(jobs))
+    if workers > 1:
+        episode_check(jobs[0])
+    rows: list[dict[str, Any]] = [{}] * len(jobs)
+    done = each(_numbered, enumerate(jobs), workers)
+    for i, row in tqdm(done, total=len(jobs), unit="episode", mininterval=2.0):
+        rows[i] = row
+    return rows
+
+
+def _numbered(job: tuple[int, Settings]) -> tuple[int, dict[str, Any]]:
+    return job[0], episode(job[1])
+
+
+def each(
+    work: Callable[[Job], Answer], jobs: Iterable[Job], workers: int, deadline: float | None = None
+) -> Iterator[Answer]:
+    """`work(job)` of each job on `workers` processes, as they come: those that are quicker come first.
+
+    `work` must be picklable. A job is only asked for when a process is about to be free for it, so that the jobs may
+    depend on the answers. At `deadline`, by `time.monotonic`, what still runs is given up. With one worker everything
+    is done here, and a job that runs is finished. Raises what `work` raises.
+    """
+    import multiprocessing as mp
+    import queue
+
     if workers == 1:
-        return [episode(job) for job in tqdm(jobs, unit="episode", mininterval=2.0)]
-    episode_check(jobs[0])
+        for job in jobs:
+            if deadline is not None and time.monotonic() >= deadline:
+                return
+            yield work(job)
+        return
+    answers: queue.SimpleQueue[tuple[bool, Any]] = queue.SimpleQueue()
+    coming, running = iter(jobs), 0
     with mp.get_context("spawn").Pool(workers, _one_thread) as pool:
-        return list(tqdm(pool.imap(episode, jobs), total=len(jobs), unit="episode", mininterval=2.0))
+        while True:
+            while running < workers + 1:  # one in hand, so that no process waits for this one
+                try:
+                    job = next(coming)
+                except StopIteration:
+                    break
+                pool.apply_async(
+                    work,
+                    (job,),
+                    callback=lambda x: answers.put((True, x)),
+                    error_callback=lambda e: answers.put((False, e)),
+                )
+                running += 1
+            if not running:
+                return
+            answer = None
+            with suppress(queue.Empty):
+                answer = answers.get(timeout=None if deadline is None else max(deadline - time.monotonic(), 0.0))
+            if answer is None:
+                return
+            running -= 1
+            if not answer[0]:
+                raise answer[1]
+            yield answer[1]
 
 
 def _one_thread() -> None:
@@ -101,7 +162,7 @@ def _one_thread() -> None:
         os.environ[name] = "1"
 
 
-def episode_check(job: Any) -> None:
+def episode_check(job: Settings) -> None:
     """Raise here, in the parent, what every episode would raise: an unknown task, policy, robot or key."""
     from dataclasses import replace
 
@@ -110,8 +171,23 @@ def episode_check(job: Any) -> None:
     run(replace(job, seconds=0.1))
 
 
-def episode(job: Any) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Judged:
+    """One run as the truth saw it."""
+
+    row: dict[str, Any]  # what a rollout keeps of it
+    task: Task
+    trace: Trace
+    witness: Witness
+
+
+def episode(job: Settings) -> dict[str, Any]:
     """One run, judged by the truth. One that the guard broke off is no success, however far it came."""
+    return judge(job).row
+
+
+def judge(job: Settings) -> Judged:
+    """One run, with everything that the truth shows of it."""
     from hw.robot import load_robot
     from stack.session import prepare, run
     from tools.witness import Witness
@@ -120,7 +196,7 @@ def episode(job: Any) -> dict[str, Any]:
     witness = Witness(simulated_truth(backend), load_robot(job.robot).dt, getattr(backend, "stage", None))
     result = run(job, backend=backend, on_tick=witness)
     trace = witness.trace()
-    return {
+    row = {
         "seed": job.seed,
         "outcome": result.outcome,
         "success": result.outcome in _ENDED and bool(task.success(trace)),
@@ -129,6 +205,7 @@ def episode(job: Any) -> dict[str, Any]:
         "metrics": task.metrics(trace) if len(trace.yaw) else {},
         "odometry_error_m": witness.odometry_error(result.trace),
     }
+    return Judged(row, task, trace, witness)
 
 
 def simulated_truth(backend: Backend) -> Truth:
@@ -137,13 +214,6 @@ def simulated_truth(backend: Backend) -> Truth:
     if truth is None:
         raise ConfigError(f"backend '{backend.name}' has no truth to judge by: use a simulated one, or `servoid run`")
     return truth
-
-
-def wilson(successes: int, n: int) -> list[float]:
-    """95 % confidence interval of a share (E. B. Wilson, 1927)."""
-    z, p = 1.959964, successes / n
-    centre, spread = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return [max((centre - spread) / (1 + z * z / n), 0.0), min((centre + spread) / (1 + z * z / n), 1.0)]
 
 
 def summarise(args: argparse.Namespace, rows: list[dict[str, Any]], wall_seconds: float) -> dict[str, Any]:

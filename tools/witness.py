@@ -8,6 +8,7 @@ import numpy as np
 
 from hw.hal import Array, Trace, Truth
 from stack.loop import TickRecord
+from tools.motion import Poses
 
 if TYPE_CHECKING:
     from sim.scene import Stage
@@ -20,15 +21,19 @@ class Witness:
         self._truth, self._dt, self._stage = truth, dt, stage
         self._rows: list[tuple[Array, float, Array, float, Array]] = []
         self._joints: list[Array] = []
+        self._up: list[Array] = []
         self._obstacles: list[Array] = []
         self._fallen = self._touched = False
+        self.upright = 0  # ticks of the task before the robot had fallen
 
     def __call__(self, record: TickRecord) -> None:
         instruction, truth = record.proposal.instruction, self._truth
         if instruction is None:
             return
         self._fallen |= bool(truth.fallen[0])
+        self.upright += not self._fallen
         self._joints.append(truth.joints[0].copy())
+        self._up.append(-truth.gravity[0])
         if self._stage is not None:
             self._touched |= bool(truth.touching[0])
             self._obstacles.append(self._stage.obstacles)
@@ -56,6 +61,18 @@ class Witness:
             joints=np.array(self._joints),
             obstacles=_turned(np.array(self._obstacles) - origin, yaw[0]) if self._obstacles else None,
             touched=self._touched if self._obstacles else None,
+        )
+
+    def poses(self) -> Poses:
+        """All poses before the robot had fallen."""
+        upright = slice(self.upright)
+        position, yaw, *_ = zip(*self._rows, strict=True) if self._rows else ((), ())
+        return Poses(
+            self._dt,
+            np.array(position[upright]).reshape(-1, 3),
+            np.array(yaw[upright], dtype=float),
+            np.array(self._up[upright]).reshape(-1, 3),
+            np.array(self._joints[upright]),
         )
 
     def odometry_error(self, estimate: Trace) -> float:

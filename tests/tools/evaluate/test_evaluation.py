@@ -1,0 +1,261 @@
+"""Evaluations go on where they were, do nothing twice, and notice what changed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hw.config import ConfigError
+from policy.checkpoint import resolve
+from tools.cli import main
+from tools.evaluate import session
+from tools.evaluate.cache import EpisodeCache, key
+from tools.evaluate.episode import Done, Job
+from tools.evaluate.pilots import Pilots, spec
+from tools.evaluate.rows import Metric, Network, Row, Run
+from tools.evaluate.session import Options, evaluate
+from tools.rollout import each
+
+NEAR = Row("t/near", "T", "Near", Run("goal-near", episodes=4), Metric("success", share=True))
+FALLS = Row("t/falls", "T", "Falls", Run("goal-near", episodes=4), Metric("fell", share=True))
+FAR = Row("t/far", "T", "Far", Run("goal-far", episodes=2), Metric("success", share=True))
+
+
+@pytest.fixture
+def done(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
+    """Episodes that were done, in order; none of them is really run."""
+    jobs: list[Job] = []
+
+    def do(job: Job) -> Done:
+        jobs.append(job)
+        if job.settings.task == "stand":
+            return Done(job, {}, "the floor is missing")
+        return Done(job, {"success": True, "fell": False, "outcome": "succeeded", "seed": job.settings.seed})
+
+    monkeypatch.setattr(session, "do", do)
+    return jobs
+
+
+def options(out: Path, **more: Any) -> Options:
+    return Options(out=out, policy="gait", workers=1, **more)
+
+
+def quiet(text: str) -> None:
+    """Say nothing."""
+
+
+def test_episodes_are_done_in_turns_once_for_all_rows_that_share_them(tmp_path: Path, done: list[Job]) -> None:
+    measured = evaluate([NEAR, FALLS, FAR], options(tmp_path), quiet)
+    order = [(job.settings.task, job.episode) for job in done]
+    assert order == [
+        ("goal-near", 0),
+        ("goal-far", 0),
+        ("goal-near", 1),
+        ("goal-far", 1),
+        ("goal-near", 2),
+        ("goal-near", 3),
+    ]
+    assert measured["t/near"].records == measured["t/falls"].records
+    assert len({job.settings.seed for job in done if job.settings.task == "goal-near"}) == 4
+
+
+def test_what_was_done_is_not_done_again(tmp_path: Path, done: list[Job]) -> None:
+    evaluate([NEAR], options(tmp_path, episodes=2), quiet)
+    assert len(done) == 2
+    first = evaluate([NEAR], options(tmp_path), quiet)
+    assert [job.episode for job in done] == [0, 1, 2, 3]
+    assert evaluate([NEAR], options(tmp_path), quiet) == first
+    assert len(done) == 4
+    evaluate([NEAR], options(tmp_path, fresh=True), quiet)
+    assert len(done) == 8
+
+
+def test_a_half_written_line_is_done_again_and_the_file_stays_whole(tmp_path: Path, done: list[Job]) -> None:
+    evaluate([NEAR], options(tmp_path), quiet)
+    (path,) = (tmp_path / "episodes").glob("*.jsonl")
+    path.write_text(path.read_text()[:-20])  # as a kill in the middle of a write leaves it
+    evaluate([NEAR], options(tmp_path), quiet)
+    assert [job.episode for job in done] == [0, 1, 2, 3, 3]
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [line["episode"] for line in lines[1:]] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"seconds": 5.0}])
+def test_other_settings_are_other_episodes(tmp_path: Path, done: list[Job], change: dict[str, Any]) -> None:
+    evaluate([NEAR], options(tmp_path), quiet)
+    evaluate([NEAR], options(tmp_path, **change), quiet)
+    assert len(done) == 8
+
+
+def test_a_changed_checkpoint_setting_or_task_changes_what_episodes_depend_on(tmp_path: Path) -> None:
+    checkpoint = tmp_path / "mine.safetensors"
+    shutil.copy(resolve("diffusion"), checkpoint)
+
+    def made_of(run: Run) -> str:
+        return key(spec(run, Pilots(str(checkpoint), tmp_path), "op3", 0, None, None))
+
+    run = Run("goal-near")
+    before = made_of(run)
+    assert made_of(Run("goal-near", episodes=7)) == before  # more of the same
+    others = [
+        made_of(Run("goal-near", set={"radius": "0.09"})),
+        made_of(Run("goal-near", plan={"replan": "8"})),
+        made_of(Run("goal-near", randomise=True)),
+        made_of(Run("goal-near", backend="virtual")),
+        made_of(Run("goal-near", policy="expert")),
+        made_of(Run("goal-far")),
+    ]
+    elsewhere = tmp_path / "elsewhere" / "other.safetensors"
+    elsewhere.parent.mkdir()
+    shutil.copy(checkpoint, elsewhere)
+    assert key(spec(run, Pilots(str(elsewhere), tmp_path), "op3", 0, None, None)) == before  # the same bytes
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-4] + b"\0\0\0\1")
+    assert len({before, *others, made_of(run)}) == 8
+
+
+def test_a_policy_that_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = tmp_path / "mine.safetensors"
+    shutil.copy(resolve("diffusion"), checkpoint)
+
+    def do(job: Job) -> Done:
+        checkpoint.write_bytes(checkpoint.read_bytes()[:-4] + b"\0\0\0\1")
+        return Done(job, {"success": True})
+
+    monkeypatch.setattr(session, "do", do)
+    with pytest.raises(ConfigError, match="changed while"):
+        evaluate([NEAR], Options(tmp_path, policy=str(checkpoint), workers=1), quiet)
+    assert not any('"episode"' in path.read_text() for path in (tmp_path / "episodes").glob("*.jsonl"))
+
+
+def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done: list[Job]) -> None:
+    stand = Row("t/stand", "T", "Stand", Run("stand", episodes=3), Metric("success", share=True))
+    variant = Row("t/variant", "T", "Variant", Run("goal-near", plan={"replan": "8"}), Metric("success", share=True))
+    measured = evaluate([stand, variant, FAR], options(tmp_path), quiet)
+    assert measured["t/stand"].refused == "the floor is missing"
+    assert sum(job.settings.task == "stand" for job in done) == 1
+    assert "for diffusion models" in (measured["t/variant"].refused or "")
+    assert len(measured["t/far"].records) == 2
+
+
+def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path, done: list[Job]) -> None:
+    run = Run("goal-near", episodes=1, network=Network("full", "--mask full"))
+    row = Row("t/full", "T", "Full", run, Metric("success", share=True))
+    chosen = Options(tmp_path, policy="diffusion", workers=1)
+    measured = evaluate([row], chosen, quiet)["t/full"]
+    assert measured.training == f"servoid train diffusion --data runs/walks --out {tmp_path}/networks/full --mask full"
+    assert not measured.records
+    path = tmp_path / "networks" / "full" / "best.safetensors"
+    path.parent.mkdir(parents=True)
+    shutil.copy(resolve("diffusion"), path)
+    assert len(evaluate([row], chosen, quiet)["t/full"].records) == 1
+    assert str(path.resolve()) in Path(done[0].settings.policy).read_text()
+
+
+def test_variants_of_the_planner_are_files_that_the_policy_is_made_from(tmp_path: Path) -> None:
+    from policy.diffusion.settings import load_settings
+
+    pilots = Pilots("diffusion", tmp_path)
+    assert pilots.name(Run("goal")) == "diffusion"
+    assert pilots.name(Run("goal", policy="expert")) == "expert"
+    written = load_settings(pilots.name(Run("goal", plan={"replan": "8", "guidance.clip": "3"})))
+    assert (written.replan, written.guidance.clip) == (8, 3.0)
+    assert written.steps == load_settings().steps
+    with pytest.raises(ConfigError, match="replann"):
+        pilots.name(Run("goal", plan={"replann": "8"}))
+
+
+def test_no_episode_begins_after_the_deadline() -> None:
+    seen = list(each(abs, iter([-1, -2, -3]), 1, time.monotonic() - 1.0))
+    assert seen == []
+    assert sorted(each(abs, iter([-1, -2, -3]), 2)) == [1, 2, 3]
+    begun = time.monotonic()
+    assert list(each(time.sleep, iter([600.0]), 2, begun + 2.0)) == []  # what still runs is given up
+    assert time.monotonic() - begun < 60.0
+
+
+def test_jobs_are_asked_for_when_they_can_be_done() -> None:
+    """So that a run which refuses its settings does not do so a hundred times."""
+    asked = []
+
+    def jobs():
+        for i in range(20):
+            asked.append(i)
+            yield i
+
+    for answer in each(abs, jobs(), 2):
+        assert len(asked) <= answer + 2 * 3
+        break
+
+
+def test_a_cache_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="--out"):
+        EpisodeCache(tmp_path / "file", {"a": 1})
+
+
+def test_the_command_from_episodes_to_pictures(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A real one, two seconds long, with a pillar or two; and again, from what was kept."""
+    words = [
+        "evaluate",
+        "papers",
+        "--rows",
+        "uniphys/goal-near",
+        "cloc/forest",
+        "cloc/attention-full",
+        "--policy",
+        "gait",
+    ]
+    words += ["--episodes", "1", "--seconds", "2", "--workers", "1", "--out", str(tmp_path), "--json"]
+    assert main(words) == 0
+    (line,) = capfd.readouterr().out.splitlines()
+    first = json.loads(line)
+    assert {"paper", "row", "published", "figure", "value", "ci95", "episodes", "reached"} <= set(first["rows"][0])
+    rows = {row["name"]: row for row in first["rows"]}
+    assert [rows[name]["episodes"] for name in ("uniphys/goal-near", "cloc/forest", "cloc/attention-full")] == [1, 1, 0]
+    assert rows["cloc/attention-full"]["value"] is None
+    assert "--mask full" in rows["cloc/attention-full"]["note"]
+    assert "jump" in " ".join(first["left_out"]).lower()
+    page = (tmp_path / "papers.md").read_text()
+    assert "Goal, near: success" in page
+    assert "cut to 2 s" in page
+    assert (tmp_path / "papers.csv").read_text().count("\n") == 1 + len(rows)
+    for name in ("paths-uniphys-goal-near.png", "paths-cloc-forest.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+        assert name in page
+    kept = [json.loads(path.read_text().splitlines()[1]) for path in (tmp_path / "episodes").glob("*.jsonl")]
+    forest = next(record for record in kept if len(record["pillars"]))
+    assert len(forest["pillars"]) == 15
+    assert forest["ticks"] == 100
+    assert forest["motion"]["jerk_mps3"] > 0
+    main(words)
+    (line,) = capfd.readouterr().out.splitlines()
+    assert json.loads(line)["rows"] == first["rows"]
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--rows", "uniphys/gaol-near"], "uniphys/goal-near"),
+        (["--episodes", "0"], "--episodes"),
+        (["--minutes", "-1"], "--minutes"),
+        (["--policy", "gate"], "gait"),
+        (["--robot", "op4"], "op4"),
+    ],
+)
+def test_bad_choices_are_refused(words: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert main(["evaluate", "papers", "--out", str(tmp_path), *words]) == 2
+    assert named in capsys.readouterr().err
+
+
+def test_the_text_encoder_is_measured_apart() -> None:
+    from policy.text.captions import MOTIONS
+    from tools.evaluate.papers import encoder_accuracy
+
+    result = encoder_accuracy()
+    assert result["phrasings"] == sum(len(motion.held_out) for motion in MOTIONS)
+    assert 0.5 < result["accuracy"] <= 1.0

@@ -1,0 +1,137 @@
+"""The table's logic: values, intervals, figures to reach, and rows that have none."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from hw.config import ConfigError
+from tools.evaluate.rows import Beside, Metric, Network, Row, Run, select
+from tools.evaluate.summary import Measured, table
+from tools.evaluate.table import ROWS
+from tools.evaluate.write import as_csv, cells, markdown
+from tools.intervals import bootstrap
+
+SHARE = Row("a/share", "A", "Share", Run("goal"), Metric("success", share=True), 0.95, figure=0.9)
+FALLS = Row("a/falls", "A", "Falls", Run("goal"), Metric("fell", share=True, lower=True), 0.16, figure=0.16)
+ERROR = Row("a/error", "A", "Error", Run("goal"), Metric("metrics.error_m", "m", lower=True), 0.1, figure=0.05)
+TWICE = Row("a/twice", "A", "Twice", Run("goal"), Metric("ticks", lower=True), figure=Beside("a/expert", 1.2))
+EXPERT = Row("a/expert", "A", "Expert", Run("goal", policy="expert"), Metric("ticks", lower=True))
+
+
+def records(n: int, good: int) -> list[dict]:
+    return [
+        {"success": i < good, "fell": i >= good, "ticks": 100 + i, "metrics": {"error_m": 0.04}, "outcome": "succeeded"}
+        for i in range(n)
+    ]
+
+
+def one(row: Row, measured: Measured) -> dict:
+    (line,) = table([row], {row.name: measured})
+    return line
+
+
+def test_a_share_has_wilsons_interval_and_is_held_against_its_figure() -> None:
+    line = one(SHARE, Measured(records(200, 190)))
+    assert (line["value"], line["episodes"], line["reached"]) == (0.95, 200, True)
+    assert line["ci95"] == pytest.approx([0.9104, 0.9726], abs=5e-4)
+    assert one(SHARE, Measured(records(200, 179)))["reached"] is False
+
+
+def test_less_is_better_where_it_is() -> None:
+    assert one(FALLS, Measured(records(100, 84)))["reached"] is True
+    assert one(FALLS, Measured(records(100, 83)))["reached"] is False
+
+
+def test_episodes_without_the_figure_do_not_count_and_are_told() -> None:
+    some = records(5, 5)
+    some[0]["metrics"] = {}
+    some[1]["metrics"]["error_m"] = math.nan
+    some[2]["metrics"]["error_m"] = None  # as it comes back from a file
+    line = one(ERROR, Measured(some))
+    assert (line["episodes"], line["value"]) == (2, pytest.approx(0.04))
+    assert "3 more episodes" in line["note"]
+
+
+def test_a_figure_may_be_another_rows_value() -> None:
+    lines = table([TWICE, EXPERT], {"a/twice": Measured(records(3, 3)), "a/expert": Measured(records(1, 1))})
+    assert lines[0]["figure"] == pytest.approx(120.0)
+    assert lines[0]["reached"] is True
+    assert lines[1]["reached"] is None  # no figure was set
+    lines = table([TWICE, EXPERT], {"a/twice": Measured(records(3, 3)), "a/expert": Measured()})
+    assert (lines[0]["figure"], lines[0]["reached"]) == (None, False)
+
+
+@pytest.mark.parametrize(
+    ("measured", "told"),
+    [
+        (Measured(training="servoid train diffusion --mask full"), "`servoid train diffusion --mask full`"),
+        (Measured(refused="unknown setting 'x'"), "unknown setting 'x'"),
+        (Measured(), "no time was left"),
+    ],
+)
+def test_what_was_not_measured_has_no_value_and_says_why(measured: Measured, told: str) -> None:
+    line = one(SHARE, measured)
+    assert (line["value"], line["ci95"], line["episodes"], line["reached"]) == (None, None, 0, False)
+    assert told in line["note"]
+    assert "none" in cells(line)
+
+
+def test_an_episode_that_the_guard_broke_off_is_told() -> None:
+    some = records(4, 4)
+    some[3]["outcome"] = "stopped"
+    assert "1 stopped by the guard" in one(SHARE, Measured(some))["note"]
+
+
+def test_bootstrap_covers_the_mean_and_is_the_same_each_time() -> None:
+    values = [float(x) for x in range(100)]
+    low, high = bootstrap(values) or (0.0, 0.0)
+    assert low == pytest.approx(49.5 - 1.96 * 28.9 / 10, abs=0.5)  # the normal interval, which this many values follow
+    assert high == pytest.approx(49.5 + 1.96 * 28.9 / 10, abs=0.5)
+    assert bootstrap(values) == [low, high]
+    assert bootstrap([1.0]) is None
+
+
+def test_markdown_and_csv_hold_what_the_table_does() -> None:
+    line = one(SHARE, Measured(records(200, 190))) | {"note": "a | b"}
+    page = markdown("Papers", ["policy: x"], [line], ["![p](p.png)"])
+    assert "| A | Share | 0.95 | at least 0.9 | 0.95 | 0.91 to 0.973 | 200 | yes | a \\| b |" in page
+    head, row = as_csv([line]).splitlines()
+    assert head.startswith("paper,row,name,published")
+    assert row.startswith("A,Share,a/share,0.95,")
+
+
+def test_rows_are_chosen_by_pattern_and_bring_what_they_are_held_against() -> None:
+    rows = [SHARE, FALLS, TWICE, EXPERT]
+    assert [row.name for row in select(rows, ["a/tw*"], quick=False)] == ["a/twice", "a/expert"]
+    assert select(rows, [], quick=True) == rows
+    with pytest.raises(ConfigError, match="did you mean 'a/share'"):
+        select(rows, ["a/sharee"], quick=False)
+
+
+def test_every_row_can_be_told_apart_and_is_of_a_task_that_there_is() -> None:
+    from stack.tasks import load_settings
+
+    assert len({row.name for row in ROWS}) == len(ROWS)
+    for row in ROWS:
+        load_settings(row.run.task, dict(row.run.set))
+        assert row.run.episodes >= 50
+    for row in ROWS:
+        if isinstance(row.figure, Beside):
+            assert row.figure.row in {other.name for other in ROWS}
+
+
+def test_the_main_rows_are_repeated_on_the_randomised_robot_and_four_on_the_virtual_one() -> None:
+    assert sum(row.run.randomise for row in ROWS) == 8
+    assert sum(row.run.backend == "virtual" for row in ROWS) == 4
+    quick = select(ROWS, [], quick=True)
+    assert not any(row.run.randomise or row.run.backend != "sim" or row.run.network for row in quick)
+
+
+def test_networks_are_named_apart() -> None:
+    """Two networks in one folder would be measured as one."""
+    trained = [row.run.network for row in ROWS if row.run.network is not None]
+    assert len({network.name for network in trained}) == len(
+        {(n.name, n.train) for n in trained if isinstance(n, Network)}
+    )

@@ -1,0 +1,1 @@
+"""Evaluation by the simulation's truth."""

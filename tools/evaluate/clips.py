@@ -1,0 +1,60 @@
+"""Recorded motions to take keyframes from: runs of the expert that no training saw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hw.config import ConfigError
+from tools.evaluate.cache import key
+
+SECONDS = 10.0
+SEED = 7_000_000  # of the first clip; demonstrations come from other streams
+_TRIES = 4  # times as many runs as clips, since some may fall
+
+
+def recipe(robot: str) -> dict[str, Any]:
+    """What clips depend on beside their number. Raises ConfigError for an unknown robot."""
+    from dataclasses import asdict
+
+    from hw.robot import load_robot
+    from policy.checkpoint import resolve
+    from policy.gait import load_gait
+    from stack.provenance import fingerprint, sha256
+
+    return {
+        "expert": sha256(resolve("expert")),
+        "gait": asdict(load_gait()),
+        "robot": fingerprint(load_robot(robot)),
+        "seconds": SECONDS,
+        "seed": SEED,
+    }
+
+
+def record_clips(folder: Path, robot: str, number: int) -> list[Path]:
+    """Flight logs of `number` walks in all directions, recorded where they are not in `folder` yet.
+
+    Raises ConfigError where the expert falls too often.
+    """
+    from stack.session import Settings, run
+
+    place, clips = folder / key(recipe(robot)), []
+    for seed in range(SEED, SEED + _TRIES * number):
+        path, fallen = place / f"walk-{seed}.mcap", place / f"walk-{seed}.fell"
+        if fallen.exists():
+            continue
+        if not path.exists():
+            # Under another name until it is whole: a killed program leaves no half clip behind.
+            part = place / f"part-{seed}.mcap"
+            place.mkdir(parents=True, exist_ok=True)
+            part.unlink(missing_ok=True)
+            result = run(Settings("walk", policy="expert", robot=robot, seconds=SECONDS, seed=seed, record=part))
+            if result.outcome not in ("succeeded", "timed_out"):
+                part.unlink()
+                fallen.touch()
+                continue
+            part.rename(path)
+        clips.append(path.resolve())
+        if len(clips) == number:
+            return clips
+    raise ConfigError(f"{place}: the expert fell in most of its walks: only {len(clips)} of {number} clips are there")

@@ -1,0 +1,94 @@
+"""One episode of an evaluation: what a rollout keeps of it, how the motion was made, and its path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hw.config import ConfigError
+from hw.hal import Array, Trace
+
+if TYPE_CHECKING:
+    from stack.session import Settings
+
+PATH_STEP = 0.2  # s between the points of a path that is kept
+
+
+@dataclass(frozen=True)
+class Job:
+    """An episode to be done, by the numbers of its run and of itself."""
+
+    run: int
+    episode: int
+    settings: Settings
+
+
+@dataclass(frozen=True)
+class Done:
+    """An episode's record, or why the run refuses its settings."""
+
+    job: Job
+    record: dict[str, Any]
+    refused: str | None = None
+
+
+def do(job: Job) -> Done:
+    """Do an episode. A run that cannot be done is an answer too: the other rows of the table go on."""
+    try:
+        return Done(job, record(job.settings))
+    except ConfigError as error:
+        return Done(job, {}, str(error))
+
+
+def record(settings: Settings) -> dict[str, Any]:
+    """Do an episode and keep what any row could ask of it. Raises ConfigError."""
+    from hw.robot import load_robot
+    from tools.motion import quality
+    from tools.rollout import judge
+
+    judged = judge(settings)
+    trace, task = judged.trace, judged.task
+    limit = round(task.seconds / trace.dt)
+    goal = getattr(task, "goal", None)
+    return {
+        **judged.row,
+        "ticks": min(judged.witness.upright, limit),
+        "motion": quality(judged.witness.poses(), load_robot(settings.robot)),
+        "path": _points(trace.displacement[:, :2], trace.dt),
+        "goal": None if goal is None else np.round(goal, 3),
+        "pillars": _still(trace),
+        "spheres": _rolling(trace),
+    }
+
+
+def _points(places: Array, dt: float) -> Array:
+    """Places `(ticks, 2)`, one for each step of time, and the last one, to the millimetre."""
+    step = max(round(PATH_STEP / dt), 1)
+    thinned = np.concatenate([places[:-1:step], places[-1:]]) if len(places) else places
+    return np.round(thinned, 3)
+
+
+def _still(trace: Trace) -> Array:
+    """Obstacles `(n, 3)` m that stayed where they were: x, y, radius."""
+    if trace.obstacles is None or not len(trace.obstacles):
+        return np.zeros((0, 3))
+    return np.round(trace.obstacles[0][~_moved(trace.obstacles)], 3)
+
+
+def _rolling(trace: Trace) -> list[dict[str, Any]]:
+    """Radius and path of each obstacle that moved."""
+    if trace.obstacles is None or not len(trace.obstacles):
+        return []
+    moving = trace.obstacles[:, _moved(trace.obstacles)]
+    return [
+        {"radius": float(moving[0, i, 2]), "path": _points(moving[:, i, :2], trace.dt)} for i in range(moving.shape[1])
+    ]
+
+
+def _moved(obstacles: Array) -> Array:
+    """Which of the obstacles `(ticks, n, 3)` are not where they were at the start."""
+    apart = np.linalg.norm(obstacles[-1, :, :2] - obstacles[0, :, :2], axis=-1)
+    result: Array = apart > 1e-6
+    return result

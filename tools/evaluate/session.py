@@ -1,0 +1,149 @@
+"""One evaluation: the rows that are asked for, the episodes that they lack, done on all processes, and kept."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hw.config import ConfigError
+from tools.evaluate.cache import EpisodeCache, key
+from tools.evaluate.episode import Job, do
+from tools.evaluate.pilots import Pilots, spec
+from tools.evaluate.rows import Row, Run
+from tools.evaluate.summary import Measured
+from tools.rollout import each, episode_seed
+
+if TYPE_CHECKING:
+    from stack.session import Settings
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to evaluate and how. `episodes` and `seconds` are instead of the rows' own."""
+
+    out: Path
+    policy: str = "diffusion"
+    robot: str = "op3"
+    seed: int = 0
+    episodes: int | None = None
+    seconds: float | None = None  # at most so long an episode: for a try, since figures mean little then
+    workers: int = 0
+    minutes: float | None = None  # then stop, and go on another time
+    fresh: bool = False  # do again what was done
+
+
+@dataclass
+class _Work:
+    """A run of one or more rows, with what was done of it."""
+
+    run: Run
+    settings: Settings
+    pilot: Mapping[str, Any]  # fingerprint of the policy
+    episodes: int
+    cache: EpisodeCache
+    rows: list[str] = field(default_factory=list)
+    refused: str | None = None
+
+    def records(self) -> list[dict[str, Any]]:
+        return [self.cache.records[i] for i in range(self.episodes) if i in self.cache.records]
+
+
+def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[str, Measured]:
+    """Do the episodes that `rows` lack, and return what was measured by the rows' names.
+
+    Episode i has the same seed in every row. Every run gets its first episode before any gets its second, so that an
+    evaluation that is stopped has a bit of everything. A row that cannot be done says why; the others go on. Raises
+    ConfigError for a robot or policy that there is not, or where nothing can be written.
+    """
+    from hw.robot import load_robot
+    from policy.checkpoint import git_commit
+
+    begun = time.monotonic()
+    load_robot(options.robot)
+    pilots = Pilots(options.policy, options.out)
+    works: dict[str, _Work] = {}
+    measured: dict[str, Measured] = {}
+    prepared: dict[str, str | ConfigError] = {}  # key of the work of a run, or why there is none
+    for row in rows:
+        training = pilots.training(row.run)
+        if training is not None:
+            measured[row.name] = Measured(training=training)
+            continue
+        if repr(row.run) not in prepared:
+            try:
+                work = _prepare(row.run, pilots, options)
+                prepared[repr(row.run)] = work.cache.path.name
+                works.setdefault(work.cache.path.name, work)
+            except ConfigError as error:
+                prepared[repr(row.run)] = error
+        found = prepared[repr(row.run)]
+        if isinstance(found, ConfigError):
+            measured[row.name] = Measured(refused=str(found))
+        else:
+            works[found].rows.append(row.name)
+    runs, commit = list(works.values()), git_commit()
+    jobs = list(_jobs(runs, options.seed))
+    cached = sum(len(work.records()) for work in runs)
+    say(f"{len(rows)} rows, {len(runs)} runs: {cached} episodes are there, {len(jobs)} are to be done")
+    deadline = None if options.minutes is None else begun + 60.0 * options.minutes
+    workers = max(min(options.workers or os.cpu_count() or 1, len(jobs)), 1)
+    for done in _progress(each(do, _jobs(runs, options.seed), workers, deadline), len(jobs)):
+        work = runs[done.job.run]
+        if done.refused is not None:
+            work.refused = done.refused
+        else:
+            if pilots.fingerprint(work.run) != work.pilot:
+                raise ConfigError(
+                    f"the policy of {', '.join(work.rows)} changed while its episodes ran: what was done is kept;"
+                    " give the same command again when its files stay as they are"
+                )
+            work.cache.add(done.job.episode, {**done.record, "commit": commit})
+    for work in runs:
+        result = Measured(work.records(), refused=work.refused)
+        measured.update(dict.fromkeys(work.rows, result))
+    return measured
+
+
+def _prepare(run: Run, pilots: Pilots, options: Options) -> _Work:
+    """Raises ConfigError where the run cannot be done."""
+    from stack.session import Settings
+    from stack.tasks import load_settings
+    from tools.evaluate import clips
+
+    chosen, recipe = dict(run.set), None
+    if run.clips:
+        recipe = key(clips.recipe(options.robot) | {"number": run.clips})
+        recorded = clips.record_clips(options.out / "clips", options.robot, run.clips)
+        chosen["clips"] = ":".join(map(str, recorded))
+    own = load_settings(run.task, dict(run.set)).seconds
+    seconds = None if options.seconds is None or options.seconds >= own else options.seconds
+    kept = spec(run, pilots, options.robot, options.seed, seconds, recipe)
+    settings = Settings(
+        task=run.task,
+        backend=run.backend,
+        robot=options.robot,
+        policy=pilots.name(run),
+        randomise=run.randomise,
+        seconds=seconds,
+        set=chosen,
+    )
+    cache = EpisodeCache(options.out / "episodes", kept, options.fresh)
+    return _Work(run, settings, kept["policy"], options.episodes or run.episodes, cache)
+
+
+def _jobs(runs: Sequence[_Work], seed: int) -> Iterator[Job]:
+    """Episodes that are to be done, in turns; those of a run that refuses are left out from then on."""
+    for episode in range(max((work.episodes for work in runs), default=0)):
+        for number, work in enumerate(runs):
+            if episode < work.episodes and episode not in work.cache.records and work.refused is None:
+                yield Job(number, episode, replace(work.settings, seed=episode_seed(seed, episode)))
+
+
+def _progress(done: Iterator[Any], total: int) -> Iterator[Any]:
+    from tqdm import tqdm
+
+    yield from tqdm(done, total=total, unit="episode", mininterval=2.0, disable=total == 0)

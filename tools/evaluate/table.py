@@ -1,0 +1,184 @@
+"""The rows of `servoid evaluate papers`: what UniPhys and Diffuse-CLoC publish, and the same tasks here.
+
+Lengths are scaled by 0.275, times and speeds by 0.524. docs/evaluation.md says how each row compares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from tools.evaluate.rows import Beside, Metric, Network, Row, Run
+
+UNIPHYS, CLOC, OURS = "UniPhys", "Diffuse-CLoC", "Servoid"
+
+SUCCESS = Metric("success", share=True)
+FALLS = Metric("fell", share=True, lower=True)
+LENGTH = Metric("ticks", "ticks")
+
+# How plans are sampled, by the papers' names: settings of the diffusion policy.
+_STABLE = {"stabilisation": "3"}
+FULL: Mapping[str, str] = {"schedule": "full_sequence", **_STABLE}
+AUTOREGRESSIVE: Mapping[str, str] = {"schedule": "autoregressive", **_STABLE}
+UNSTABLE: Mapping[str, str] = {"schedule": "autoregressive", "stabilisation": "0"}
+GRADUAL: Mapping[str, str] = {"schedule": "gradual", **_STABLE}
+ROLLING: Mapping[str, str] = {"schedule": "rolling"}
+
+
+def _survive(name: str, title: str, plan: Mapping[str, str], published: float, figure: float | None) -> Row:
+    run = Run("survive", plan=plan)
+    return Row(f"uniphys/{name}", UNIPHYS, title, run, LENGTH, published, "of 3000 frames", figure)
+
+
+def _trained(name: str, paper: str, title: str, task: str, metric: Metric, published: float, train: str) -> Row:
+    """A row that needs another network: trained for 45 minutes, as the reference that it is compared with."""
+    run = Run(task, network=Network(name.replace("/", "-"), f"--minutes 45 {train}"))
+    return Row(name, paper, title, run, metric, published, quick=False)
+
+
+_FOREST = Run("forest")
+_INBETWEEN = Run("inbetween", clips=6)
+_TEXT = Run("text")
+_TEXT_EXPERT = Run("text", policy="expert")
+
+_MAIN: tuple[Row, ...] = (
+    _survive("length", "Episode length, unconditional: autoregressive + stabilisation", AUTOREGRESSIVE, 2320.3, 2850),
+    Row("uniphys/goal-near", UNIPHYS, "Goal, near: success", Run("goal-near"), SUCCESS, 1.0, figure=1.0),
+    Row("uniphys/goal-far", UNIPHYS, "Goal, far: success", Run("goal-far"), SUCCESS, 0.95, figure=0.95),
+    Row(
+        "uniphys/velocity", UNIPHYS, "Velocity control: error", Run("velocity"),
+        Metric("metrics.velocity_error_mps", "m/s", lower=True), 0.07, figure=0.04,
+    ),
+    Row(
+        "uniphys/obstacle", UNIPHYS, "Dynamic obstacle: success", Run("obstacle", episodes=50), SUCCESS, 0.94,
+        figure=0.94,
+    ),
+    Row("cloc/perturb", CLOC, "Walk + perturb: falls", Run("perturb"), FALLS, 0.16, figure=0.16),
+    Row("cloc/forest", CLOC, "Forest: success", _FOREST, SUCCESS, 0.96, figure=0.96),
+    Row("cloc/inbetween", CLOC, "In-betweening: falls", _INBETWEEN, FALLS, 0.31, figure=0.31),
+)  # fmt: skip
+
+_BESIDE: tuple[Row, ...] = (
+    Row(
+        "cloc/perturb-expert", CLOC, "Walk + perturb: falls, the expert", Run("perturb", policy="expert"), FALLS,
+        note="beside the policy",
+    ),
+    Row(
+        "cloc/forest-seconds", CLOC, "Forest: time", _FOREST,
+        Metric("metrics.seconds_to_goal", "s", lower=True), 13.23, "s of a human", 6.9, note="of those that got there",
+    ),
+    Row(
+        "cloc/inbetween-mjpe", CLOC, "In-betweening: joints", _INBETWEEN,
+        Metric("metrics.mjpe_m", "m", lower=True), 0.116, figure=0.032,
+    ),
+    Row(
+        "cloc/inbetween-mrpe", CLOC, "In-betweening: base", _INBETWEEN,
+        Metric("metrics.mrpe_m", "m", lower=True), 0.322, figure=0.089,
+    ),
+)  # fmt: skip
+
+_SAMPLING: tuple[Row, ...] = (
+    _survive("length-gradual", "Episode length: gradual", GRADUAL, 1817.6, None),
+    _survive("length-full-sequence", "Episode length: full-sequence", FULL, 231.6, None),
+    _survive("length-unstable", "Episode length: autoregressive, without stabilisation", UNSTABLE, 148.2, None),
+    *(
+        Row(
+            f"uniphys/monte-carlo-{n}", UNIPHYS, f"Monte-Carlo guidance, N = {n}: success",
+            Run("goal-far", plan={"guidance.samples": str(n)}), SUCCESS, share,
+        )
+        for n, share in ((1, 0.26), (3, 0.82), (5, 0.98))
+    ),
+    *(
+        Row(
+            f"cloc/rolling-{name}", CLOC, f"Forest, rolling of {title}: success",
+            Run("forest", plan={**ROLLING, **plan}), SUCCESS, share,
+        )
+        for name, title, plan, share in (
+            ("both", "states and actions", {}, 0.96),
+            ("states", "states only", {"roll_actions": "false"}, 0.79),
+            ("actions", "actions only", {"roll_states": "false"}, 0.96),
+            ("none", "neither", {"roll_states": "false", "roll_actions": "false"}, 0.95),
+        )
+    ),
+    *(
+        Row(
+            f"cloc/executed-{n}", CLOC, f"Forest, actions executed of a plan: {n}",
+            Run("forest", plan={"delay": "0", "replan": str(n)}), SUCCESS, note="not in the paper's table",
+        )
+        for n in (1, 4, 8, 16)
+    ),
+)  # fmt: skip
+
+_TRAINED: tuple[Row, ...] = (
+    _trained("cloc/reference", CLOC, "Forest, the reference of the rows below: success", "forest", SUCCESS, 0.96, ""),
+    *(
+        _trained(f"cloc/horizon-{n}", CLOC, f"Forest, horizon {n}: success", "forest", SUCCESS, share, f"--horizon {n}")
+        for n, share in ((16, 0.0), (32, 0.96), (64, 0.19))
+    ),
+    *(
+        _trained(
+            f"cloc/actions-{n}", CLOC, f"Forest, action horizon {n} of 32: success", "forest", SUCCESS, share,
+            f"--horizon 32 --action-horizon {n}",
+        )
+        for n, share in ((1, 0.57), (4, 0.84), (8, 0.80))
+    ),
+    _trained("cloc/attention-full", CLOC, "Forest, full attention: success", "forest", SUCCESS, 0.58, "--mask full"),
+    _trained("cloc/attention-diffuser", CLOC, "Forest, Diffuser's attention: success", "forest", SUCCESS, 0.0,
+             "--mask diffuser"),
+    _trained("uniphys/reference", UNIPHYS, "Episode length, raw action, the reference: ticks", "survive", LENGTH, 238.2,
+             "--mask causal"),
+    _trained("uniphys/latent-action", UNIPHYS, "Episode length, latent action: ticks", "survive", LENGTH, 2320.3,
+             "--mask causal --latent"),
+)  # fmt: skip
+
+_TEXTS: tuple[Row, ...] = (
+    Row(
+        "text/followed", OURS, "Text, held-out phrasings: instructions followed", _TEXT,
+        Metric("metrics.followed_share"), figure=0.95,
+    ),
+    Row("text/falls", OURS, "Text, held-out phrasings: falls", _TEXT, FALLS, figure=0.05),
+)  # fmt: skip
+
+_MOTION: tuple[Row, ...] = tuple(
+    row
+    for name, title, of, unit, published, theirs in (
+        ("floating", "Floating", "motion.floating_mm", "mm", 16.6, "mm of a human"),
+        ("jerk", "Jerk", "motion.jerk_mps3", "m/s3", 1.2, "mm/s3, as printed"),
+        ("foot-slip", "Foot slip", "motion.foot_slip_mmps", "mm/s", None, None),
+    )
+    for row in (
+        Row(
+            f"motion/{name}", UNIPHYS, f"{title}, told in words", _TEXT, Metric(of, unit, lower=True), published,
+            theirs, Beside(f"motion/{name}-expert", 1.2),
+        ),
+        Row(
+            f"motion/{name}-expert", UNIPHYS, f"{title}, the expert", _TEXT_EXPERT, Metric(of, unit, lower=True),
+            note="beside the policy",
+        ),
+    )
+)  # fmt: skip
+
+
+def _elsewhere(row: Row, where: str, run: Run) -> Row:
+    """The same row on another body, where no figure was set."""
+    return replace(row, name=f"{row.name}@{where}", title=f"{row.title} ({where})", run=run, figure=None, quick=False)
+
+
+ON_VIRTUAL = ("uniphys/length", "uniphys/goal-near", "cloc/perturb", "cloc/forest")
+
+ROWS: tuple[Row, ...] = (
+    *_MAIN,
+    *_BESIDE,
+    *_SAMPLING,
+    *_TRAINED,
+    *_TEXTS,
+    *_MOTION,
+    *(_elsewhere(row, "randomised", replace(row.run, randomise=True)) for row in _MAIN),
+    *(_elsewhere(row, "virtual", replace(row.run, backend="virtual")) for row in _MAIN if row.name in ON_VIRTUAL),
+)
+
+LEFT_OUT = (
+    "Diffuse-CLoC: Jump (71 %) is left out: jumping is beyond the torque of these servos.",
+    "Diffuse-CLoC: FID (0.074) is left out: it compares with motion capture, of which there is none here.",
+    "UniPhys: user studies and jogging are left out: nobody was asked, and these servos do not run.",
+)
