@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 demo: $(VENV)/.installed-demo
 	mkdir -p runs && rm -f runs/demo.mcap runs/demo.mp4 runs/demo.png
-	$(BIN)/servoid run goal --backend sim --seed 8 --record runs/demo.mcap --video runs/demo.mp4
+	$(BIN)/servoid run goal --backend sim --seed 1 --record runs/demo.mcap --video runs/demo.mp4
 
 test: $(VENV)/.installed-test
 	$(BIN)/ruff check .

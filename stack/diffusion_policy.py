@@ -21,6 +21,7 @@ from policy.diffusion.config import check_fit
 from policy.diffusion.features import raw_row
 from policy.diffusion.settings import DiffusionSettings, load_settings
 from stack.planner import Answer, InlinePlanner, Planner, ProcessPlanner
+from stack.trim import Trim
 
 if TYPE_CHECKING:
     from policy.diffusion.runtime import Cost
@@ -32,12 +33,17 @@ class DiffusionPolicy:
     `latest_plan` is the plan that runs; `adopted` lists (requested tick, adopted tick) of all plans of the episode.
     """
 
-    def __init__(self, planner: Planner, history: int, replan: int, delay: int, wait: bool = True) -> None:
-        """`history` is the number of states that a request holds. With `wait` no plan is ever late: for simulation."""
+    def __init__(
+        self, planner: Planner, history: int, replan: int, delay: int, wait: bool = True, trim: Trim | None = None
+    ) -> None:
+        """`history` is the number of states that a request holds. With `wait` no plan is ever late: for simulation.
+
+        `trim` corrects the velocity that is asked of the planner.
+        """
         if not 0 <= delay <= replan:
             raise ValueError(f"delay must be 0 to replan ({replan} ticks), not {delay}")
         self._planner = planner
-        self._history, self._replan, self._delay, self._wait = history, replan, delay, wait
+        self._history, self._replan, self._delay, self._wait, self._trim = history, replan, delay, wait, trim
         self._states: deque[Array] = deque(maxlen=history)
         self._applied: deque[Array] = deque(maxlen=history - 1)
         self.only: Container[int] | None = None  # requests in time in a recorded run, where it is repeated
@@ -46,6 +52,8 @@ class DiffusionPolicy:
     def reset(self, seed: int) -> None:
         """Begin an episode; its plans draw their noise from `seed`."""
         self._planner.reset(seed)
+        if self._trim is not None:
+            self._trim.reset()
         self._tick = 0
         self._states.clear()
         self._applied.clear()
@@ -66,6 +74,8 @@ class DiffusionPolicy:
         self._states.append(raw_row(state))
         self._applied.append(np.array(applied, dtype=float))  # what ran at the tick before
         tick = self._tick
+        if self._trim is not None:
+            instruction = replace(instruction, velocity=self._trim(state, instruction.velocity))
         self._adopt(tick)
         if tick % self._replan == 0 and len(self._states) == self._history:
             meanwhile = [self._action(tick + i) for i in range(self._delay)]
@@ -142,7 +152,8 @@ def diffusion_policy(
     else:
         planner = InlinePlanner(_build(robot, settings, cost))
     history = int(read_header(path)["config"]["history"])
-    return DiffusionPolicy(planner, history, settings.replan, settings.delay, wait=not process)
+    trim = Trim(robot.dt, settings.trim) if settings.trim else None
+    return DiffusionPolicy(planner, history, settings.replan, settings.delay, wait=not process, trim=trim)
 
 
 def _check(robot: Robot, settings: DiffusionSettings) -> None:

@@ -12,8 +12,8 @@ from policy.diffusion.schedule import ddim_levels
 class GuidanceSettings:
     """Loss guidance: see `policy.diffusion.sampler.Guidance`. A weight of 0 turns it off."""
 
-    weight: float = 1500.0
-    clip: float = 6.0
+    weight: float = 4000.0
+    clip: float = 12.0
     gradient: str = "analytic"
 
     def __post_init__(self) -> None:
@@ -28,10 +28,11 @@ class DiffusionSettings:
     """Settings of the diffusion policy; ticks are those of the control loop."""
 
     checkpoint: str = "diffusion"  # a shipped one, or the path of a .safetensors file
-    steps: int = 10  # network calls a plan
+    steps: int = 5  # network calls a plan
     lead: int = 1  # extra calls by which the states are finished before the actions
-    replan: int = 12  # ticks between requests
+    replan: int = 4  # ticks between requests
     delay: int = 2  # ticks from a request to the adoption of its plan
+    trim: float = 1.0  # 1/s at which what is asked is corrected by what comes of it; 0: not
     text_weight: float = 1.0  # classifier-free guidance by the instruction; 0: unread, 1: as trained
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
 

@@ -27,8 +27,8 @@ class GoalSettings(Settings):
     radius: Annotated[float, "m from the goal that count as reached"] = 0.1
     stand: Annotated[bool, "whether it must also stand there, or coming there is enough"] = True
     seen: Annotated[bool, "whether the robot sees the goal, as by a camera, or goes by its odometry alone"] = False
-    arrive: Annotated[float, "m from the goal at which to stop"] = 0.09
-    leave: Annotated[float, "m from the goal at which to start again"] = 0.13
+    arrive: Annotated[float, "m from the goal at which to stop"] = 0.05
+    leave: Annotated[float, "m from the goal at which to start again"] = 0.1
     approach: Annotated[Approach, "speed profile"] = field(default_factory=Approach)
 
     def __post_init__(self) -> None:

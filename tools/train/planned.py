@@ -8,6 +8,7 @@ import numpy as np
 
 from hw.hal import Array, Instruction
 from policy.diffusion.features import raw_row
+from stack.trim import Trim
 from tools.train.fleet import Fleet
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ class PlannedWalker:
         self._plan, self._made = np.repeat(fleet.applied[:, None], self._horizon, 1), 0
         self._waiting: Array | None = None  # the plans that are not adopted yet
         self._requested = 0
+        self._trim = Trim(fleet.robot.dt, runtime.settings.trim)
         self._fresh = np.ones(fleet.n, bool)
 
     def reset(self, where: Array) -> None:
@@ -41,13 +43,14 @@ class PlannedWalker:
         """Targets for the present state of the fleet under `command` `(n, 3)`."""
         settings, tick = self._runtime.settings, self._tick
         self._observe()
+        asked = self._trim(self.fleet.state, command)
         if self._waiting is not None and tick == self._requested + settings.delay:
             self._plan, self._made, self._waiting = self._waiting, self._requested, None
         if tick % settings.replan == 0 and self._states is not None:
             ahead = np.stack([self._action(tick + i) for i in range(settings.delay)], 1) if settings.delay else None
             actions = self._applied if ahead is None else np.concatenate([self._applied, ahead], 1)
             seeds = [(self._seed + i, tick) for i in range(self.fleet.n)]
-            plan, _ = self._runtime.plan_batch(self._states, actions, Instruction(command), seeds)
+            plan, _ = self._runtime.plan_batch(self._states, actions, Instruction(asked), seeds)
             self._requested = tick
             if settings.delay:
                 self._waiting = plan
