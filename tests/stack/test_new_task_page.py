@@ -45,7 +45,7 @@ def test_the_example_walks_there_and_back(written: ModuleType) -> None:
     assert {row["key"]: row["value"] for row in described["settings"]}["distance"] == "0.6"
     result = run(Settings("return", policy="gait", set={"distance": "0.3"}))
     assert result.outcome == "succeeded"
-    assert 0.15 < result.metrics["farthest_m"] < 0.5
+    assert 0.15 < result.metrics["farthest_m"] < 0.7
 
 
 def test_every_weight_of_the_cost_is_on_the_page() -> None:
