@@ -247,7 +247,7 @@ class Keyframes:
     """States to be in at given times. A planner takes them as known: inpainted at zero noise."""
 
     ticks: Array  # (k,) int, ahead of now, at least 1 and rising
-    states: Array  # (k, state features): rows like those of `PlanRequest.states`, in the odometry frame
+    states: Array  # (k, state features): rows like those of `PlanRequest.states`, in the odometry frame; NaN: free
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,6 +280,7 @@ class PlanRequest:
     states: Array  # (history, state features), oldest first, the last one being now
     actions: Array  # (history - 1 + delay, n_joints) rad: those applied after each past state, then those yet to run
     instruction: Instruction
+    previous: Plan | None = None  # the plan that runs, for planners that go on from it
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,6 +292,7 @@ class Plan:
     states: Array  # (horizon, state features)
     path: Array  # (horizon, 2) m: predicted displacement in the heading frame of `tick`, to be drawn and logged
     seconds: float  # how long planning took
+    error: str = ""  # why there is no plan, where there is none: its arrays are NaN then
 
 
 @dataclass(frozen=True, slots=True)

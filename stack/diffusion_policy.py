@@ -1,7 +1,9 @@
 """The diffusion planner-controller as a policy: history in, requests out, plans executed by tick.
 
 A plan requested at tick k is adopted at tick k + delay and was made for the actions that run meanwhile. A plan that is
-late is not adopted: the last one goes on by its tick index. So a run does not depend on how fast the machine was.
+late is not adopted: the last one goes on by its tick index. So a run does not depend on how fast the machine was. A
+planner that finds no plan, because guidance diverged for one, says why: the last plan goes on, and then its last action
+is held.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from stack.planner import Answer, InlinePlanner, Planner, ProcessPlanner
 from stack.trim import Trim
 
 if TYPE_CHECKING:
-    from policy.diffusion.runtime import Cost
+    from policy.diffusion.runtime import Cost, Runtime
 
 
 class DiffusionPolicy:
@@ -59,7 +61,7 @@ class DiffusionPolicy:
         self._applied.clear()
         self._hold: Array | None = None
         self._requested: int | None = None
-        self._ended = False
+        self._ended = self._refused = False
         self._events: list[str] = []
         self.latest_plan: Plan | None = None
         self.adopted: list[tuple[int, int]] = []
@@ -80,7 +82,8 @@ class DiffusionPolicy:
         if tick % self._replan == 0 and len(self._states) == self._history:
             meanwhile = [self._action(tick + i) for i in range(self._delay)]
             actions = np.stack([*self._applied, *meanwhile])
-            self._planner.submit(PlanRequest(tick, np.stack(self._states), actions, instruction))
+            states = np.stack(self._states)
+            self._planner.submit(PlanRequest(tick, states, actions, instruction, self.latest_plan))
             self._requested = tick
             self._adopt(tick)  # at once, when there is no delay
         if self.latest_plan is not None and tick >= self._end and not self._ended:
@@ -112,14 +115,21 @@ class DiffusionPolicy:
             return
         requested, self._requested = self._requested, None
         plan = self._planner.collect(requested, self._wait)
+        if plan is not None and plan.error:
+            if not self._refused:  # one that comes again and again is said once
+                self._events.append(f"no plan for tick {requested}: {plan.error}: {self._running()}")
+            self._refused = True
+            return
         if self.only is not None and requested not in self.only:
             plan = None
         if plan is None:
-            running = "the goal is held" if self.latest_plan is None else f"that of {self.latest_plan.tick} goes on"
-            self._events.append(f"the plan requested at tick {requested} was not ready at {tick}: {running}")
+            self._events.append(f"the plan requested at tick {requested} was not ready at {tick}: {self._running()}")
             return
-        self.latest_plan, self._ended = plan, False
+        self.latest_plan, self._ended, self._refused = plan, False, False
         self.adopted.append((requested, tick))
+
+    def _running(self) -> str:
+        return "the goal is held" if self.latest_plan is None else f"that of {self.latest_plan.tick} goes on"
 
     def _action(self, tick: int) -> Array:
         """What runs at `tick` by the running plan."""
@@ -160,7 +170,7 @@ def _check(robot: Robot, settings: DiffusionSettings) -> None:
     """Refuse here, with a plain error, what the planner process would refuse."""
     path = resolve(settings.checkpoint)
     config = check_fit(path, read_header(path), robot)
-    settings.check(config.horizon, config.levels)
+    settings.check(config)
 
 
 def _build(robot: Robot, settings: DiffusionSettings, cost: Cost | None) -> Answer:
@@ -168,4 +178,15 @@ def _build(robot: Robot, settings: DiffusionSettings, cost: Cost | None) -> Answ
 
     runtime = load_runtime(robot, settings, cost)
     runtime.warm_up()
-    return runtime.plan
+    return partial(_plan, runtime)
+
+
+def _plan(runtime: Runtime, request: PlanRequest, seed: int) -> Plan:
+    """The plan of a request, or why there is none."""
+    from policy.diffusion.sampler import Diverged
+
+    try:
+        return runtime.plan(request, seed)
+    except Diverged as error:
+        nothing = np.full((1, 1), np.nan)
+        return Plan(request.tick, nothing, nothing, nothing, 0.0, str(error))

@@ -33,7 +33,26 @@ def state_full_action_causal(state_ticks: Array, action_ticks: Array) -> Array:
     return np.block([[states, no_actions], [to_states, to_actions]])
 
 
+def causal(state_ticks: Array, action_ticks: Array) -> Array:
+    """The mask of UniPhys (section 4.2): a frame sees itself and the frames before it.
+
+    There a token holds an action and the state that it leads to. Here that frame is two tokens, which see each other.
+    """
+    frames = np.concatenate([state_ticks - 1, action_ticks])
+    mask: Array = frames[None, :] <= frames[:, None]
+    return mask
+
+
+def diffuser_local(state_ticks: Array, action_ticks: Array) -> Array:
+    """The local attention of Diffuser (arXiv:2205.09991), as Diffuse-CLoC ablates it: a tick sees its neighbours."""
+    ticks = np.concatenate([state_ticks, action_ticks])
+    mask: Array = np.abs(ticks[None, :] - ticks[:, None]) <= 1
+    return mask
+
+
 MASKS: dict[str, Callable[[Array, Array], Array]] = {
+    "causal": causal,
+    "diffuser_local": diffuser_local,
     "full": full,
     "state_full_action_causal": state_full_action_causal,
 }

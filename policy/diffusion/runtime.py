@@ -1,32 +1,39 @@
 """From a request to a plan, as a pure function: the same request, seed and network give the same plan.
 
-Receding chunk: a plan covers the horizon, its first actions run, and the next plan replaces the rest.
+Receding chunk: a plan covers the horizon, its first actions run, and the next plan replaces the rest. With the rolling
+schedule the next plan is denoised from the one that runs, which the request holds.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from hw.config import ConfigError
 from hw.hal import Array, Instruction, Plan, PlanRequest
 from hw.robot import Robot
 from policy.checkpoint import resolve
 from policy.diffusion.checkpoint import Model, load
 from policy.diffusion.features import Trajectory, raw_layout, to_raw, to_tokens
-from policy.diffusion.sampler import Guidance, Known, Sampler, classifier_free
-from policy.diffusion.schedule import cosine_signal, full_sequence
+from policy.diffusion.keyframes import imputation, keyframe_tokens
+from policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise, seeded
+from policy.diffusion.sampler import Diverged, Guidance, Known, Sampler, classifier_free
+from policy.diffusion.schedule import DenoisingMatrix, cosine_signal
 from policy.diffusion.settings import DiffusionSettings
 from policy.text.captions import MOTIONS, motion_of
 from policy.text.encoder import load_encoder
 
 # (trajectory, instruction) -> cost (batch,), as tasks define it
 Cost = Callable[[Trajectory, Instruction], Any]
+
+BOUND = 1000.0  # deviations: what is predicted further out than this was driven there by guidance
 
 
 class Runtime:
@@ -38,24 +45,37 @@ class Runtime:
         Raises ConfigError where settings and model do not fit.
         """
         config = model.config
-        settings.check(config.horizon, config.levels)
+        settings.check(config)
         self.model, self.settings, self.dt = model, settings, dt
         self.cost = cost if settings.guidance.weight > 0 else None
-        n_states, n_actions = len(config.state_ticks), len(config.action_ticks)
-        self.matrix = full_sequence(config.levels, settings.steps, n_states, n_actions, settings.lead)
+        self.samples = settings.guidance.samples if self.cost else 1
+        self.horizon = settings.horizon or config.horizon  # ticks that are planned,
+        self.actions = min(self.horizon, int(config.action_ticks[-1]) + 1)  # and those with actions
+        trained = model.header.get("training", {})
+        needed = settings.replan + settings.delay
+        if not trained.get("far_actions", 1.0) and needed > trained["near_actions"]:
+            raise ConfigError(
+                f"diffusion policy: a plan must last replan + delay = {needed} ticks, and this checkpoint learned the "
+                f"actions of the next {trained['near_actions']} only; lower replan or delay"
+            )
+        self.matrix = settings.matrix(config)
+        self._warm: dict[int, DenoisingMatrix] = {}  # rolling, by the number of fresh frames
         self._signal = cosine_signal(config.levels)
         self._encoder = load_encoder(config.text) if config.text and settings.text_weight else None
         self._read: dict[str, Tensor] = {}  # instructions that were encoded
-        self._state_mask = torch.from_numpy(config.state_ticks <= 0)
+        self._used = tuple(torch.from_numpy(mask) for mask in settings.used(config))
+        self._state_mask = torch.from_numpy(config.state_ticks <= 0) & self._used[0]
 
     def plan(self, request: PlanRequest, seed: int) -> Plan:
-        """The plan of one request. Raises ValueError when it does not fit the model or is not finite."""
+        """The plan of one request. Raises ValueError when it does not fit the model, and Diverged."""
         start = time.perf_counter()
+        last = request.previous
+        previous = Previous(request.tick - last.tick, last.states[None], last.actions[None]) if last else None
         actions, states = self.plan_batch(
-            request.states[None], request.actions[None], request.instruction, [(seed, request.tick)]
+            request.states[None], request.actions[None], request.instruction, [(seed, request.tick)], previous
         )
         origin = request.states[-1:].astype(np.float32)
-        tokens = to_tokens(states[0], origin[0], self.model.config.action_size)
+        tokens = to_tokens(states[0], origin[0], self._joints)
         return Plan(
             tick=request.tick,
             actions=actions[0],
@@ -65,33 +85,48 @@ class Runtime:
         )
 
     def plan_batch(
-        self, states: Array, actions: Array, instruction: Instruction, seeds: Sequence[tuple[int, int]]
+        self,
+        states: Array,
+        actions: Array,
+        instruction: Instruction,
+        seeds: Sequence[tuple[int, int]],
+        previous: Previous | None = None,
     ) -> tuple[Array, Array]:
         """Plans of many robots at once, each with its own (seed, tick).
 
         `states` is `(batch, history, raw size)`, the present last; `actions` is `(batch, history - 1 + delay,
-        n_joints)`: those applied, then those that will run anyway. Returns joint targets `(batch, horizon, n_joints)`
-        from the present tick on, and predicted raw rows `(batch, horizon, raw size)`, the first one tick ahead, in the
-        odometry frame. Batches of different size may differ in the last bits. Raises ValueError like `plan`.
+        n_joints)`: those applied, then those that will run anyway. `previous` are the plans that run, None at first;
+        only the rolling schedule reads them. Returns joint targets `(batch, actions, n_joints)` from the present tick
+        on, and predicted raw rows `(batch, horizon, raw size)`, the first one tick ahead, in the odometry frame.
+        Batches of different size may differ in the last bits. Raises ValueError like `plan`.
         """
         self._check(states, actions)
+        n, history = self.samples, self.model.config.history
         quiet = torch.inference_mode() if self.cost is None else nullcontext()
         with one_thread(), torch.no_grad(), quiet:
             raw = torch.from_numpy(np.ascontiguousarray(states, dtype=np.float32))
-            # Differences of a long walk's displacements want more than float32.
-            rows = to_tokens(np.asarray(states, dtype=float), np.asarray(states[:, -1], dtype=float), self._joints)
-            generators = [_generator(*pair) for pair in seeds]
-            known = self._known(torch.from_numpy(rows.astype(np.float32)), actions)
+            # Sample i of a robot's n draws noise of its own; the first one's does not depend on n.
+            keys = [(*pair, *((i,) if i else ())) for pair in seeds for i in range(n)]
+            known = self._known(states, actions, instruction)
+            matrix, start = self._start(keys, states[:, -1], previous)
+            text = self._text(instruction, len(states))
             predict = classifier_free(
-                self.model.denoiser, self._text(instruction, len(states)), self.settings.text_weight
+                self.model.denoiser,
+                None if text is None else text.repeat_interleave(n, 0),
+                self.settings.text_weight,
             )
-            clean_states, clean_actions = Sampler(predict, self._signal).sample(
-                self.matrix, known, generators, self._guidance(instruction)
-            )
-            history = self.model.config.history
-            tokens = self.model.states.decode(clean_states[:, history:])
+            sampler = Sampler(predict, self._signal, self.settings.eta, self.settings.stabilise)
+            guidance = self._guidance(_repeat(instruction, n))
+            clean = sampler.sample(matrix, known, [seeded(*key) for key in keys], guidance, start)
+            clean_states, clean_actions = (x[:, used] for x, used in zip(clean, self._used, strict=True))
+            reach = max(float(x.abs().max().nan_to_num(torch.inf)) for x in (clean_states, clean_actions))
+            if not reach < BOUND:
+                raise Diverged(f"the plan leaves all bounds ({reach:.3g} deviations); lower the weight of guidance")
+            chosen = self._choose(clean[0], guidance)
+            future, now = slice(history, history + self.horizon), slice(history - 1, history - 1 + self.actions)
+            tokens = self.model.states.decode(clean[0][chosen, future])
             predicted = to_raw(tokens, raw[:, -1], self._joints)
-            targets = self.model.actions.decode(clean_actions[:, history - 1 :])
+            targets = self.model.actions.decode(clean[1][chosen, now])
         return targets.numpy().astype(float), predicted.numpy()
 
     def warm_up(self) -> None:
@@ -99,7 +134,8 @@ class Runtime:
         config = self.model.config
         states = np.zeros((1, config.history, raw_layout(self._joints).size))
         actions = np.zeros((1, config.history - 1 + self.settings.delay, self._joints))
-        self.plan_batch(states, actions, Instruction(np.zeros(3), np.zeros(2)), [(0, 0)])
+        with suppress(Diverged):  # a robot that is nowhere may well be out of bounds; a real plan will say so
+            self.plan_batch(states, actions, Instruction(np.zeros(3), np.zeros(2)), [(0, 0)])
 
     @property
     def _joints(self) -> int:
@@ -110,23 +146,64 @@ class Runtime:
         if states.shape[1:] != (config.history, rows):
             raise ValueError(f"plan request: states are {states.shape[1:]}, ({config.history}, {rows}) are needed")
         past = config.history - 1
-        if actions.shape[2:] != (self._joints,) or not past <= actions.shape[1] < past + config.horizon:
+        if actions.shape[2:] != (self._joints,) or not past <= actions.shape[1] < len(config.action_ticks):
             raise ValueError(
                 f"plan request: actions are {actions.shape[1:]}, ({past} past + delay, {self._joints}) are needed"
             )
         if not (np.isfinite(states).all() and np.isfinite(actions).all()):
             raise ValueError("plan request: states or actions are not finite; was every sensor read?")
 
-    def _known(self, tokens: Tensor, actions: Array) -> Known:
-        """Past states and past and committed actions, clean and normalised."""
-        config, batch = self.model.config, len(tokens)
-        states = torch.zeros(batch, len(config.state_ticks), config.state_size)
-        states[:, : config.history] = self.model.states.encode(tokens)
-        given = torch.from_numpy(np.ascontiguousarray(actions, dtype=np.float32))
-        filled = torch.zeros(batch, len(config.action_ticks), config.action_size)
-        filled[:, : given.shape[1]] = self.model.actions.encode(given)
-        mask = torch.arange(len(config.action_ticks)) < given.shape[1]
-        return Known(states, filled, self._state_mask, mask)
+    def _known(self, states: Array, actions: Array, instruction: Instruction) -> Known:
+        """Past states and past and committed actions, clean and normalised, and keyframes; `samples` of each window."""
+        config, batch = self.model.config, len(states)
+        present = np.asarray(states[:, -1], dtype=float)
+        # Differences of a long walk's displacements want more than float32.
+        rows = to_tokens(np.asarray(states, dtype=float), present, self._joints)
+        filled = torch.zeros(batch, len(config.state_ticks), config.state_size)
+        filled[:, : config.history] = self.model.states.encode(torch.from_numpy(rows.astype(np.float32)))
+        state_mask, impute = self._state_mask, None
+        if instruction.keyframes is not None and len(instruction.keyframes.ticks):
+            ticks, given = keyframe_tokens(instruction.keyframes, present, self._joints)
+            tokens = torch.from_numpy(given.astype(np.float32))
+            index, whole = torch.from_numpy(config.history - 1 + ticks), tokens.isfinite().all(2).all(0)
+            inside = torch.from_numpy(ticks <= self.horizon)  # those further ahead will come in later
+            exact, partly = inside & whole, inside & ~whole
+            filled[:, index[exact]] = self.model.states.encode(tokens[:, exact])
+            state_mask = state_mask.index_fill(0, index[exact], True)
+            if partly.any():
+                pinned = tokens[:, partly].repeat_interleave(self.samples, 0)
+                impute = imputation(self.model.states, index[partly], pinned)
+        ran = torch.from_numpy(np.ascontiguousarray(actions, dtype=np.float32))
+        done = torch.zeros(batch, len(config.action_ticks), config.action_size)
+        done[:, : ran.shape[1]] = self.model.actions.encode(ran)
+        action_mask = (torch.arange(len(config.action_ticks)) < ran.shape[1]) & self._used[1]
+        filled, done = (x.repeat_interleave(self.samples, 0) for x in (filled, done))
+        return Known(filled, done, state_mask, action_mask, impute)
+
+    def _start(
+        self, keys: Sequence[Sequence[int]], present: Array, previous: Previous | None
+    ) -> tuple[DenoisingMatrix, tuple[Tensor, Tensor] | None]:
+        """The matrix to walk, and what is denoised: for the rolling schedule, what is left of the plans that run."""
+        if self.settings.schedule != "rolling":
+            return self.matrix, None
+        model, matrix = self.model, self.matrix
+        noise = frame_noise(model.config, keys)
+        if previous is None or not 0 <= previous.age < self.actions:
+            return matrix, noise
+        if previous.age not in self._warm:
+            self._warm[previous.age] = self.settings.matrix(model.config, previous.age)
+        matrix = self._warm[previous.age]
+        clean = clean_start(model.config, model.states, model.actions, previous, present)
+        states, actions = (x.repeat_interleave(self.samples, 0) for x in clean)
+        return matrix, renoise((states, actions), noise, matrix, self._signal)
+
+    def _choose(self, states: Tensor, guidance: Guidance | None) -> Tensor:
+        """The sample of each robot that is run, as rows `(batch,)` of the samples' clean windows `states`."""
+        first = torch.arange(0, len(states), self.samples)
+        if guidance is None or self.samples == 1 or self.settings.guidance.choose == "mean":
+            return first
+        cheapest: Tensor = guidance.cost(states).view(-1, self.samples).argmin(1)
+        return first + cheapest
 
     def _text(self, instruction: Instruction, batch: int) -> Tensor | None:
         """The encoded sentence `(batch, text size)`; where the task gives none, one that names the asked motion."""
@@ -147,12 +224,13 @@ class Runtime:
         history, normaliser = self.model.config.history, self.model.states
 
         def of_states(states: Tensor) -> Tensor:
-            tokens = normaliser.decode(states[:, history:])
+            tokens = normaliser.decode(states[:, history : history + self.horizon])
             value: Tensor = cost(Trajectory.of(tokens, self._joints, self.dt), instruction)
             return value
 
         settings = self.settings.guidance
-        return Guidance(of_states, settings.weight, settings.clip, settings.gradient)
+        shared = self.samples if settings.choose == "mean" else 1
+        return Guidance(of_states, settings.weight, settings.clip, settings.gradient, shared)
 
 
 def load_runtime(robot: Robot, settings: DiffusionSettings, cost: Cost | None = None) -> Runtime:
@@ -160,10 +238,12 @@ def load_runtime(robot: Robot, settings: DiffusionSettings, cost: Cost | None = 
     return Runtime(load(resolve(settings.checkpoint), robot), settings, robot.dt, cost)
 
 
-def _generator(seed: int, tick: int) -> torch.Generator:
-    """Noise of its own for each seed and tick."""
-    state = np.random.SeedSequence([seed, tick]).generate_state(1, np.uint64)[0]
-    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+def _repeat(instruction: Instruction, samples: int) -> Instruction:
+    """The instruction of each of many robots, where they have their own, once for every sample."""
+    if samples == 1 or instruction.velocity.ndim == 1:
+        return instruction
+    goal = None if instruction.goal is None else np.repeat(instruction.goal, samples, 0)
+    return replace(instruction, velocity=np.repeat(instruction.velocity, samples, 0), goal=goal)
 
 
 @contextmanager

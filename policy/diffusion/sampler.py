@@ -1,8 +1,9 @@
-"""DDIM sampling over a denoising matrix, with known tokens inpainted clean and loss guidance.
+"""Sampling over a denoising matrix, with known tokens inpainted clean and loss guidance.
 
 Each network call predicts the clean window. Guidance moves the predicted states down the gradient of a cost before the
-DDIM step, so the next call, and with it the actions, sees states that follow the cost. Deterministic given its noise
-(eta = 0; Song et al., arXiv:2010.02502).
+step to the next levels, so the next call, and with it the actions, sees states that follow the cost. Steps are those of
+DDIM (Song et al., arXiv:2010.02502, eq. 12 and 16): deterministic given the first noise with eta = 0, and those of DDPM
+(ancestral) with eta = 1.
 """
 
 from __future__ import annotations
@@ -25,33 +26,60 @@ ANALYTIC = "analytic"
 NETWORK = "network"
 
 
+class Diverged(ValueError):
+    """Sampling left all bounds, or guidance has no gradient: there is no plan. The message says what to change."""
+
+
 @dataclass(frozen=True)
 class Guidance:
     """Loss guidance: predicted clean states move by `-weight * gradient`, never further than `clip`.
 
     `cost` maps normalised states `(batch, state tokens, features)` to `(batch,)`. `gradient` is "analytic": taken on
     the predicted states themselves, which is cheap; or "network": taken on the noisy states, back through the network
-    (UniPhys, eq. 3). `clip` is the norm of a step over one window, in normalised units.
+    (UniPhys, eq. 3). `clip` is the norm of a step over one window, in normalised units. With `samples` > 1 so many
+    neighbours in the batch are samples of one window, and all move by the mean of their gradients (Monte-Carlo
+    guidance, UniPhys, eq. 4).
     """
 
     cost: Callable[[Tensor], Tensor]
     weight: float
     clip: float
     gradient: str = ANALYTIC
+    samples: int = 1
 
     def __post_init__(self) -> None:
         if self.gradient not in (ANALYTIC, NETWORK):
             raise ConfigError(f"guidance: gradient must be '{ANALYTIC}' or '{NETWORK}', not '{self.gradient}'")
 
+    def step(self, gradient: Tensor, moving: Tensor) -> Tensor:
+        """How far states go, `(batch, state tokens, features)`: those `moving` `(state tokens,)`. Raises Diverged."""
+        if not torch.isfinite(gradient).all():
+            raise Diverged("the guidance cost has no finite gradient on this trajectory; check the task's cost")
+        if self.samples > 1:
+            mean = gradient.reshape(-1, self.samples, *gradient.shape[1:]).mean(1)
+            gradient = mean.repeat_interleave(self.samples, 0)
+        step = self.weight * gradient * moving[:, None]  # what does not move uses nothing of the step up
+        norm = step.flatten(1).norm(dim=1).clamp_min(1e-12)
+        if not torch.isfinite(norm).all():
+            raise Diverged(
+                f"guidance with a weight of {self.weight:g} moves this trajectory out of all bounds; lower it"
+            )
+        limited: Tensor = step * (self.clip / norm).clamp_max(1.0)[:, None, None]
+        return limited
+
 
 @dataclass(frozen=True)
 class Known:
-    """Tokens that are given, normalised; the masks say which. What lies under False is not read."""
+    """Tokens that are given, normalised; the masks say which. What lies under False is not read.
+
+    `impute` puts what is known of other states, some features of a token for one, into a predicted clean window.
+    """
 
     states: Tensor  # (batch, state tokens, features)
     actions: Tensor  # (batch, action tokens, features)
     state_mask: Tensor  # (state tokens,) bool
     action_mask: Tensor  # (action tokens,) bool
+    impute: Callable[[Tensor], Tensor] | None = None  # clean states to clean states
 
 
 def classifier_free(denoise: Callable[..., tuple[Tensor, Tensor]], text: Tensor | None, weight: float) -> Predictor:
@@ -83,10 +111,16 @@ def draw_noise(generators: Sequence[torch.Generator], tokens: int, features: int
 class Sampler:
     """Walks a denoising matrix with a predictor of clean windows."""
 
-    def __init__(self, predict: Predictor, signal: Array) -> None:
-        """`signal` is the cumulative signal of each level (`schedule.cosine_signal`)."""
+    def __init__(self, predict: Predictor, signal: Array, eta: float = 0.0, stabilise: int = 0) -> None:
+        """`signal` is the cumulative signal of each level (`schedule.cosine_signal`).
+
+        `eta` 0 is DDIM and 1 is DDPM. Tokens that are clean, the past among them, are shown to the network as if they
+        were at level `stabilise`, with their values untouched (UniPhys, algorithm 1, line 5).
+        """
         self._predict = predict
         self._signal = torch.as_tensor(signal, dtype=torch.float32)
+        self._eta = eta
+        self._stabilise = stabilise
 
     def sample(
         self,
@@ -94,50 +128,66 @@ class Sampler:
         known: Known,
         generators: Sequence[torch.Generator],
         guidance: Guidance | None = None,
+        start: tuple[Tensor, Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Clean states and actions, shaped like `known`; all randomness comes from `generators`, one a sample.
 
-        Raises ValueError when the guidance cost has no finite gradient.
+        Sampling begins with pure noise, or with the noisy states and actions `start` at the levels of the matrix's
+        first row. Raises Diverged.
         """
         matrix = matrix.hold(known.state_mask.numpy(), known.action_mask.numpy())
         state_rows, action_rows = torch.as_tensor(matrix.states), torch.as_tensor(matrix.actions)
-        states = draw_noise(generators, *known.states.shape[1:])
-        actions = draw_noise(generators, *known.actions.shape[1:])
-        states = torch.where(known.state_mask[:, None], known.states, states)
-        actions = torch.where(known.action_mask[:, None], known.actions, actions)
+        if start is None:
+            start = draw_noise(generators, *known.states.shape[1:]), draw_noise(generators, *known.actions.shape[1:])
+        states = torch.where(known.state_mask[:, None], known.states, start[0])
+        actions = torch.where(known.action_mask[:, None], known.actions, start[1])
         for call in range(matrix.calls):
-            clean_states, clean_actions = self._call(states, actions, state_rows[call], action_rows[call], guidance)
-            states = self._step(states, clean_states, state_rows[call], state_rows[call + 1])
-            actions = self._step(actions, clean_actions, action_rows[call], action_rows[call + 1])
+            before, after = (state_rows[call], action_rows[call]), (state_rows[call + 1], action_rows[call + 1])
+            clean_states, clean_actions = self._call(states, actions, *before, after[0] < before[0], guidance)
+            if known.impute is not None:
+                clean_states = known.impute(clean_states)
+            states = self._step(states, clean_states, before[0], after[0], generators)
+            actions = self._step(actions, clean_actions, before[1], after[1], generators)
         return states, actions
 
     def _call(
-        self, states: Tensor, actions: Tensor, state_levels: Tensor, action_levels: Tensor, guidance: Guidance | None
+        self,
+        states: Tensor,
+        actions: Tensor,
+        state_levels: Tensor,
+        action_levels: Tensor,
+        moving: Tensor,
+        guidance: Guidance | None,
     ) -> tuple[Tensor, Tensor]:
-        """One network call, its states moved by guidance."""
+        """One network call, its `moving` states moved by guidance."""
+        levels = (levels.masked_fill(levels == 0, self._stabilise) for levels in (state_levels, action_levels))
         if guidance is None:
-            return self._predict(states, actions, state_levels, action_levels)
+            return self._predict(states, actions, *levels)
         if guidance.gradient == NETWORK:
             with torch.enable_grad():
                 source = states.detach().requires_grad_()
-                clean_states, clean_actions = self._predict(source, actions, state_levels, action_levels)
+                clean_states, clean_actions = self._predict(source, actions, *levels)
                 (gradient,) = torch.autograd.grad(guidance.cost(clean_states).sum(), source)
             clean_states, clean_actions = clean_states.detach(), clean_actions.detach()
         else:
-            clean_states, clean_actions = self._predict(states, actions, state_levels, action_levels)
+            clean_states, clean_actions = self._predict(states, actions, *levels)
             with torch.enable_grad():
                 source = clean_states.detach().requires_grad_()
                 (gradient,) = torch.autograd.grad(guidance.cost(source).sum(), source)
-        if not torch.isfinite(gradient).all():
-            raise ValueError("the guidance cost has no finite gradient on this trajectory; check the task's cost")
-        step = guidance.weight * gradient * (state_levels > 0)[:, None]  # what is known does not move
-        norm = step.flatten(1).norm(dim=1).clamp_min(1e-12)
-        step = step * (guidance.clip / norm).clamp_max(1.0)[:, None, None]
-        return clean_states - step, clean_actions
+        return clean_states - guidance.step(gradient, moving), clean_actions
 
-    def _step(self, noisy: Tensor, clean: Tensor, before: Tensor, after: Tensor) -> Tensor:
-        """The DDIM step from levels `before` to `after`, `(tokens,)`; tokens whose level stays are left alone."""
+    def _step(
+        self, noisy: Tensor, clean: Tensor, before: Tensor, after: Tensor, generators: Sequence[torch.Generator]
+    ) -> Tensor:
+        """The step from levels `before` to `after`, `(tokens,)`; tokens whose level stays are left alone."""
         a, b = self._signal[before][:, None], self._signal[after][:, None]
         noise = (noisy - a.sqrt() * clean) / (1 - a).sqrt().clamp_min(1e-6)
-        stepped = b.sqrt() * clean + (1 - b).sqrt() * noise
+        if self._eta == 0.0:
+            stepped = b.sqrt() * clean + (1 - b).sqrt() * noise
+        else:
+            fresh = self._eta**2 * (1 - b) / (1 - a).clamp_min(1e-6) * (1 - a / b)  # variance of the noise drawn anew
+            drawn = draw_noise(generators, *noisy.shape[1:])
+            stepped = (
+                b.sqrt() * clean + (1 - b - fresh).clamp_min(0.0).sqrt() * noise + fresh.clamp_min(0.0).sqrt() * drawn
+            )
         return torch.where((after < before)[:, None], stepped, noisy)

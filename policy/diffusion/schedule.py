@@ -17,6 +17,9 @@ import numpy as np
 
 from hw.hal import Array
 
+PYRAMID = "pyramid"
+TRAPEZOID = "trapezoid"
+
 
 def cosine_signal(levels: int, offset: float = 0.008) -> Array:
     """Cumulative signal `(levels + 1,)` of the cosine schedule, from 1 at level 0 to almost 0 at `levels`.
@@ -64,6 +67,16 @@ class DenoisingMatrix:
         """The same matrix with known tokens at level 0 throughout; masks `(state tokens,)`, `(action tokens,)` bool."""
         return DenoisingMatrix(np.where(states, 0, self.states), np.where(actions, 0, self.actions))
 
+    def ignore(self, states: Array, actions: Array, levels: int) -> DenoisingMatrix:
+        """The same matrix with tokens that stay pure noise (`levels`), which tells the network nothing; masks as above.
+
+        Calls that would change nothing are left out.
+        """
+        state_rows, action_rows = np.where(states, levels, self.states), np.where(actions, levels, self.actions)
+        change = (np.diff(state_rows, axis=0) != 0).any(1) | (np.diff(action_rows, axis=0) != 0).any(1)
+        kept = np.r_[True, change if change.any() else np.ones_like(change)]
+        return DenoisingMatrix(state_rows[kept], action_rows[kept])
+
 
 def full_sequence(levels: int, steps: int, state_tokens: int, action_tokens: int, lead: int = 0) -> DenoisingMatrix:
     """All tokens go down together, in `steps` calls.
@@ -71,7 +84,97 @@ def full_sequence(levels: int, steps: int, state_tokens: int, action_tokens: int
     With `lead` > 0 the states finish that many calls before the actions, which then see the finished states, at the
     price of as many extra calls.
     """
-    ladder = ddim_levels(levels, steps)
-    states = np.concatenate([ladder, np.zeros(lead, dtype=np.int64)])
-    actions = np.concatenate([np.full(lead, levels), ladder])
-    return DenoisingMatrix(np.repeat(states[:, None], state_tokens, 1), np.repeat(actions[:, None], action_tokens, 1))
+    states, actions = np.zeros(state_tokens, dtype=np.int64), np.zeros(action_tokens, dtype=np.int64)
+    return _staggered(levels, levels, states, actions + lead, steps)
+
+
+def autoregressive(
+    levels: int, steps: int, state_frames: Array, action_frames: Array, block: int = 1, lead: int = 0
+) -> DenoisingMatrix:
+    """Frames are denoised one block after the other, each in `steps` calls, while all later ones stay pure noise.
+
+    Frame f is the action of tick f and the state of tick f + 1 that it leads to, as a token of UniPhys is; `..._frames`
+    gives the frame of each token, `(tokens,)`, negative in the past. `lead` is that of `full_sequence`, in each block.
+    """
+    if block < 1:
+        raise ValueError(f"a block of frames must hold at least one, not {block}")
+    states, actions = (np.maximum(frames, 0) // block * (steps + lead) for frames in (state_frames, action_frames))
+    return _staggered(levels, levels, states, actions + lead, steps)
+
+
+def gradual(
+    levels: int,
+    steps: int,
+    state_frames: Array,
+    action_frames: Array,
+    spread: int,
+    shape: str = PYRAMID,
+    lead: int = 0,
+) -> DenoisingMatrix:
+    """Near frames go down first: each frame begins later than the one before it, the last one `spread` calls late.
+
+    "pyramid" is that of UniPhys and of Diffusion Forcing. In a "trapezoid" the latest are the frames in the middle, for
+    a window whose far end is known as well, by a keyframe say. Frames are those of `autoregressive`.
+    """
+    if spread < 0:
+        raise ValueError(f"the spread of a gradual schedule must not be negative, not {spread}")
+    if shape not in (PYRAMID, TRAPEZOID):
+        raise ValueError(f"a gradual schedule is '{PYRAMID}' or '{TRAPEZOID}', not '{shape}'")
+    last = max(state_frames.max(), action_frames.max())
+
+    def delays(frames: Array) -> Array:
+        frames, latest = np.maximum(frames, 0), last
+        if shape == TRAPEZOID:
+            frames, latest = np.minimum(frames, last - frames), last // 2
+        late: Array = np.round(spread * frames / max(latest, 1)).astype(np.int64)
+        return late
+
+    return _staggered(levels, levels, delays(state_frames), delays(action_frames) + lead, steps)
+
+
+def rolling(
+    levels: int,
+    steps: int,
+    state_frames: Array,
+    action_frames: Array,
+    state_level: int,
+    action_level: int,
+    fresh: int = 1,
+    ramp: int = 1,
+    lead: int = 0,
+) -> DenoisingMatrix:
+    """A plan that goes on from an earlier one: the first-in, first-out buffer of Diffuse-CLoC (section 3.2).
+
+    The last `fresh` frames were pushed in since and are pure noise. Of the others, states go on from `state_level` and
+    actions from `action_level`; over the `ramp` frames before the fresh ones the level rises to pure noise. Frames are
+    those of `autoregressive`.
+    """
+    for name, level in (("states", state_level), ("actions", action_level)):
+        if not 1 <= level <= levels:
+            raise ValueError(f"rolling {name} must go on from a level of 1 to {levels}, not {level}")
+    if fresh < 0 or ramp < 1:
+        raise ValueError(f"fresh must not be negative and ramp must be at least 1 frame, not {fresh}, {ramp}")
+
+    def starts(frames: Array, level: int) -> Array:
+        last = frames.max()  # an earlier plan may have had fewer actions than states
+        risen = np.clip(1 - (last - fresh + 1 - frames) / ramp, 0.0, 1.0)  # 1 in the fresh frames
+        start: Array = np.round(level + (levels - level) * risen).astype(np.int64)
+        return start
+
+    states, actions = np.zeros_like(state_frames), np.zeros_like(action_frames)
+    starts_of = starts(state_frames, state_level), starts(action_frames, action_level)
+    return _staggered(*starts_of, states, actions + lead, steps)
+
+
+def _staggered(
+    state_levels: Array | int, action_levels: Array | int, state_delays: Array, action_delays: Array, steps: int
+) -> DenoisingMatrix:
+    """Each token begins at its level and goes down evenly in `steps` calls, after a delay of so many calls."""
+    calls = steps + int(max(state_delays.max(), action_delays.max()))
+
+    def rows(levels: Array | int, delays: Array) -> Array:
+        ladder = np.linspace(np.broadcast_to(levels, delays.shape), 0.0, steps + 1)
+        at = np.clip(np.arange(calls + 1)[:, None] - delays, 0, steps)
+        return np.take_along_axis(np.round(ladder).astype(np.int64), at, 0)
+
+    return DenoisingMatrix(rows(state_levels, state_delays), rows(action_levels, action_delays))

@@ -1,11 +1,28 @@
-"""How a diffusion policy plans: `configs/policies/diffusion.yaml`."""
+"""How a diffusion policy plans: the files in `configs/policies/` that name a checkpoint of the diffusion model."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
-from hw.config import ConfigError, load_yaml, resolve
-from policy.diffusion.schedule import ddim_levels
+import numpy as np
+
+from hw.config import ConfigError, load_yaml, nearest, resolve
+from hw.hal import Array
+from policy.diffusion.config import DenoiserConfig
+from policy.diffusion.schedule import (
+    PYRAMID,
+    TRAPEZOID,
+    DenoisingMatrix,
+    autoregressive,
+    ddim_levels,
+    full_sequence,
+    gradual,
+    rolling,
+)
+
+SCHEDULES = ("full_sequence", "autoregressive", "gradual", "rolling")
+SHAPES = (PYRAMID, TRAPEZOID)
 
 
 @dataclass(frozen=True)
@@ -15,12 +32,60 @@ class GuidanceSettings:
     weight: float = 4000.0
     clip: float = 12.0
     gradient: str = "analytic"
+    samples: int = 1  # windows denoised side by side for one plan
+    choose: str = "mean"  # of them. mean: they share the mean gradient, the first is run; best: the cheapest is run
 
     def __post_init__(self) -> None:
-        if self.weight < 0 or self.clip <= 0:
-            raise ValueError(f"weight must not be negative and clip must be positive, not {self.weight}, {self.clip}")
-        if self.gradient not in ("analytic", "network"):
-            raise ValueError(f"gradient must be 'analytic' or 'network', not '{self.gradient}'")
+        if not (math.isfinite(self.weight) and self.weight >= 0 and self.clip > 0):
+            raise ValueError(
+                f"weight must be a number that is not negative and clip positive, not {self.weight}, {self.clip}"
+            )
+        if self.samples < 1:
+            raise ValueError(f"samples must be at least 1, not {self.samples}")
+        for name, value, known in (
+            ("gradient", self.gradient, ("analytic", "network")),
+            ("choose", self.choose, ("mean", "best")),
+        ):
+            if value not in known:
+                raise ValueError(f"{name} must be '{known[0]}' or '{known[1]}', not '{value}'")
+
+
+@dataclass(frozen=True)
+class Autoregressive:
+    """See `policy.diffusion.schedule.autoregressive`."""
+
+    block: int = 4  # frames
+
+    def __post_init__(self) -> None:
+        if self.block < 1:
+            raise ValueError(f"block must be at least 1 frame, not {self.block}")
+
+
+@dataclass(frozen=True)
+class Gradual:
+    """See `policy.diffusion.schedule.gradual`."""
+
+    spread: int = 5  # calls by which the last frame is later than the first
+    shape: str = PYRAMID
+
+    def __post_init__(self) -> None:
+        if self.spread < 0:
+            raise ValueError(f"spread must not be negative, not {self.spread}")
+        if self.shape not in SHAPES:
+            raise ValueError(f"no shape is called '{self.shape}': {nearest(self.shape, SHAPES)}")
+
+
+@dataclass(frozen=True)
+class Rolling:
+    """See `policy.diffusion.schedule.rolling`. Levels are those of a network with 20, as in Diffuse-CLoC."""
+
+    state_level: int = 14
+    action_level: int = 4
+    ramp: int = 1  # frames
+
+    def __post_init__(self) -> None:
+        if min(self.state_level, self.action_level, self.ramp) < 1:
+            raise ValueError("state_level, action_level and ramp must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -28,11 +93,19 @@ class DiffusionSettings:
     """Settings of the diffusion policy; ticks are those of the control loop."""
 
     checkpoint: str = "diffusion"  # a shipped one, or the path of a .safetensors file
-    steps: int = 5  # network calls a plan
+    steps: int = 5  # network calls that take a token from noise to clean
     lead: int = 1  # extra calls by which the states are finished before the actions
-    replan: int = 4  # ticks between requests
+    replan: int = 4  # ticks between requests: the actions executed of a plan
     delay: int = 2  # ticks from a request to the adoption of its plan
     trim: float = 1.0  # 1/s at which what is asked is corrected by what comes of it; 0: not
+    history: int | None = None  # states that a plan is made from; None: as many as the network has
+    horizon: int | None = None  # ticks that are planned; None: as many as the network has
+    schedule: str = "full_sequence"
+    autoregressive: Autoregressive = field(default_factory=Autoregressive)
+    gradual: Gradual = field(default_factory=Gradual)
+    rolling: Rolling = field(default_factory=Rolling)
+    eta: float = 0.0  # 0: DDIM, deterministic; 1: DDPM
+    stabilise: int = 0  # noise level that clean tokens are shown with
     text_weight: float = 1.0  # classifier-free guidance by the instruction; 0: unread, 1: as trained
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
 
@@ -41,18 +114,69 @@ class DiffusionSettings:
             raise ValueError("steps and replan must be at least 1, and lead must not be negative")
         if not 0 <= self.delay <= self.replan:
             raise ValueError(f"delay must be 0 to replan ({self.replan} ticks), not {self.delay}")
+        if self.schedule not in SCHEDULES:
+            raise ValueError(f"no schedule is called '{self.schedule}': {nearest(self.schedule, SCHEDULES)}")
+        if not 0.0 <= self.eta <= 1.0:
+            raise ValueError(f"eta must be 0 (DDIM) to 1 (DDPM), not {self.eta}")
+        if self.stabilise < 0:
+            raise ValueError(f"stabilise must not be negative, not {self.stabilise}")
 
-    def check(self, horizon: int, levels: int) -> None:
-        """Raise ConfigError where a network of this horizon and number of noise levels cannot serve."""
+    def check(self, network: DenoiserConfig) -> None:
+        """Raise ConfigError where this network cannot serve."""
+        for name, ours in (("history", self.history), ("horizon", self.horizon)):
+            most = getattr(network, name)
+            if ours is not None and not 1 <= ours <= most:
+                raise ConfigError(
+                    f"diffusion policy: {name} {ours} is asked for, and this checkpoint has 1 to {most} ticks; "
+                    f"lower it, or train a model with --{name} {ours}"
+                )
+        horizon = min(self.horizon or network.horizon, int(network.action_ticks[-1]) + 1)
         if self.replan + self.delay > horizon:
             raise ConfigError(
                 f"diffusion policy: a plan must last replan + delay = {self.replan + self.delay} ticks, "
-                f"and this checkpoint plans {horizon}; lower replan or delay"
+                f"and this one has actions for {horizon}; lower replan or delay"
+            )
+        if self.stabilise > network.levels:
+            raise ConfigError(
+                f"diffusion policy: stabilise must be at most {network.levels}, the network's noise levels"
             )
         try:
-            ddim_levels(levels, self.steps)
+            ddim_levels(network.levels, self.steps)
+            self.matrix(network)
+            self.matrix(network, fresh=1)
         except ValueError as error:
             raise ConfigError(f"diffusion policy: {error}") from error
+
+    def matrix(self, network: DenoiserConfig, fresh: int | None = None) -> DenoisingMatrix:
+        """The denoising matrix of a plan, with what `history` and `horizon` leave out as pure noise.
+
+        For the rolling schedule `fresh` is the number of frames at the end that no earlier plan had; without an earlier
+        plan (None) the window begins as pure noise altogether.
+        """
+        horizon = self.horizon or network.horizon
+        # The frames of a schedule end with the horizon.
+        state_frames = np.minimum(network.state_ticks - 1, horizon - 1)
+        action_frames = np.minimum(network.action_ticks, horizon - 1)
+        frames = state_frames, action_frames
+        levels, lead = network.levels, self.lead
+        if self.schedule == "autoregressive":
+            matrix = autoregressive(levels, self.steps, *frames, self.autoregressive.block, lead)
+        elif self.schedule == "gradual":
+            matrix = gradual(levels, self.steps, *frames, self.gradual.spread, self.gradual.shape, lead)
+        elif self.schedule == "rolling" and fresh is not None:
+            roll = self.rolling
+            start = roll.state_level, roll.action_level
+            matrix = rolling(levels, self.steps, *frames, *start, fresh, roll.ramp, lead)
+        else:
+            matrix = full_sequence(levels, self.steps, len(state_frames), len(action_frames), lead)
+        states, actions = self.used(network)
+        return matrix.ignore(~states, ~actions, levels)
+
+    def used(self, network: DenoiserConfig) -> tuple[Array, Array]:
+        """State and action tokens that `history` and `horizon` leave in, `(tokens,)` bool each."""
+        first, horizon = 1 - (self.history or network.history), self.horizon or network.horizon
+        states, actions = network.state_ticks, network.action_ticks
+        return (states >= first) & (states <= horizon), (actions >= first) & (actions < horizon)
 
 
 def load_settings(name: str = "diffusion") -> DiffusionSettings:

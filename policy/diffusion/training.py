@@ -2,28 +2,56 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
+from hw.config import ConfigError
 from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.denoiser import Denoiser
 
 UNTOLD = 0.1  # share of windows without an instruction
 
 
+@dataclass(frozen=True)
+class Objective:
+    """What is trained for, beside the plain squared error."""
+
+    near_actions: int = 8  # ticks to come whose actions count in full
+    far_actions: float = 0.2  # weight of those beyond; 0 cuts them, as Diffuse-CLoC does
+    min_snr: float = 0.0  # clip of the signal-to-noise ratio that weights tokens; 0: all levels weigh the same
+    action_rate: float = 0.0  # weight of the error of the change from one action to the next
+    monotone: float = 0.0  # share of windows whose levels rise along the window, as in gradual and rolling schedules
+
+    def __post_init__(self) -> None:
+        if self.near_actions < 1:
+            raise ConfigError(f"near_actions must be at least 1 tick, not {self.near_actions}")
+        if min(self.far_actions, self.min_snr, self.action_rate) < 0:
+            raise ConfigError("the weights of far actions and of the action rate, and min-SNR, must not be negative")
+        if not 0.0 <= self.monotone <= 0.5:
+            raise ConfigError(f"the share of windows with monotone levels must be 0 to 0.5, not {self.monotone}")
+
+
+PLAIN = Objective()
+
+
 def draw_levels(
-    config: DenoiserConfig, batch: int, committed: int, generator: torch.Generator
+    config: DenoiserConfig, batch: int, committed: int, generator: torch.Generator, monotone: float = 0.0
 ) -> tuple[Tensor, Tensor]:
     """Noise levels `(batch, state tokens)` and `(batch, action tokens)`.
 
     Half of the windows have independent levels, clean included; the others share one, as they do when a plan is
-    sampled. There the first 0 to `committed` actions to come are clean: they run while a plan is being made. The past
-    is clean but in half of the windows with independent levels, which learn to mend one (UniPhys, section 3.2).
+    sampled; of these, a share `monotone` of all windows has levels that rise along the window instead. There the first
+    0 to `committed` actions to come are clean: they run while a plan is being made. The past is clean but in half of
+    the windows with independent levels, which learn to mend one (UniPhys, section 3.2).
     """
     half = batch // 2
     n_states, n_actions, k = len(config.state_ticks), len(config.action_ticks), config.levels
     levels = torch.randint(k + 1, (batch, n_states + n_actions), generator=generator)
     levels[:half] = torch.randint(1, k + 1, (half, 1), generator=generator)
+    if rising := round(monotone * batch):
+        levels[:rising] = torch.cat(rising_levels(config, rising, generator), 1)
     states, actions = levels[:, :n_states], levels[:, n_states:]
     state_ticks, action_ticks = torch.from_numpy(config.state_ticks), torch.from_numpy(config.action_ticks)
     clean = torch.zeros(batch, 1, dtype=torch.long)
@@ -32,6 +60,25 @@ def draw_levels(
     states = torch.where((state_ticks <= 0) & known, 0, states)
     actions = torch.where((action_ticks < clean) & known, 0, actions)
     return states, actions
+
+
+def rising_levels(config: DenoiserConfig, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Levels that rise along the frames of a window: from a gentle slope (gradual, rolling) to a step (autoregressive).
+
+    In half of the windows actions are ahead of the states of their frame, or behind them, by some levels: when rolling,
+    or with a lead, they are not denoised together.
+    """
+
+    def uniform(low: Tensor | float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(batch, 1, generator=generator)
+
+    k, last = config.levels, config.horizon - 1
+    slope = k / (2 * config.horizon) * (4.0 * config.horizon) ** uniform(0.0, 1.0)  # levels a frame: a ramp to a step
+    first = uniform(-slope * last, k)
+    behind = uniform(-k, k) * (uniform(0.0, 1.0) < 0.5)
+    frames = torch.from_numpy(config.state_ticks - 1), torch.from_numpy(config.action_ticks)
+    states, actions = (first + slope * x for x in frames)
+    return states.round().clamp(0, k).long(), (actions + behind).round().clamp(0, k).long()
 
 
 def add_noise(x: Tensor, levels: Tensor, signal: Tensor, generator: torch.Generator) -> Tensor:
@@ -53,6 +100,27 @@ def action_weight(config: DenoiserConfig, near: int = 8, far_weight: float = 0.2
     return torch.where(ticks < near, 1.0, far_weight) * (ticks >= 0)
 
 
+def level_weight(levels: Tensor, signal: Tensor, min_snr: float) -> Tensor:
+    """Loss weight of tokens by their level: 0 for clean ones; min(SNR, `min_snr`) of the others, or 1 without a clip.
+
+    Hang et al., arXiv:2303.09556, for a network that predicts x0.
+    """
+    noisy = (levels > 0).float()
+    if not min_snr:
+        return noisy
+    a = signal[levels]
+    return noisy * (a / (1 - a).clamp_min(1e-9)).clamp_max(min_snr)
+
+
+def rate_error(predicted: Tensor, target: Tensor, levels: Tensor, weight: Tensor) -> Tensor:
+    """Weighted mean of the squared error of the change from each action to the next; clean actions are as given.
+
+    Shapes as in `token_error`; `weight` is that of the later action of a pair.
+    """
+    predicted = torch.where((levels > 0)[..., None], predicted.float(), target)
+    return token_error(predicted.diff(dim=1), target.diff(dim=1), weight[..., 1:])
+
+
 def losses(
     denoiser: Denoiser,
     states: Tensor,
@@ -61,21 +129,24 @@ def losses(
     signal: Tensor,
     committed: int,
     generator: torch.Generator,
+    objective: Objective = PLAIN,
 ) -> tuple[Tensor, Tensor]:
     """State and action losses of a batch of clean windows: squared error of the predicted clean tokens (x0).
 
     One window in ten is shown without its instruction `text` `(batch, text_size)`, for classifier-free guidance.
     """
     config = denoiser.config
-    state_levels, action_levels = draw_levels(config, len(states), committed, generator)
+    state_levels, action_levels = draw_levels(config, len(states), committed, generator, objective.monotone)
     noisy_states = add_noise(states, state_levels, signal, generator)
     noisy_actions = add_noise(actions, action_levels, signal, generator)
     told = torch.rand(len(states), generator=generator) >= UNTOLD
     clean_states, clean_actions = denoiser(noisy_states, noisy_actions, state_levels, action_levels, text, told)
-    return (
-        token_error(clean_states, states, (state_levels > 0).float()),
-        token_error(clean_actions, actions, (action_levels > 0) * action_weight(config)),
-    )
+    state_weight, weight = (level_weight(x, signal, objective.min_snr) for x in (state_levels, action_levels))
+    weight = weight * action_weight(config, objective.near_actions, objective.far_actions)
+    action_loss = token_error(clean_actions, actions, weight)
+    if objective.action_rate:
+        action_loss = action_loss + objective.action_rate * rate_error(clean_actions, actions, action_levels, weight)
+    return token_error(clean_states, states, state_weight), action_loss
 
 
 class Average:

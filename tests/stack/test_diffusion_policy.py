@@ -15,7 +15,7 @@ from policy.diffusion import checkpoint
 from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.denoiser import Denoiser
 from policy.diffusion.features import Normaliser, raw_layout
-from policy.diffusion.settings import DiffusionSettings
+from policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 from stack.diffusion_policy import DiffusionPolicy, diffusion_policy
 from stack.planner import InlinePlanner
 
@@ -119,6 +119,40 @@ def test_the_last_action_is_held_when_plans_stop_coming_and_it_is_said_once() ->
     assert ended == ["the plan of tick 4 ended before another one came: its last action is held"]
 
 
+def test_a_request_holds_the_plan_that_runs() -> None:
+    planner = Spy()
+    policy = DiffusionPolicy(planner, history=4, replan=1, delay=1)
+    run(policy, 8)
+    previous = [None if r.previous is None else r.previous.tick for r in planner.requests]
+    assert [r.tick for r in planner.requests] == [3, 4, 5, 6, 7]
+    assert previous == [None, 3, 4, 5, 6]
+    policy.reset(1)
+    run(policy, 4)
+    assert planner.requests[-1].previous is None
+
+
+class Refusing(Spy):
+    """Finds no plan for some ticks."""
+
+    def collect(self, tick: int, wait: bool) -> Plan | None:
+        plan = super().collect(tick, wait)
+        if plan is None or tick not in (8, 12, 20):
+            return plan
+        nothing = np.full((1, 1), np.nan)
+        return Plan(tick, nothing, nothing, nothing, 0.0, "guidance diverged")
+
+
+def test_a_plan_that_could_not_be_made_is_said_once_and_the_last_goes_on() -> None:
+    policy = DiffusionPolicy(Refusing(), history=4, replan=4, delay=1)
+    assert run(policy, 18)[8:] == [*range(4008, 4017), 16017]
+    assert policy.take_events() == ("no plan for tick 8: guidance diverged: that of 4 goes on",)
+    assert policy.adopted == [(4, 5), (16, 17)]
+    applied = np.zeros(20)
+    for tick in range(18, 22):
+        applied = policy.act(state(tick), applied, INSTRUCTION)
+    assert policy.take_events() == ("no plan for tick 20: guidance diverged: that of 16 goes on",)
+
+
 def test_reset_forgets_the_episode() -> None:
     policy = DiffusionPolicy(Spy(), history=4, replan=4, delay=1)
     first = run(policy, 12)
@@ -166,6 +200,26 @@ def test_in_line_and_beside_the_loop_a_seed_gives_the_same_actions(settings: Dif
         process.close()
 
 
+def beyond(trajectory: Any, instruction: Instruction) -> Any:
+    return trajectory.velocity.square().sum((-1, -2))
+
+
+@pytest.mark.parametrize("process", [False, True])
+def test_a_guidance_weight_that_diverges_holds_the_robot_and_says_why(
+    settings: DiffusionSettings, process: bool
+) -> None:
+    wild = replace(settings, guidance=GuidanceSettings(weight=1e9, clip=1e12))
+    policy = diffusion_policy(ROBOT, wild, beyond, process=process)
+    try:
+        targets = trace(policy, 3, wait=True)
+    finally:
+        policy.close()
+    np.testing.assert_array_equal(targets, np.repeat(ROBOT.home[None], len(targets), 0))
+    (event,) = policy.take_events()
+    assert "the goal is held" in event
+    assert "lower" in event
+
+
 @pytest.mark.parametrize("process", [False, True])
 def test_a_checkpoint_for_another_rate_is_refused_before_anything_starts(
     settings: DiffusionSettings, process: bool
@@ -174,3 +228,17 @@ def test_a_checkpoint_for_another_rate_is_refused_before_anything_starts(
         diffusion_policy(replace(ROBOT, rate=100), settings, process=process)
     with pytest.raises(ConfigError, match="lower replan or delay"):
         diffusion_policy(ROBOT, replace(settings, replan=15, delay=2), process=process)
+    with pytest.raises(ConfigError, match="horizon 32 is asked for"):
+        diffusion_policy(ROBOT, replace(settings, horizon=32), process=process)
+
+
+def test_rolling_gives_the_same_actions_in_line_and_beside_the_loop(settings: DiffusionSettings) -> None:
+    rolling = replace(settings, schedule="rolling", steps=2, replan=1, delay=1)
+    inline, process = diffusion_policy(ROBOT, rolling), diffusion_policy(ROBOT, rolling, process=True)
+    try:
+        first = trace(inline, 3, wait=True)
+        np.testing.assert_array_equal(first, trace(process, 3, wait=True))
+        np.testing.assert_array_equal(first, trace(inline, 3, wait=True))  # a new episode starts afresh
+        assert inline.adopted[:2] == [(3, 4), (4, 5)]
+    finally:
+        process.close()

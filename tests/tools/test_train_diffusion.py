@@ -15,7 +15,17 @@ from policy.diffusion.checkpoint import load
 from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.dataset import Windows, read_recording
 from policy.diffusion.denoiser import Denoiser
-from policy.diffusion.training import Average, action_weight, draw_levels
+from policy.diffusion.schedule import cosine_signal
+from policy.diffusion.training import (
+    Average,
+    Objective,
+    action_weight,
+    draw_levels,
+    level_weight,
+    losses,
+    rate_error,
+    rising_levels,
+)
 from tools.train import diffusion
 from tools.train.diffusion import Settings, Trainer
 from tools.train.journal import Journal
@@ -181,6 +191,84 @@ def test_far_actions_count_less_and_past_ones_not_at_all() -> None:
     assert weight[:3].tolist() == [0, 0, 0]
     assert weight[3:11].tolist() == [1] * 8
     assert weight[11:].tolist() == pytest.approx([0.2] * 8)
+
+
+def test_some_windows_have_levels_that_rise_as_gradual_and_rolling_schedules_do() -> None:
+    generator = torch.Generator().manual_seed(0)
+    states, actions = rising_levels(CONFIG, 500, generator)
+    assert (states.diff(dim=1) >= 0).all()
+    assert (actions.diff(dim=1) >= 0).all()
+    assert states.min() == 0
+    assert states.max() == 20
+    between = ((states[:, 4:] > 0) & (states[:, 4:] < 20)).sum(1)
+    steps = (between <= 1) & (states[:, 4] == 0) & (states[:, -1] == 20)
+    assert 0.05 < steps.float().mean() < 0.5  # autoregressive
+    assert (states[:, 4:].diff(dim=1).amax(1) <= 2).float().mean() > 0.1  # gentle
+    together = (states[:, 1:] == actions).all(1).float().mean()
+    assert 0.3 < together < 0.9  # the others are ahead or behind
+    # In a batch they take the place of windows that share one level; the rest is as it was.
+    plain = draw_levels(CONFIG, 400, 2, torch.Generator().manual_seed(0))
+    mixed = draw_levels(CONFIG, 400, 2, torch.Generator().manual_seed(0), monotone=0.25)
+    assert (mixed[0][:100, 4:].diff(dim=1) > 0).any(1).float().mean() > 0.5
+    assert not mixed[0][:300, :4].any()
+    assert torch.equal(plain[0][100:], mixed[0][100:])
+
+
+def test_the_clip_of_min_snr_bounds_what_a_nearly_clean_token_weighs() -> None:
+    signal = torch.as_tensor(cosine_signal(20), dtype=torch.float32)
+    levels = torch.tensor([0, 1, 10, 20])
+    assert level_weight(levels, signal, 0.0).tolist() == [0, 1, 1, 1]
+    weight = level_weight(levels, signal, 5.0)
+    assert weight[:2].tolist() == [0, 5]
+    assert weight[2].item() == pytest.approx(1.0, abs=0.1)  # half of the variance is signal
+    assert 0 < weight[3] < 1e-3
+
+
+def test_the_action_rate_loss_sees_jitter_and_not_an_offset() -> None:
+    target = torch.zeros(1, 5, 2)
+    jitter = torch.tensor([0.1, -0.1, 0.1, -0.1, 0.1])[None, :, None].expand(1, 5, 2)
+    noisy, weight = torch.full((1, 5), 7), torch.ones(1, 5)
+    assert rate_error(target + 0.1, target, noisy, weight).item() == 0
+    assert rate_error(jitter, target, noisy, weight).item() == pytest.approx(0.04)
+    # A step away from an action that is given counts, whatever was predicted for that one.
+    first = torch.tensor([[0, 7, 7, 7, 7]])
+    assert rate_error(target + 0.1, target, first, weight).item() == pytest.approx(0.01 / 4)
+
+
+def test_objectives_change_the_loss_and_nothing_else() -> None:
+    network = Denoiser(CONFIG)
+    signal = torch.as_tensor(cosine_signal(20), dtype=torch.float32)
+    states, actions = torch.randn(32, 20, 54), torch.randn(32, 19, 20)
+
+    def loss(**options: float) -> list[float]:
+        generator = torch.Generator().manual_seed(3)
+        parts = losses(network, states, actions, None, signal, 2, generator, Objective(**options))  # type: ignore[arg-type]
+        return [part.item() for part in parts]
+
+    plain = loss()
+    assert loss(action_rate=0.5)[1] > plain[1]
+    assert loss(action_rate=0.5)[0] == plain[0]
+    assert loss(far_actions=0.0)[1] != plain[1]
+    assert loss(min_snr=5.0) != plain
+    assert loss(monotone=0.25) != plain
+
+
+def test_objectives_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"0 to 0\.5, not 0\.8"):
+        Objective(monotone=0.8)
+    with pytest.raises(ConfigError, match="at least 1 tick"):
+        Objective(near_actions=0)
+    with pytest.raises(ConfigError, match="must not be negative"):
+        Objective(min_snr=-1.0)
+
+
+def test_a_checkpoint_says_what_it_was_trained_for(windows: Windows, tmp_path: Path) -> None:
+    options = {"min_snr": 5.0, "action_rate": 0.1, "monotone": 0.25, "far_actions": 0.0}
+    settings = Settings(minutes=0.002, batch=16, warmup_steps=5, **options)  # type: ignore[arg-type]
+    trainer(windows, tmp_path, Measured(1.0), settings).run()
+    training = read_header(tmp_path / "best.safetensors")["training"]
+    assert options.items() <= training.items()
+    assert training["near_actions"] == 8
 
 
 def test_the_average_starts_quickly_and_then_forgets_slowly() -> None:

@@ -28,6 +28,7 @@ Survival = Callable[[Path], Mapping[str, float]]
 
 MEANS = ("minutes", "loss", "state_loss", "action_loss", "learning_rate", "tokens_per_s")
 COLUMNS = (*MEANS, "validation_action_loss", "survival", "velocity_error")
+OBJECTIVE = ("near_actions", "far_actions", "min_snr", "action_rate", "monotone")
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,11 @@ class Settings:
     evaluate_every: float = 5.0
     seed: int = 0
     precision: str = "bf16"
+    near_actions: int = 8  # this and the rest: see `policy.diffusion.training.Objective`
+    far_actions: float = 0.2
+    min_snr: float = 0.0
+    action_rate: float = 0.0
+    monotone: float = 0.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,6 +73,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--emphasis", type=float, default=5.0, help="of global states; 0: no projection")
     parser.add_argument("--mask", default="state_full_action_causal", help="attention mask")
     parser.add_argument("--committed", type=int, default=d.committed, help="longest delay, in ticks, to be trained for")
+    parser.add_argument("--near-actions", type=int, default=d.near_actions, help="ticks whose actions count in full")
+    parser.add_argument("--far-actions", type=float, default=d.far_actions, help="weight of later ones; 0: none")
+    parser.add_argument("--min-snr", type=float, default=d.min_snr, help="clip of SNR loss weights, 5 for one; 0: none")
+    parser.add_argument("--action-rate", type=float, default=d.action_rate, help="weight of the error of changes")
+    parser.add_argument(
+        "--monotone", type=float, default=d.monotone, help="share of windows with rising noise levels, 0 to 0.5"
+    )
     parser.add_argument("--precision", choices=("bf16", "fp32"), default=d.precision)
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch threads (default: all cores)")
     parser.add_argument("--evaluate-every", type=float, default=d.evaluate_every, help="minutes; 0: only at the end")
@@ -99,7 +112,7 @@ def main(args: argparse.Namespace) -> int:
         text_size=load_encoder(args.text).size if args.text else 0,
         **{name: getattr(args, name) for name in shape},
     )
-    names = ("minutes", "batch", "learning_rate", "committed", "evaluate_every", "seed", "precision")
+    names = ("minutes", "batch", "learning_rate", "committed", "evaluate_every", "seed", "precision", *OBJECTIVE)
     settings = Settings(**{name: getattr(args, name) for name in names})
     recording = read_recording(args.data, robot)
     windows = Windows(recording, robot, config, emphasis=args.emphasis, seed=args.seed)
@@ -146,10 +159,11 @@ class Trainer:
 
         from policy.diffusion.denoiser import Denoiser
         from policy.diffusion.schedule import cosine_signal
-        from policy.diffusion.training import Average
+        from policy.diffusion.training import Average, Objective
 
         if settings.committed > config.horizon:
             raise ConfigError(f"--committed {settings.committed} is longer than the horizon of {config.horizon} ticks")
+        self.objective = Objective(**{name: getattr(settings, name) for name in OBJECTIVE})
         torch.manual_seed(settings.seed)
         self.windows, self.robot, self.config, self.settings = windows, robot, config, settings
         self.out, self.source, self.licence, self.survival = out, source, licence, survival
@@ -249,7 +263,8 @@ class Trainer:
             group["lr"] = rate
         states, actions, text = self.windows.draw(settings.batch, self.generator)
         with torch.autocast("cpu", torch.bfloat16, enabled=settings.precision == "bf16"):
-            parts = losses(self.network, states, actions, text, self.signal, settings.committed, self.generator)
+            given = states, actions, text, self.signal, settings.committed, self.generator
+            parts = losses(self.network, *given, self.objective)
         total = parts[0] + parts[1]
         if not torch.isfinite(total):
             raise ConfigError(f"the loss is not finite at step {self.step}: try a lower --learning-rate, or fp32")
@@ -291,14 +306,16 @@ class Trainer:
         import torch
 
         from policy.diffusion.denoiser import Denoiser
-        from policy.diffusion.training import losses
+        from policy.diffusion.training import Objective, losses
 
         network = Denoiser(self.config).eval()
         network.load_state_dict(self.average.weights)
         states, actions, text = self.windows.held_out(count)
         with torch.inference_mode():
-            generator = torch.Generator().manual_seed(0)
-            return losses(network, states, actions, text, self.signal, self.settings.committed, generator)[1].item()
+            given = states, actions, text, self.signal, self.settings.committed, torch.Generator().manual_seed(0)
+            # The same measure whatever else is trained for, so that runs can be compared.
+            objective = Objective(self.objective.near_actions, self.objective.far_actions)
+            return losses(network, *given, objective)[1].item()
 
     # -- files -----------------------------------------------------------------------------------------------------
 

@@ -24,13 +24,13 @@ class PlannedWalker:
 
     def __init__(self, fleet: Fleet, runtime: Runtime, seed: int = 0) -> None:
         self.fleet, self._runtime, self._seed = fleet, runtime, seed
-        config = runtime.model.config
-        self._history, self._horizon = config.history, config.horizon
+        self._history, self._horizon = runtime.model.config.history, runtime.actions
         self._tick = 0
         self._states: Array | None = None  # (n, history, raw size), newest last
         self._applied = np.repeat(fleet.applied[:, None], self._history - 1, 1)
         self._plan, self._made = np.repeat(fleet.applied[:, None], self._horizon, 1), 0
-        self._waiting: Array | None = None  # the plans that are not adopted yet
+        self._predicted: Array | None = None  # (n, horizon, raw size) by the plans that run; None before the first
+        self._waiting: tuple[Array, Array] | None = None  # the plans that are not adopted yet
         self._requested = 0
         self._trim = Trim(fleet.robot.dt, runtime.settings.trim)
         self._fresh = np.ones(fleet.n, bool)
@@ -41,21 +41,26 @@ class PlannedWalker:
 
     def act(self, command: Array) -> Array:
         """Targets for the present state of the fleet under `command` `(n, 3)`."""
+        from policy.diffusion.rolling import Previous
+
         settings, tick = self._runtime.settings, self._tick
         self._observe()
         asked = self._trim(self.fleet.state, command)
         if self._waiting is not None and tick == self._requested + settings.delay:
-            self._plan, self._made, self._waiting = self._waiting, self._requested, None
+            (self._plan, self._predicted), self._made, self._waiting = self._waiting, self._requested, None
         if tick % settings.replan == 0 and self._states is not None:
             ahead = np.stack([self._action(tick + i) for i in range(settings.delay)], 1) if settings.delay else None
             actions = self._applied if ahead is None else np.concatenate([self._applied, ahead], 1)
             seeds = [(self._seed + i, tick) for i in range(self.fleet.n)]
-            plan, _ = self._runtime.plan_batch(self._states, actions, Instruction(asked), seeds)
+            previous = None
+            if self._predicted is not None:
+                previous = Previous(tick - self._made, self._predicted, self._plan)
+            plan, predicted = self._runtime.plan_batch(self._states, actions, Instruction(asked), seeds, previous)
             self._requested = tick
             if settings.delay:
-                self._waiting = plan
+                self._waiting = plan, predicted
             else:
-                self._plan, self._made = plan, tick
+                self._plan, self._predicted, self._made = plan, predicted, tick
         self._tick += 1
         return self._action(tick)
 
@@ -68,11 +73,20 @@ class PlannedWalker:
         self._applied = np.concatenate([self._applied[:, 1:], applied[:, None]], 1)
         if (fresh := self._fresh).any():
             self._states[fresh], self._applied[fresh] = row[fresh, None], applied[fresh, None]
-            self._plan = self._plan.copy()
-            self._plan[fresh] = applied[fresh, None]
+            still = applied[fresh, None], row[fresh, None]
+            self._plan = _with(self._plan, fresh, still[0])
+            if self._predicted is not None:
+                self._predicted = _with(self._predicted, fresh, still[1])
             if self._waiting is not None:
-                self._waiting[fresh] = applied[fresh, None]
+                self._waiting = _with(self._waiting[0], fresh, still[0]), _with(self._waiting[1], fresh, still[1])
             self._fresh = np.zeros_like(fresh)
 
     def _action(self, tick: int) -> Array:
         return self._plan[:, min(tick - self._made, self._horizon - 1)]
+
+
+def _with(array: Array, where: Array, value: Array) -> Array:
+    """A copy of `array` with rows `where` replaced."""
+    out = array.copy()
+    out[where] = value
+    return out

@@ -48,10 +48,32 @@ def test_full_mask_lets_everything_through() -> None:
     assert leaks(layers=1, mask="full")[1].all()
 
 
+def frames(denoiser: Denoiser) -> torch.Tensor:
+    """The frame of each token: an action goes with the state that it leads to."""
+    config = denoiser.config
+    return torch.cat([torch.as_tensor(config.state_ticks) - 1, torch.as_tensor(config.action_ticks)])
+
+
+@pytest.mark.parametrize("layers", [1, 3])
+def test_the_uniphys_mask_lets_nothing_through_from_a_later_frame_however_deep_the_network(layers: int) -> None:
+    denoiser, leak, _ = leaks(layers, mask="causal")
+    frame = frames(denoiser)
+    assert torch.equal(leak, frame[None] <= frame[:, None])
+
+
+def test_the_diffuser_mask_is_local_and_a_layer_reaches_one_tick_further() -> None:
+    for layers in (1, 2):
+        denoiser, leak, action_ticks = leaks(layers, mask="diffuser_local")
+        ticks = torch.cat([torch.as_tensor(denoiser.config.state_ticks), action_ticks])
+        assert torch.equal(leak, (ticks[None] - ticks[:, None]).abs() <= layers)
+
+
 def test_an_unknown_mask_is_refused_with_the_nearest_name() -> None:
     config = DenoiserConfig(5, 3)
     with pytest.raises(ConfigError, match="did you mean 'state_full_action_causal'"):
         attention_mask("state_full_action_casual", config.state_ticks, config.action_ticks)
+    with pytest.raises(ConfigError, match="did you mean 'causal'"):
+        Denoiser(DenoiserConfig(5, 3, mask="casual"))
 
 
 def test_training_and_inference_attend_alike() -> None:

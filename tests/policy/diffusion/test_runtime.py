@@ -26,7 +26,7 @@ SETTINGS = DiffusionSettings(steps=4, delay=2)
 
 def model(seed: int = 0, **shape: Any) -> checkpoint.Model:
     torch.manual_seed(seed)
-    config = DenoiserConfig(54, 20, **({"width": 32, "heads": 2} | shape))
+    config = DenoiserConfig(shape.pop("state_size", 54), 20, **({"width": 32, "heads": 2} | shape))
     denoiser = Denoiser(config).eval().requires_grad_(False)
     states = Normaliser(0.1 * torch.randn(54), torch.rand(54) + 0.1)
     actions = Normaliser(torch.tensor(ROBOT.home, dtype=torch.float32), torch.full((20,), 0.2))
@@ -132,7 +132,7 @@ def test_settings_that_a_network_cannot_serve_are_refused() -> None:
 def test_the_shipped_settings_load() -> None:
     settings = load_settings()
     assert settings.guidance.weight > 0
-    settings.check(horizon=16, levels=20)
+    settings.check(DenoiserConfig(54, 20, horizon=16, levels=20))
 
 
 def test_a_checkpoint_plans_as_what_was_saved(tmp_path: Path) -> None:

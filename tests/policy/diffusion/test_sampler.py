@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -7,8 +8,8 @@ from torch import Tensor
 from hw.config import ConfigError
 from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.denoiser import Denoiser
-from policy.diffusion.sampler import Guidance, Known, Sampler, classifier_free
-from policy.diffusion.schedule import cosine_signal, full_sequence
+from policy.diffusion.sampler import Diverged, Guidance, Known, Sampler, classifier_free
+from policy.diffusion.schedule import autoregressive, cosine_signal, full_sequence, rolling
 from policy.diffusion.training import losses
 
 LEVELS = 100
@@ -42,14 +43,18 @@ def mixture(weights: Tensor, means: Tensor, deviation: float) -> object:
     return lambda s, a, ks, ka: (clean(s, ks), clean(a, ka))
 
 
-def test_samples_have_the_mean_and_spread_of_the_distribution() -> None:
+# DDPM leaves out how uncertain each prediction is: its samples are narrower the fewer the levels.
+@pytest.mark.parametrize(("eta", "steps", "count", "narrow"), [(0.0, 50, 4000, 0.05), (1.0, LEVELS, 1500, 0.08)])
+def test_samples_have_the_mean_and_spread_of_the_distribution(
+    eta: float, steps: int, count: int, narrow: float
+) -> None:
     predict = mixture(torch.tensor([1.0]), torch.tensor([0.7]), 0.5)
-    states, actions = Sampler(predict, cosine_signal(LEVELS)).sample(
-        full_sequence(LEVELS, 50, 1, 1), unknown(4000), generators(4000)
+    states, actions = Sampler(predict, cosine_signal(LEVELS), eta).sample(
+        full_sequence(LEVELS, steps, 1, 1), unknown(count), generators(count)
     )
     for x in (states, actions):
         assert x.mean().item() == pytest.approx(0.7, abs=0.03)
-        assert x.std().item() == pytest.approx(0.5, rel=0.05)
+        assert x.std().item() == pytest.approx(0.5, rel=narrow)
 
 
 def test_both_modes_are_sampled_in_proportion() -> None:
@@ -94,6 +99,88 @@ def test_a_sample_depends_on_its_own_generator_only() -> None:
     assert not torch.equal(other, many)
 
 
+def test_the_noise_of_ddpm_is_drawn_from_the_samples_own_generator() -> None:
+    predict = mixture(torch.tensor([1.0]), torch.tensor([0.0]), 1.0)
+    matrix = full_sequence(LEVELS, 5, 1, 1)
+    plain, _ = Sampler(predict, cosine_signal(LEVELS)).sample(matrix, unknown(3), generators(3))
+    ancestral = Sampler(predict, cosine_signal(LEVELS), eta=1.0)
+    many, _ = ancestral.sample(matrix, unknown(3), generators(3))
+    alone, _ = ancestral.sample(matrix, unknown(1), generators(3)[2:])
+    torch.testing.assert_close(alone[0], many[2], rtol=0, atol=0)
+    assert not torch.equal(many, plain)
+
+
+def test_finished_tokens_are_shown_slightly_noisy_and_keep_their_values() -> None:
+    shown, values = [], []
+
+    def predict(s: Tensor, a: Tensor, ks: Tensor, ka: Tensor) -> tuple[Tensor, Tensor]:
+        shown.append(torch.cat([ks, ka]).tolist())
+        values.append(s[0, 0].item())
+        return torch.full_like(s, 9.0), torch.full_like(a, 9.0)
+
+    known = unknown(1, tokens=3)
+    known.states[:, 0] = 3.0
+    known.state_mask[0] = True
+    matrix = autoregressive(20, 2, np.arange(3), np.arange(3))
+    states, _ = Sampler(predict, cosine_signal(20), stabilise=3).sample(matrix, known, generators(1))
+    assert shown[0] == [3, 20, 20, 20, 20, 20]
+    assert shown[2] == [3, 20, 20, 3, 20, 20]
+    assert shown[4] == [3, 3, 20, 3, 3, 20]
+    assert values == [3.0] * 6
+    assert states[0, :, 0].tolist() == [3.0, 9.0, 9.0]
+
+
+def test_sampling_can_go_on_from_a_noisy_start() -> None:
+    seen = []
+
+    def predict(s: Tensor, a: Tensor, ks: Tensor, ka: Tensor) -> tuple[Tensor, Tensor]:
+        seen.append((s.clone(), ks.tolist(), ka.tolist()))
+        return s, a
+
+    start = torch.full((1, 2, 1), 5.0), torch.full((1, 2, 1), 6.0)
+    matrix = rolling(20, 2, np.arange(2), np.arange(2), 14, 4)
+    Sampler(predict, cosine_signal(20)).sample(matrix, unknown(1, tokens=2), generators(1), start=start)
+    assert seen[0][0].eq(5.0).all()
+    assert seen[0][1:] == ([14, 20], [4, 20])
+
+
+def test_what_is_known_of_a_state_replaces_the_prediction_and_the_rest_follows_the_network() -> None:
+    def pin(clean: Tensor) -> Tensor:
+        return torch.cat([torch.full_like(clean[..., :1], 2.0), clean[..., 1:]], -1)
+
+    known = Known(torch.zeros(4, 3, 2), torch.zeros(4, 1, 1), torch.zeros(3).bool(), torch.zeros(1).bool(), pin)
+    sampler = Sampler(lambda s, a, ks, ka: (s, a), cosine_signal(20))
+    states, _ = sampler.sample(full_sequence(20, 4, 3, 1), known, generators(4))
+    assert states[..., 0].eq(2.0).all()
+    assert states[..., 1].std() > 0.1
+
+
+@pytest.mark.parametrize("gradient", ["analytic", "network"])
+def test_monte_carlo_guidance_moves_the_samples_of_a_window_by_their_mean_gradient(gradient: str) -> None:
+    sampler = Sampler(lambda s, a, ks, ka: (s, a), cosine_signal(LEVELS))
+    matrix, known = full_sequence(LEVELS, 1, 2, 2), unknown(6, tokens=2)
+    plain, _ = sampler.sample(matrix, known, generators(6))
+    guidance = Guidance(lambda s: 0.5 * s.square().sum((1, 2)), 0.1, clip=10.0, gradient=gradient, samples=3)
+    guided, _ = sampler.sample(matrix, known, generators(6), guidance)
+    mean = plain.unflatten(0, (2, 3)).mean(1).repeat_interleave(3, 0)  # of each sample's own gradient
+    torch.testing.assert_close(plain - guided, 0.1 * mean, atol=1e-5, rtol=1e-4)
+
+
+def test_a_weight_beyond_all_bounds_is_an_error_that_says_so() -> None:
+    sampler = Sampler(lambda s, a, ks, ka: (s, a), cosine_signal(LEVELS))
+    guidance = Guidance(lambda s: s.square().sum((1, 2)), weight=1e39, clip=1.0)
+    with pytest.raises(Diverged, match=r"weight of 1e\+39 moves this trajectory out of all bounds; lower it"):
+        sampler.sample(full_sequence(LEVELS, 1, 1, 1), unknown(1), generators(1), guidance)
+
+
+def test_frames_whose_turn_has_not_come_use_nothing_of_the_guidance_step_up() -> None:
+    sampler = Sampler(lambda s, a, ks, ka: (torch.zeros_like(s), a), cosine_signal(LEVELS))
+    guidance = Guidance(lambda s: s.sum((1, 2)), weight=100.0, clip=0.5)
+    matrix = autoregressive(LEVELS, 1, np.arange(2), np.arange(2))
+    states, _ = sampler.sample(matrix, unknown(1, tokens=2), generators(1), guidance)
+    torch.testing.assert_close(states[0, :, 0], torch.tensor([-0.5, -0.5]))
+
+
 @pytest.mark.parametrize("gradient", ["analytic", "network"])
 def test_a_guidance_step_is_never_longer_than_its_clip(gradient: str) -> None:
     # One call from pure noise whose prediction is its input: the sample is that prediction, moved.
@@ -120,7 +207,7 @@ def test_known_states_do_not_use_up_the_guidance_step() -> None:
 def test_a_cost_without_a_finite_gradient_is_an_error() -> None:
     sampler = Sampler(lambda s, a, ks, ka: (torch.zeros_like(s), a), cosine_signal(LEVELS))
     guidance = Guidance(lambda s: s.norm(dim=(1, 2)).sqrt(), weight=1.0, clip=1.0)
-    with pytest.raises(ValueError, match="no finite gradient"):
+    with pytest.raises(Diverged, match="no finite gradient"):
         sampler.sample(full_sequence(LEVELS, 1, 1, 1), unknown(1), generators(1), guidance)
 
 

@@ -1,0 +1,83 @@
+"""The warm start of rolling inference: an earlier plan, moved on, is what the next one is denoised from.
+
+The buffer of Diffuse-CLoC (section 3.2) is not kept here. A plan and the noise of its frames determine it, and the
+noise of a frame depends on the seed and the frame's own tick alone. So a plan is a function of its request, which holds
+the plan that runs, and needs no memory that a lost or late plan could spoil.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hw.hal import Array
+from policy.diffusion.config import DenoiserConfig
+from policy.diffusion.features import Normaliser, to_tokens
+from policy.diffusion.schedule import DenoisingMatrix
+
+_FRAME = 2**31  # sets the noise of frames apart from what is drawn for a plan
+
+
+@dataclass(frozen=True)
+class Previous:
+    """Plans that were made `age` ticks before now."""
+
+    age: int
+    states: Array  # (batch, horizon, raw size), the first one a tick ahead of those plans
+    actions: Array  # (batch, actions, n_joints) rad, the first one of those plans' tick
+
+
+def clean_start(
+    config: DenoiserConfig, states: Normaliser, actions: Normaliser, previous: Previous, present: Array
+) -> tuple[Tensor, Tensor]:
+    """What an earlier plan says of a window, normalised: states and actions, zero where it says nothing.
+
+    `present` `(batch, raw size)` is now; the plan is seen from there.
+    """
+    batch, age = len(present), previous.age
+    rows = to_tokens(previous.states[:, age:].astype(float), np.asarray(present, dtype=float), config.action_size)
+    clean_states = torch.zeros(batch, len(config.state_ticks), config.state_size)
+    clean_actions = torch.zeros(batch, len(config.action_ticks), config.action_size)
+    first = config.history
+    clean_states[:, first : first + rows.shape[1]] = states.encode(torch.from_numpy(rows.astype(np.float32)))
+    now = first - 1
+    kept = torch.from_numpy(previous.actions[:, age:].astype(np.float32))
+    clean_actions[:, now : now + kept.shape[1]] = actions.encode(kept)
+    return clean_states, clean_actions
+
+
+def frame_noise(config: DenoiserConfig, seeds: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
+    """Noise `(batch, state tokens, features)` and `(batch, action tokens, features)` that belongs to the frames.
+
+    Each of `seeds` is a seed, the tick of now, and further numbers: a frame keeps its noise when the tick goes on.
+    """
+    states, actions = [], []
+    for seed, tick, *more in seeds:
+        for frame in range(-config.history, config.horizon):  # a frame is an action and the state after it
+            generator = seeded(seed, tick + frame + config.history, *more, _FRAME)
+            states.append(torch.randn(config.state_size, generator=generator))
+            if config.action_ticks[0] <= frame <= config.action_ticks[-1]:
+                actions.append(torch.randn(config.action_size, generator=generator))
+    shape = (len(seeds), -1)
+    return torch.stack(states).view(*shape, config.state_size), torch.stack(actions).view(*shape, config.action_size)
+
+
+def renoise(
+    clean: tuple[Tensor, Tensor], noise: tuple[Tensor, Tensor], matrix: DenoisingMatrix, signal: Array
+) -> tuple[Tensor, Tensor]:
+    """States and actions at the levels of the first row of `matrix`."""
+    parts = []
+    for x, drawn, levels in zip(clean, noise, (matrix.states[0], matrix.actions[0]), strict=True):
+        a = torch.as_tensor(signal[levels], dtype=torch.float32)[:, None]
+        parts.append(a.sqrt() * x + (1 - a).sqrt() * drawn)
+    return parts[0], parts[1]
+
+
+def seeded(*numbers: int) -> torch.Generator:
+    """A generator of its own for each sequence of numbers, none of them negative."""
+    state = np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0]
+    return torch.Generator().manual_seed(int(state >> np.uint64(1)))

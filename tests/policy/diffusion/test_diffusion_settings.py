@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hw.config import CONFIGS, ConfigError, load_yaml
+from policy.diffusion.config import DenoiserConfig
+from policy.diffusion.settings import DiffusionSettings, GuidanceSettings, Rolling, load_settings
+
+NETWORK = DenoiserConfig(108, 20)
+
+
+def refused(tmp_path: Path, text: str, match: str) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=match):
+        load_settings(str(path))
+
+
+def test_unknown_names_are_refused_with_the_line_and_the_nearest_one(tmp_path: Path) -> None:
+    refused(
+        tmp_path,
+        "steps: 5\nschedule: roling\n",
+        r"mine\.yaml:1: no schedule is called 'roling': did you mean 'rolling'",
+    )
+    refused(
+        tmp_path, "gradual:\n  shape: pyramide\n", r"gradual: no shape is called 'pyramide': did you mean 'pyramid'"
+    )
+    refused(tmp_path, "guidance:\n  choose: worst\n", "choose must be 'mean' or 'best', not 'worst'")
+    refused(tmp_path, "rolling:\n  level: 3\n", "rolling.level: unknown key")
+
+
+def test_numbers_that_make_no_sense_are_refused(tmp_path: Path) -> None:
+    refused(tmp_path, "eta: 1.5\n", r"eta must be 0 \(DDIM\) to 1 \(DDPM\), not 1.5")
+    refused(tmp_path, "guidance:\n  samples: 0\n", "samples must be at least 1")
+    refused(tmp_path, "guidance:\n  weight: inf\n", "finite")
+    refused(tmp_path, "autoregressive:\n  block: 0\n", "at least 1 frame")
+    with pytest.raises(ValueError, match="weight must be a number"):
+        GuidanceSettings(weight=float("nan"))
+
+
+def test_what_a_checkpoint_does_not_have_is_refused_with_the_remedy() -> None:
+    with pytest.raises(ConfigError, match=r"horizon 32 is asked for, and this checkpoint has 1 to 16 .* --horizon 32"):
+        DiffusionSettings(horizon=32).check(NETWORK)
+    with pytest.raises(ConfigError, match="history 6 is asked for, and this checkpoint has 1 to 4"):
+        DiffusionSettings(history=6).check(NETWORK)
+    with pytest.raises(ConfigError, match=r"replan .* delay = 6 ticks, and this one has actions for 5"):
+        DiffusionSettings(horizon=5, replan=4, delay=2).check(NETWORK)
+    with pytest.raises(ConfigError, match="level of 1 to 20, not 30"):
+        DiffusionSettings(schedule="rolling", rolling=Rolling(state_level=30)).check(NETWORK)
+    with pytest.raises(ConfigError, match="stabilise must be at most 20"):
+        DiffusionSettings(stabilise=21).check(NETWORK)
+
+
+def test_every_file_of_diffusion_settings_loads_and_fits_the_default_network() -> None:
+    files = [path for path in (CONFIGS / "policies").glob("*.yaml") if "\nschedule:" in path.read_text()]
+    assert len(files) >= 2
+    for path in files:
+        load_yaml(path, DiffusionSettings).check(NETWORK)
+
+
+@pytest.mark.parametrize("schedule", ["full_sequence", "autoregressive", "gradual", "rolling"])
+def test_a_shorter_history_and_horizon_leave_the_rest_as_noise(schedule: str) -> None:
+    settings = DiffusionSettings(schedule=schedule, history=2, horizon=8)
+    matrix = settings.matrix(NETWORK, fresh=1)
+    states, actions = settings.used(NETWORK)
+    assert NETWORK.state_ticks[states].tolist() == list(range(-1, 9))
+    assert NETWORK.action_ticks[actions].tolist() == list(range(-1, 8))
+    assert (matrix.states[:, ~states] == 20).all()
+    assert (matrix.actions[:, ~actions] == 20).all()
+    assert not matrix.states[-1, states].any()
+    assert not matrix.actions[-1, actions].any()
+    if schedule == "rolling":  # what is fresh is the last frame of the plan, not of the network
+        assert matrix.states[0, np.flatnonzero(NETWORK.state_ticks == 8)] == 20
+        assert matrix.states[0, np.flatnonzero(NETWORK.state_ticks == 7)] == 14
