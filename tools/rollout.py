@@ -9,13 +9,12 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from hw.config import ConfigError
 from hw.hal import Backend, Task, Trace, Truth
+from tools.crew import each
 from tools.intervals import wilson
 from tools.output import add_json_argument, reporting
 from tools.parser import add_set_argument, settings
@@ -23,9 +22,6 @@ from tools.parser import add_set_argument, settings
 if TYPE_CHECKING:
     from stack.session import Settings
     from tools.witness import Witness
-
-Job = TypeVar("Job")
-Answer = TypeVar("Answer")
 
 _ENDED = ("succeeded", "failed", "timed_out")  # outcomes of runs whose task ended by itself
 
@@ -103,63 +99,10 @@ def run_all(args: argparse.Namespace, values: dict[str, str], report: Any) -> li
 
 
 def _numbered(job: tuple[int, Settings]) -> tuple[int, dict[str, Any]]:
-    return job[0], episode(job[1])
-
-
-def each(
-    work: Callable[[Job], Answer], jobs: Iterable[Job], workers: int, deadline: float | None = None
-) -> Iterator[Answer]:
-    """`work(job)` of each job on `workers` processes, as they come: those that are quicker come first.
-
-    `work` must be picklable. A job is only asked for when a process is about to be free for it, so that the jobs may
-    depend on the answers. At `deadline`, by `time.monotonic`, what still runs is given up. With one worker everything
-    is done here, and a job that runs is finished. Raises what `work` raises.
-    """
-    import multiprocessing as mp
-    import queue
-
-    if workers == 1:
-        for job in jobs:
-            if deadline is not None and time.monotonic() >= deadline:
-                return
-            yield work(job)
-        return
-    answers: queue.SimpleQueue[tuple[bool, Any]] = queue.SimpleQueue()
-    coming, running = iter(jobs), 0
-    with mp.get_context("spawn").Pool(workers, _one_thread) as pool:
-        while True:
-            while running < workers + 1:  # one in hand, so that no process waits for this one
-                try:
-                    job = next(coming)
-                except StopIteration:
-                    break
-                pool.apply_async(
-                    work,
-                    (job,),
-                    callback=lambda x: answers.put((True, x)),
-                    error_callback=lambda e: answers.put((False, e)),
-                )
-                running += 1
-            if not running:
-                return
-            answer = None
-            with suppress(queue.Empty):
-                answer = answers.get(timeout=None if deadline is None else max(deadline - time.monotonic(), 0.0))
-            if answer is None:
-                return
-            running -= 1
-            if not answer[0]:
-                raise answer[1]
-            yield answer[1]
-
-
-def _one_thread() -> None:
-    """A worker's numpy and torch use one thread: the workers are the parallelism. Ctrl-C is the parent's."""
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
+    row = episode(job[1])
+    if row["outcome"] == "interrupted":  # by a Ctrl-C that the run took: no episode, and none after it
+        raise KeyboardInterrupt
+    return job[0], row
 
 
 def episode_check(job: Settings) -> None:

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hw.config import ConfigError
+from tools.crew import each
 from tools.evaluate.cache import EpisodeCache, key
 from tools.evaluate.episode import Job, do
 from tools.evaluate.pilots import Pilots, spec
 from tools.evaluate.rows import Row, Run
 from tools.evaluate.summary import Measured
-from tools.rollout import each, episode_seed
+from tools.rollout import episode_seed
 
 if TYPE_CHECKING:
     from stack.session import Settings
