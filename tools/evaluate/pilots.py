@@ -35,11 +35,13 @@ class Pilots:
         return None if run.network is None else self._folder / "networks" / run.network.name / "best.safetensors"
 
     def training(self, run: Run, data: str = "runs/walks") -> str | None:
-        """The command that trains the network that a run lacks; None where nothing is lacking."""
+        """How the network that a run lacks is trained; None where nothing is lacking."""
         path = self.network(run)
         if run.network is None or path is None or path.is_file():
             return None
-        return f"servoid train diffusion --data {data} --out {path.parent} {run.network.train}".strip()
+        if run.network.train is None:
+            return f"`servoid train diffusion` cannot make it; put one at {path}"
+        return f"`servoid train diffusion --data {data} --out {path.parent} {run.network.train}`"
 
     def name(self, run: Run) -> str:
         """The policy of a run, as `servoid run --policy` takes it. Raises ConfigError for settings that do not fit."""

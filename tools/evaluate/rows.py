@@ -14,10 +14,13 @@ from hw.config import ConfigError
 
 @dataclass(frozen=True)
 class Network:
-    """A network that is not shipped. `train` are the options of `servoid train diffusion` beside --data and --out."""
+    """A network that is not shipped. `train` are the options of `servoid train diffusion` beside --data and --out.
+
+    None where that trains no such network yet.
+    """
 
     name: str
-    train: str
+    train: str | None
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ class Measured:
     """What came of a row's run: records of its episodes, or why there are none."""
 
     records: Sequence[Mapping[str, Any]] = ()
-    training: str | None = None  # the command that trains the network that the row needs
+    training: str | None = None  # how the network that the row needs is trained
     refused: str | None = None  # why the run cannot be done
 
 
@@ -76,7 +76,7 @@ def _reached(row: Row, value: float | None, figure: float | None) -> bool | None
 def _note(row: Row, measured: Measured, counted: int) -> str:
     parts = [row.note]
     if measured.training is not None:
-        parts.append(f"needs training: `{measured.training}`")
+        parts.append(f"needs training: {measured.training}")
     if measured.refused is not None:
         parts.append(f"refused: {measured.refused}")
     if not measured.records and measured.training is None and measured.refused is None:

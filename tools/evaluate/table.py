@@ -17,12 +17,13 @@ FALLS = Metric("fell", share=True, lower=True)
 LENGTH = Metric("ticks", "ticks")
 
 # How plans are sampled, by the papers' names: settings of the diffusion policy.
-_STABLE = {"stabilisation": "3"}
+_STABLE = {"stabilise": "3"}
 FULL: Mapping[str, str] = {"schedule": "full_sequence", **_STABLE}
 AUTOREGRESSIVE: Mapping[str, str] = {"schedule": "autoregressive", **_STABLE}
-UNSTABLE: Mapping[str, str] = {"schedule": "autoregressive", "stabilisation": "0"}
+UNSTABLE: Mapping[str, str] = {"schedule": "autoregressive", "stabilise": "0"}
 GRADUAL: Mapping[str, str] = {"schedule": "gradual", **_STABLE}
-ROLLING: Mapping[str, str] = {"schedule": "rolling"}
+# As in configs/policies/diffuse_cloc.yaml; a level of 20, pure noise, is no rolling.
+ROLLING: Mapping[str, str] = {"schedule": "rolling", "steps": "3", "delay": "1", "replan": "1"}
 
 
 def _survive(name: str, title: str, plan: Mapping[str, str], published: float, figure: float | None) -> Row:
@@ -30,10 +31,17 @@ def _survive(name: str, title: str, plan: Mapping[str, str], published: float, f
     return Row(f"uniphys/{name}", UNIPHYS, title, run, LENGTH, published, "of 3000 frames", figure)
 
 
-def _trained(name: str, paper: str, title: str, task: str, metric: Metric, published: float, train: str) -> Row:
-    """A row that needs another network: trained for 45 minutes, as the reference that it is compared with."""
-    run = Run(task, network=Network(name.replace("/", "-"), f"--minutes 45 {train}"))
-    return Row(name, paper, title, run, metric, published, quick=False)
+def _trained(row: Row, train: str | None, name: str | None = None) -> Row:
+    """The row with a network of its own, trained for 45 minutes, as the reference that it is compared with."""
+    network = Network(
+        name or row.name.replace("/", "-"), None if train is None else f"--minutes 45 --width 128 {train}"
+    )
+    return replace(row, run=replace(row.run, network=network), quick=False)
+
+
+def _forest(name: str, title: str, published: float, train: str, plan: Mapping[str, str] | None = None) -> Row:
+    run = Run("forest", plan=plan or {})
+    return _trained(Row(f"cloc/{name}", CLOC, f"Forest, {title}: success", run, SUCCESS, published), train)
 
 
 _FOREST = Run("forest")
@@ -90,14 +98,22 @@ _SAMPLING: tuple[Row, ...] = (
     ),
     *(
         Row(
+            f"uniphys/best-of-{n}", UNIPHYS, f"Guidance, the best of N = {n}: success",
+            Run("goal-far", plan={"guidance.samples": str(n), "guidance.choose": "best"}), SUCCESS,
+            note="not in the paper's table",
+        )
+        for n in (3, 5)
+    ),
+    *(
+        Row(
             f"cloc/rolling-{name}", CLOC, f"Forest, rolling of {title}: success",
             Run("forest", plan={**ROLLING, **plan}), SUCCESS, share,
         )
         for name, title, plan, share in (
             ("both", "states and actions", {}, 0.96),
-            ("states", "states only", {"roll_actions": "false"}, 0.79),
-            ("actions", "actions only", {"roll_states": "false"}, 0.96),
-            ("none", "neither", {"roll_states": "false", "roll_actions": "false"}, 0.95),
+            ("states", "states only", {"rolling.action_level": "20"}, 0.79),
+            ("actions", "actions only", {"rolling.state_level": "20"}, 0.96),
+            ("none", "neither", {"rolling.state_level": "20", "rolling.action_level": "20"}, 0.95),
         )
     ),
     *(
@@ -107,29 +123,32 @@ _SAMPLING: tuple[Row, ...] = (
         )
         for n in (1, 4, 8, 16)
     ),
+    Row("cloc/horizon-16", CLOC, "Forest, horizon 16: success", Run("forest", plan={"horizon": "16"}), SUCCESS, 0.0),
 )  # fmt: skip
 
+_SHORT = "--horizon 32 --near-actions 16 --far-actions 0"  # Diffuse-CLoC's: 32 states ahead and 16 actions
+_ONE = {"delay": "0", "replan": "1"}  # the first action of each plan, the only one that all of them have
+
 _TRAINED: tuple[Row, ...] = (
-    _trained("cloc/reference", CLOC, "Forest, the reference of the rows below: success", "forest", SUCCESS, 0.96, ""),
+    _forest("reference", "the reference of the rows below, horizon 32 and 16 actions", 0.96, _SHORT),
+    _forest("horizon-64", "horizon 64 and 16 actions", 0.19, _SHORT.replace("32", "64")),
     *(
-        _trained(f"cloc/horizon-{n}", CLOC, f"Forest, horizon {n}: success", "forest", SUCCESS, share, f"--horizon {n}")
-        for n, share in ((16, 0.0), (32, 0.96), (64, 0.19))
+        _forest(f"actions-{n}", f"horizon 32 and {n} actions", share, _SHORT.replace("16", str(n)), _ONE)
+        for n, share in ((1, 0.57), (4, 0.84), (8, 0.80), (16, 0.96))
     ),
-    *(
-        _trained(
-            f"cloc/actions-{n}", CLOC, f"Forest, action horizon {n} of 32: success", "forest", SUCCESS, share,
-            f"--horizon 32 --action-horizon {n}",
-        )
-        for n, share in ((1, 0.57), (4, 0.84), (8, 0.80))
+    _forest("attention-full", "full attention", 0.58, f"{_SHORT} --mask full"),
+    _forest("attention-diffuser", "Diffuser's attention", 0.0, f"{_SHORT} --mask diffuser_local"),
+    _trained(
+        _survive("raw-action", "Episode length, causal attention, raw action", AUTOREGRESSIVE, 238.2, None),
+        "--horizon 32 --mask causal",
     ),
-    _trained("cloc/attention-full", CLOC, "Forest, full attention: success", "forest", SUCCESS, 0.58, "--mask full"),
-    _trained("cloc/attention-diffuser", CLOC, "Forest, Diffuser's attention: success", "forest", SUCCESS, 0.0,
-             "--mask diffuser"),
-    _trained("uniphys/reference", UNIPHYS, "Episode length, raw action, the reference: ticks", "survive", LENGTH, 238.2,
-             "--mask causal"),
-    _trained("uniphys/latent-action", UNIPHYS, "Episode length, latent action: ticks", "survive", LENGTH, 2320.3,
-             "--mask causal --latent"),
-)  # fmt: skip
+    _trained(
+        _survive("raw-action-unstable", "Episode length, raw action, without stabilisation", UNSTABLE, 58.0, None),
+        "--horizon 32 --mask causal",
+        "uniphys-raw-action",
+    ),
+    _trained(_survive("latent-action", "Episode length, latent action", AUTOREGRESSIVE, 2320.3, None), None),
+)
 
 _TEXTS: tuple[Row, ...] = (
     Row(

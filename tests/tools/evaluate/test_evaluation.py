@@ -145,7 +145,8 @@ def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path
     row = Row("t/full", "T", "Full", run, Metric("success", share=True))
     chosen = Options(tmp_path, policy="diffusion", workers=1)
     measured = evaluate([row], chosen, quiet)["t/full"]
-    assert measured.training == f"servoid train diffusion --data runs/walks --out {tmp_path}/networks/full --mask full"
+    command = f"servoid train diffusion --data runs/walks --out {tmp_path}/networks/full --mask full"
+    assert measured.training == f"`{command}`"
     assert not measured.records
     path = tmp_path / "networks" / "full" / "best.safetensors"
     path.parent.mkdir(parents=True)

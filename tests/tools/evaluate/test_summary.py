@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+import shlex
 
 import pytest
 
 from hw.config import ConfigError
-from tools.evaluate.rows import Beside, Metric, Network, Row, Run, select
+from tools.evaluate.rows import Beside, Metric, Row, Run, select
 from tools.evaluate.summary import Measured, table
 from tools.evaluate.table import ROWS
 from tools.evaluate.write import as_csv, cells, markdown
 from tools.intervals import bootstrap
+from tools.parser import Parser
 
 SHARE = Row("a/share", "A", "Share", Run("goal"), Metric("success", share=True), 0.95, figure=0.9)
 FALLS = Row("a/falls", "A", "Falls", Run("goal"), Metric("fell", share=True, lower=True), 0.16, figure=0.16)
@@ -66,7 +68,10 @@ def test_a_figure_may_be_another_rows_value() -> None:
 @pytest.mark.parametrize(
     ("measured", "told"),
     [
-        (Measured(training="servoid train diffusion --mask full"), "`servoid train diffusion --mask full`"),
+        (
+            Measured(training="`servoid train diffusion --mask full`"),
+            "needs training: `servoid train diffusion --mask full`",
+        ),
         (Measured(refused="unknown setting 'x'"), "unknown setting 'x'"),
         (Measured(), "no time was left"),
     ],
@@ -132,6 +137,27 @@ def test_the_main_rows_are_repeated_on_the_randomised_robot_and_four_on_the_virt
 def test_networks_are_named_apart() -> None:
     """Two networks in one folder would be measured as one."""
     trained = [row.run.network for row in ROWS if row.run.network is not None]
-    assert len({network.name for network in trained}) == len(
-        {(n.name, n.train) for n in trained if isinstance(n, Network)}
-    )
+    assert len({network.name for network in trained}) == len(set(trained))
+
+
+def test_commands_that_train_networks_can_be_typed() -> None:
+    from policy.diffusion.masks import MASKS
+    from tools.train import diffusion
+
+    parser = Parser()
+    diffusion.add_arguments(parser)
+    for row in ROWS:
+        if row.run.network is not None and row.run.network.train is not None:
+            words = shlex.split(f"--data runs/walks --out runs/x {row.run.network.train}")
+            args = parser.parse_args(words)
+            assert args.mask in MASKS, row.name
+            assert args.minutes == 45
+
+
+def test_settings_of_the_planner_are_those_that_there_are() -> None:
+    from hw.overrides import override
+    from policy.diffusion.settings import DiffusionSettings
+
+    for row in ROWS:
+        override(DiffusionSettings(), dict(row.run.plan))
+    assert sum(bool(row.run.plan) for row in ROWS) > 10
