@@ -17,6 +17,7 @@ _TRUST = 3.0  # m/s2: a specific force this far from gravity halves the correcti
 _STILL_RATE = 0.06  # rad/s: gyro and joints below it for long enough mean that the robot stands
 _STILL_JOINTS = 0.15  # rad/s
 _STILL_TIME = 0.3  # s
+_FIRST = 0.5  # s of standing after which a bias is known
 _BIAS_MEMORY = 3.0  # s of standing that the bias is averaged over
 
 
@@ -68,10 +69,13 @@ class Attitude:
         # A bias that was given counts as a full memory.
         self._seen = np.where(where, 0.0 if bias is None else _BIAS_MEMORY, self._seen)
 
-    def update(self, gyro: Array, specific_force: Array, joint_velocity: Array) -> Array:
-        """Go on by one tick; returns the angular velocity without bias `(..., 3)` rad/s. NaN inputs coast."""
+    def update(self, gyro: Array, specific_force: Array, joint_velocity: Array, leaning: Array | float = 0.0) -> Array:
+        """Go on by one tick; returns the angular velocity without bias `(..., 3)` rad/s. NaN inputs coast.
+
+        `leaning` `(..., 3)` rad/s is how fast the base turns over standing feet, by the legs.
+        """
         rate = np.where(np.isfinite(gyro), gyro - self.bias, 0.0)
-        self._learn_bias(gyro, rate, joint_velocity)
+        self._learn_bias(gyro, rate, joint_velocity, leaning)
         norm = np.linalg.norm(specific_force, axis=-1, keepdims=True)
         good = np.isfinite(norm) & (norm > 1.0)
         measured = np.where(good, specific_force / np.where(good, norm, 1.0), 0.0)
@@ -85,15 +89,16 @@ class Attitude:
         self.yaw = self.yaw + (change + np.pi) % (2 * np.pi) - np.pi
         return rate
 
-    def _learn_bias(self, gyro: Array, rate: Array, joint_velocity: Array) -> None:
-        """Average the gyro while the robot stands. Until a first bias is known, the gyro's own size is not judged."""
+    def _learn_bias(self, gyro: Array, rate: Array, joint_velocity: Array, leaning: Array | float) -> None:
+        """Average the gyro while the robot stands. A soft robot creeps for seconds: what its legs say is no bias."""
         quiet = (np.abs(joint_velocity) < _STILL_JOINTS).all(-1)
-        quiet &= (np.linalg.norm(rate, axis=-1) < _STILL_RATE) & np.isfinite(gyro).all(-1)
+        judged = np.where((self._seen < _FIRST)[..., None], gyro, rate)  # a few ticks' mean is no bias to judge by
+        quiet &= (np.linalg.norm(judged, axis=-1) < _STILL_RATE) & np.isfinite(gyro).all(-1)
         self._still = np.where(quiet, self._still + self._dt, 0.0)
         learn = self._still > _STILL_TIME
         self._seen = np.where(learn, np.minimum(self._seen + self._dt, _BIAS_MEMORY), self._seen)
         share = np.where(learn, self._dt / np.maximum(self._seen, self._dt), 0.0)[..., None]
-        self.bias = self.bias + share * np.where(np.isfinite(gyro), gyro - self.bias, 0.0)
+        self.bias = self.bias + share * np.where(np.isfinite(gyro), gyro - leaning - self.bias, 0.0)
 
 
 def _multiply(a: Array, b: Array) -> Array:

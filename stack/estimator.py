@@ -36,6 +36,8 @@ class Estimator:
         self.leg_velocity = np.zeros((*shape, 3))
         self._pending = np.ones(shape, bool)
         self._bias: Array | None = None
+        self._soles: Array | None = None  # their orientations in the base frame at the tick before
+        self._seen = np.zeros(shape, bool)  # worlds where they are of this episode
 
     def reset(self, where: Array | None = None, bias: Array | None = None) -> None:
         """Forget everything in the worlds `where` (default: all); the next observation starts anew.
@@ -63,10 +65,11 @@ class Estimator:
         if self._pending.any():
             self._start(observation, q)
         self._position, self._velocity = q, dq
-        rate = self._attitude.update(observation.angular_velocity, observation.specific_force, dq)
+        position, rotation, origins, axes = self._legs.forward(self._legs.pick(q))
+        leaning = self._leaning(rotation)
+        rate = self._attitude.update(observation.angular_velocity, observation.specific_force, dq, leaning)
         up = up_vector(self._attitude.quaternion)
 
-        position, rotation, origins, axes = self._legs.forward(self._legs.pick(q))
         leg_rate = self._legs.pick(dq)
         corners = position[..., None, :] + np.einsum("...ij,...kj->...ki", rotation, self._legs.corners)
         heights = np.einsum("...lki,...i->...lk", corners, up)
@@ -108,6 +111,18 @@ class Estimator:
             contact=contact,
         )
 
+    def _leaning(self, rotation: Array) -> Array:
+        """How fast the base turns over soles `(..., n_feet, 3, 3)` that stay flat, `(..., 3)` rad/s in the base frame.
+
+        From angles, not from the servos' velocities: their resolution is coarser than the creep of a soft robot.
+        """
+        before = rotation if self._soles is None else self._soles
+        before = np.where(self._seen[..., None, None, None], before, rotation)
+        self._soles, self._seen = rotation, np.ones(self.shape, bool)
+        turn = np.einsum("...lij,...lkj->...ik", rotation, before) / rotation.shape[-3]
+        skew = 0.5 * (turn - np.swapaxes(turn, -1, -2))
+        return -joined(skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]) / self.robot.dt
+
     def _start(self, observation: Observation, q: Array) -> None:
         where = self._pending
         force = np.where(np.isfinite(observation.specific_force), observation.specific_force, 0.0)
@@ -115,6 +130,7 @@ class Estimator:
         self._displacement = np.where(where[..., None], 0.0, self._displacement)
         self._heading0 = np.where(where, 0.0, self._heading0)
         self.features.reset(where)
+        self._seen = self._seen & ~where
         self._pending = np.zeros(self.shape, bool)
 
 

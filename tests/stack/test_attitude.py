@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -142,3 +144,12 @@ def test_gravity_and_heading_hold_while_it_walks() -> None:
     heading = (fleet.observe().yaw - fleet.truth.yaw + np.pi) % (2 * np.pi) - np.pi
     assert np.sqrt(np.mean(np.square(errors))) < 0.03
     assert np.abs(heading).max() < 0.1 * 10 / 60 + 0.01  # 0.1 rad a minute, and a tick's latency
+
+
+def test_the_creep_of_a_standing_robot_is_not_taken_for_the_gyros_bias() -> None:
+    attitude, bias, creep = started(), np.array([0.01, -0.012, 0.004]), np.array([0.0, 0.03, 0.0])
+    rng = np.random.default_rng(0)
+    ticks = rng.normal(0.0, 0.001, (151, 3))  # rad: the legs' angles come in steps
+    for before, after in itertools.pairwise(ticks):
+        attitude.update(bias + creep, LEVEL, STILL, creep + (after - before) / DT)
+    np.testing.assert_allclose(attitude.bias, bias, atol=0.002)
