@@ -22,9 +22,9 @@ class ObstacleSettings(Settings):
     sphere_speed: Annotated[float, "m/s at which it rolls straight toward the robot"] = 0.08
     escape: Annotated[float, "m from the middle of the sphere that count as escaped"] = 0.825
     speed: Annotated[float, "m/s forward at most, of the asked velocity"] = 0.25
-    reverse: Annotated[float, "m/s backward at most"] = 0.08
-    lateral: Annotated[float, "m/s to either side at most"] = 0.08
-    yaw_rate: Annotated[float, "rad/s at most"] = 0.8
+    reverse: Annotated[float, "m/s backward at most"] = 0.0
+    lateral: Annotated[float, "m/s to either side at most"] = 0.0
+    yaw_rate: Annotated[float, "rad/s at most"] = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -60,7 +60,7 @@ class Obstacle(BaseTask):
         return Percept(source="task", age=0.0, obstacles=np.array([[*place, self.settings.radius]]))
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
-        """Away from the sphere: in any direction at once, while turning to walk ahead."""
+        """Away from the sphere: turning to walk ahead, and meanwhile stepping as far as the settings allow."""
         s = self.settings
         if percept.obstacles is None or not len(percept.obstacles):
             return Instruction(velocity=np.zeros(3))

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from hw.hal import Array, Instruction, Percept, State, Trace
+from hw.hal import Array, Instruction, Percept, Scene, State, Trace
 from stack.tasks import measures
 from stack.tasks.base import BaseTask, Settings, require_positive
 from stack.tasks.frames import to_heading
@@ -26,6 +26,7 @@ class PathSettings(Settings):
     lookahead: Annotated[float, "m along the path, of the point that the asked velocity heads for"] = 0.15
     horizon: Annotated[int, "ticks ahead for which places on the path are given to a planner"] = 64
     yaw_rate: Annotated[float, "rad/s at most"] = 0.8
+    seen: Annotated[bool, "whether the robot sees the path's end, as by a camera, or goes by its odometry alone"] = True
     tolerance: Annotated[float, "m of mean distance from the path, and from its end, that count as followed"] = 0.1
 
     def __post_init__(self) -> None:
@@ -50,6 +51,8 @@ class Path(BaseTask):
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
         """Where to be at the next ticks, and a velocity toward a point ahead on the path (pure pursuit)."""
         s, points = self.settings, self.points
+        if percept.goal is not None:
+            points = points + (percept.goal - points[-1])  # odometry has drifted by so much
         # The robot is at the nearest point of the stretch that comes next: a path may cross itself.
         stretch = points[self._at : self._at + round(2.0 * s.lookahead / _SPACING) + 1]
         self._at += int(np.argmin(np.linalg.norm(stretch - state.displacement[:2], axis=1)))
@@ -63,6 +66,10 @@ class Path(BaseTask):
             turn = math.copysign(s.yaw_rate, bearing)
         turn = min(max(turn, -s.yaw_rate), s.yaw_rate)
         return Instruction(velocity=np.array([forward, 0.0, turn]), goal=to_heading(points[-1], state), path=path)
+
+    def scene(self) -> Scene | None:
+        """The end of the path as a mark on the floor, where it shall be seen."""
+        return Scene(np.zeros((0, 3)), np.zeros((0, 4)), self.points[-1].copy()) if self.settings.seen else None
 
     def percept(self, state: State) -> Percept:
         return Percept(source="task", age=0.0, goal=self.points[-1].copy())
@@ -90,6 +97,8 @@ class Path(BaseTask):
         if len(trace.displacement) == 0:
             return float("inf"), float("inf")
         places = trace.displacement[:, :2]
+        if trace.goal is not None:
+            places = places - (trace.goal - self.points[-1])
         nearest = [float(np.linalg.norm(self.points - place, axis=1).min()) for place in places]
         return float(np.mean(nearest)), float(np.linalg.norm(places[-1] - self.points[-1]))
 
