@@ -20,7 +20,7 @@ from tools.evaluate.table import LEFT_OUT, ROWS
 from tools.evaluate.write import HEAD, as_csv, cells, markdown
 from tools.output import Report, add_json_argument, reporting
 
-QUICK_EPISODES = 3
+QUICK_EPISODES = 2
 QUICK_MINUTES = 9.0  # one more is for the start and for drawing
 
 
@@ -65,6 +65,7 @@ def main(args: argparse.Namespace) -> int:
             seconds=args.seconds,
             workers=args.workers,
             minutes=args.minutes or (QUICK_MINUTES if args.quick else None),
+            quick=args.quick,
             fresh=args.fresh,
         )
         measured = evaluate(rows, options, report.line)
@@ -143,6 +144,8 @@ def _write(
     ]
     if options.seconds is not None:
         facts.append(f"episodes were cut to {options.seconds:g} s: for a try, not to be compared")
+    if options.quick:
+        facts.append("quick: few episodes, so wide intervals; those of velocity control have 7 velocities and not 21")
     pictures = _draw(options.out, rows, measured, report)
     below = [*(f"- {text}" for text in _below(encoder)), "", *(f"![{path.stem}]({path.name})" for path in pictures)]
     for name, text in (("papers.md", markdown("Papers", facts, lines, below)), ("papers.csv", as_csv(lines))):

@@ -37,6 +37,7 @@ class Run:
     backend: str = "sim"
     randomise: bool = False
     episodes: int = 100
+    quick_seconds: float | None = None  # at most so long an episode with --quick
     clips: int = 0  # recorded motions of the expert that the task takes its keyframes from
     network: Network | None = None  # instead of the evaluated one
 

@@ -34,6 +34,7 @@ class Options:
     seconds: float | None = None  # at most so long an episode: for a try, since figures mean little then
     workers: int = 0
     minutes: float | None = None  # then stop, and go on another time
+    quick: bool = False  # cut the longest episodes
     fresh: bool = False  # do again what was done
 
 
@@ -121,7 +122,9 @@ def _prepare(run: Run, pilots: Pilots, options: Options) -> _Work:
         recorded = clips.record_clips(options.out / "clips", options.robot, run.clips)
         chosen["clips"] = ":".join(map(str, recorded))
     own = load_settings(run.task, dict(run.set)).seconds
-    seconds = None if options.seconds is None or options.seconds >= own else options.seconds
+    limits = [own, options.seconds, run.quick_seconds if options.quick else None]
+    shortest = min(limit for limit in limits if limit is not None)
+    seconds = None if shortest == own else shortest
     kept = spec(run, pilots, options.robot, options.seed, seconds, recipe)
     settings = Settings(
         task=run.task,

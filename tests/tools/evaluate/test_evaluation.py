@@ -90,6 +90,17 @@ def test_other_settings_are_other_episodes(tmp_path: Path, done: list[Job], chan
     assert len(done) == 8
 
 
+def test_quick_cuts_the_longest_episodes_and_does_not_mistake_them_for_whole_ones(
+    tmp_path: Path, done: list[Job]
+) -> None:
+    run = Run("velocity", episodes=1, quick_seconds=61.0)
+    row = Row("t/velocity", "T", "Velocity", run, Metric("success", share=True))
+    evaluate([row], options(tmp_path, quick=True), quiet)
+    evaluate([row], options(tmp_path), quiet)
+    evaluate([row], options(tmp_path, quick=True, seconds=5.0), quiet)
+    assert [job.settings.seconds for job in done] == [61.0, None, 5.0]
+
+
 def test_a_changed_checkpoint_setting_or_task_changes_what_episodes_depend_on(tmp_path: Path) -> None:
     checkpoint = tmp_path / "mine.safetensors"
     shutil.copy(resolve("diffusion"), checkpoint)
