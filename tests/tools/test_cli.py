@@ -155,7 +155,7 @@ def test_tasks_lists_every_setting() -> None:
     result = servoid("tasks", "--json", check=True)
     assert result.stdout.count("\n") == 1
     tasks = {task["name"]: task for task in json.loads(result.stdout)["tasks"]}
-    assert list(tasks) == ["stand", "walk", "goal"]
+    assert {"stand", "walk", "goal"} <= tasks.keys()
     walk = {row["key"]: row["value"] for row in tasks["walk"]["settings"]}
     assert walk["vx"] == "-0.1:0.3"
     assert walk["cost.velocity"] == "1"

@@ -217,7 +217,7 @@ def test_falls_lose_their_last_second(robot: Robot) -> None:
     driver = Faller(fleet, 180, np.array([False, True, False, True]))
     calm = DisturbanceSettings(noisy_share=0.0, pushed_share=0.0)
     recorder = Recorder(fleet, driver, calm, TICKS / 50)
-    episodes = list(recorder.episodes(701))  # one more than before the standing ones end
+    episodes = list(recorder.episodes(760))  # more than before the standing ones end
     assert (recorder.begun, recorder.fell) == (6, 2)
     assert all(180 < end < TICKS for end in driver.ends)
     lengths = [len(episode.skill) for episode in episodes]
