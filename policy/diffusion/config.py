@@ -34,6 +34,7 @@ class DenoiserConfig:
     mask: str = "state_full_action_causal"
     text: str = ""  # name of the encoder of its instructions; empty: it takes none
     text_size: int = 0  # of an encoded instruction
+    actions: int = 0  # ticks to come whose actions are planned; 0: all of the horizon
 
     def __post_init__(self) -> None:
         for name in ("state_size", "action_size", "layers", "width", "heads", "history", "horizon", "levels"):
@@ -41,6 +42,10 @@ class DenoiserConfig:
                 raise ConfigError(f"denoiser: {name} must be at least 1, not {getattr(self, name)}")
         if self.text_size < 0 or bool(self.text) != bool(self.text_size):
             raise ConfigError(f"denoiser: an encoder '{self.text}' and a text_size of {self.text_size} do not agree")
+        if not 0 <= self.actions <= self.horizon:
+            raise ConfigError(
+                f"denoiser: actions must be 1 to the horizon of {self.horizon} ticks, or 0 for all, not {self.actions}"
+            )
         if self.width % self.heads:
             raise ConfigError(f"denoiser: width {self.width} is not a multiple of heads {self.heads}")
 
@@ -51,8 +56,13 @@ class DenoiserConfig:
 
     @property
     def action_ticks(self) -> Array:
-        """Ticks of the action tokens, `(history - 1 + horizon,)`."""
-        return np.arange(1 - self.history, self.horizon)
+        """Ticks of the action tokens, `(history - 1 + action_horizon,)`."""
+        return np.arange(1 - self.history, self.action_horizon)
+
+    @property
+    def action_horizon(self) -> int:
+        """Ticks to come whose actions are planned."""
+        return self.actions or self.horizon
 
     @property
     def tokens(self) -> int:

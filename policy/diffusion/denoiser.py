@@ -3,7 +3,7 @@
 Tokens of a window around the present tick 0, with `history` ticks known and `horizon` to come:
 
     states   -history+1 .. 0 (past and present), 1 .. horizon
-    actions  -history+1 .. -1 (past), 0 .. horizon-1
+    actions  -history+1 .. -1 (past), 0 .. horizon-1, or fewer: `DenoiserConfig.actions`
 
 An action of tick t is decided on the state of tick t and leads to the state of tick t + 1.
 """
@@ -92,7 +92,8 @@ class Denoiser(nn.Module):
         """
         n = states.shape[1]
         at_state = self.embed_state(states) + self.level(state_levels) + self.position + self.kind[0]
-        at_action = self.embed_action(actions) + self.level(action_levels) + self.position[:-1] + self.kind[1]
+        place = self.position[: actions.shape[1]]
+        at_action = self.embed_action(actions) + self.level(action_levels) + place + self.kind[1]
         x = torch.cat([at_state, at_action], 1)
         if self.config.text_size:
             x = x + self._instruction(text, told)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -58,12 +59,19 @@ def frame_noise(config: DenoiserConfig, seeds: Sequence[Sequence[int]]) -> tuple
     states, actions = [], []
     for seed, tick, *more in seeds:
         for frame in range(-config.history, config.horizon):  # a frame is an action and the state after it
-            generator = seeded(seed, tick + frame + config.history, *more, _FRAME)
-            states.append(torch.randn(config.state_size, generator=generator))
-            if config.action_ticks[0] <= frame <= config.action_ticks[-1]:
-                actions.append(torch.randn(config.action_size, generator=generator))
+            numbers = seed, tick + frame + config.history, *more, _FRAME
+            state, action = _noise_of_frame(config.state_size, config.action_size, *numbers)
+            states.append(state)
+            if -config.history < frame < config.action_horizon:
+                actions.append(action)
     shape = (len(seeds), -1)
     return torch.stack(states).view(*shape, config.state_size), torch.stack(actions).view(*shape, config.action_size)
+
+
+@lru_cache(maxsize=4096)  # the next plan asks for all of them but one again, and drawing takes longer than a call
+def _noise_of_frame(state_size: int, action_size: int, *numbers: int) -> tuple[Tensor, Tensor]:
+    generator = seeded(*numbers)
+    return torch.randn(state_size, generator=generator), torch.randn(action_size, generator=generator)
 
 
 def renoise(

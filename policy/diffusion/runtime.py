@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from hw.hal import Array, Instruction, Plan, PlanRequest
 from hw.robot import Robot
 from policy.checkpoint import resolve
 from policy.diffusion.checkpoint import Model, load
+from policy.diffusion.engines import Engine, load_engine
 from policy.diffusion.features import Trajectory, raw_layout, to_raw, to_tokens
 from policy.diffusion.keyframes import imputation, keyframe_tokens
 from policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise, seeded
@@ -39,18 +41,27 @@ BOUND = 1000.0  # deviations: what is predicted further out than this was driven
 class Runtime:
     """Plans with a diffusion model on one torch thread."""
 
-    def __init__(self, model: Model, settings: DiffusionSettings, dt: float, cost: Cost | None = None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        settings: DiffusionSettings,
+        dt: float,
+        cost: Cost | None = None,
+        engine: Engine | None = None,
+    ) -> None:
         """`dt` is the length of a tick [s]; without `cost`, or with a guidance weight of 0, plans are unguided.
 
-        Raises ConfigError where settings and model do not fit.
+        `engine` is the one that the settings name, where it is loaded already. Raises ConfigError where settings and
+        model do not fit, and where the engine cannot be loaded.
         """
         config = model.config
         settings.check(config)
         self.model, self.settings, self.dt = model, settings, dt
         self.cost = cost if settings.guidance.weight > 0 else None
+        self.engine = engine or load_engine(settings.engine, model.denoiser)
         self.samples = settings.guidance.samples if self.cost else 1
         self.horizon = settings.horizon or config.horizon  # ticks that are planned,
-        self.actions = min(self.horizon, int(config.action_ticks[-1]) + 1)  # and those with actions
+        self.actions = min(self.horizon, config.action_horizon)  # and those with actions
         trained = model.header.get("training", {})
         needed = settings.replan + settings.delay
         if not trained.get("far_actions", 1.0) and needed > trained["near_actions"]:
@@ -111,7 +122,7 @@ class Runtime:
             matrix, start = self._start(keys, states[:, -1], previous)
             text = self._text(instruction, len(states))
             predict = classifier_free(
-                self.model.denoiser,
+                self.engine,
                 None if text is None else text.repeat_interleave(n, 0),
                 self.settings.text_weight,
             )
@@ -211,9 +222,10 @@ class Runtime:
             return None
         if instruction.text is not None:
             sentences = [instruction.text] * batch
+        elif instruction.velocity.ndim == 1:
+            sentences = [_sentence(*instruction.velocity.tolist())] * batch
         else:
-            twists = np.broadcast_to(instruction.velocity, (batch, 3))
-            sentences = [MOTIONS[i].phrasings[0] for i in motion_of(twists)]
+            sentences = [MOTIONS[i].phrasings[0] for i in motion_of(instruction.velocity)]
         for sentence in set(sentences) - self._read.keys():
             self._read[sentence] = torch.from_numpy(self._encoder.encode([sentence])[0])
         return torch.stack([self._read[sentence] for sentence in sentences])
@@ -236,6 +248,12 @@ class Runtime:
 def load_runtime(robot: Robot, settings: DiffusionSettings, cost: Cost | None = None) -> Runtime:
     """The runtime of the checkpoint that `settings` name, for `robot`. Raises ConfigError."""
     return Runtime(load(resolve(settings.checkpoint), robot), settings, robot.dt, cost)
+
+
+@lru_cache(maxsize=256)
+def _sentence(*twist: float) -> str:
+    """What names a twist, of which many plans in a row are asked."""
+    return MOTIONS[int(motion_of(np.array(twist)))].phrasings[0]
 
 
 def _repeat(instruction: Instruction, samples: int) -> Instruction:

@@ -53,14 +53,14 @@ class Guidance:
 
     def step(self, gradient: Tensor, moving: Tensor) -> Tensor:
         """How far states go, `(batch, state tokens, features)`: those `moving` `(state tokens,)`. Raises Diverged."""
-        if not torch.isfinite(gradient).all():
-            raise Diverged("the guidance cost has no finite gradient on this trajectory; check the task's cost")
         if self.samples > 1:
             mean = gradient.reshape(-1, self.samples, *gradient.shape[1:]).mean(1)
             gradient = mean.repeat_interleave(self.samples, 0)
         step = self.weight * gradient * moving[:, None]  # what does not move uses nothing of the step up
         norm = step.flatten(1).norm(dim=1).clamp_min(1e-12)
         if not torch.isfinite(norm).all():
+            if not torch.isfinite(gradient).all():
+                raise Diverged("the guidance cost has no finite gradient on this trajectory; check the task's cost")
             raise Diverged(
                 f"guidance with a weight of {self.weight:g} moves this trajectory out of all bounds; lower it"
             )
@@ -108,6 +108,18 @@ def draw_noise(generators: Sequence[torch.Generator], tokens: int, features: int
     return torch.stack([torch.randn(tokens, features, generator=g) for g in generators])
 
 
+@dataclass(frozen=True)
+class Step:
+    """One call's step of all tokens; factors are `(tokens, 1)`, the square roots of what they are of."""
+
+    moving: Tensor  # (tokens,) bool: the others are left alone
+    signal_before: Tensor
+    noise_before: Tensor
+    signal_after: Tensor
+    noise_after: Tensor  # of the noise that is kept
+    noise_fresh: Tensor  # of that which is drawn anew
+
+
 class Sampler:
     """Walks a denoising matrix with a predictor of clean windows."""
 
@@ -141,13 +153,17 @@ class Sampler:
             start = draw_noise(generators, *known.states.shape[1:]), draw_noise(generators, *known.actions.shape[1:])
         states = torch.where(known.state_mask[:, None], known.states, start[0])
         actions = torch.where(known.action_mask[:, None], known.actions, start[1])
-        for call in range(matrix.calls):
-            before, after = (state_rows[call], action_rows[call]), (state_rows[call + 1], action_rows[call + 1])
-            clean_states, clean_actions = self._call(states, actions, *before, after[0] < before[0], guidance)
+        state_steps, action_steps = self._steps(state_rows), self._steps(action_rows)
+        shown = [rows.masked_fill(rows == 0, self._stabilise) for rows in (state_rows, action_rows)]
+        for call, (of_states, of_actions) in enumerate(zip(state_steps, action_steps, strict=True)):
+            # Once all states are finished, guidance has nothing to move.
+            steering = guidance if of_states.moving.any() else None
+            levels = shown[0][call], shown[1][call]
+            clean_states, clean_actions = self._call(states, actions, *levels, of_states.moving, steering)
             if known.impute is not None:
                 clean_states = known.impute(clean_states)
-            states = self._step(states, clean_states, before[0], after[0], generators)
-            actions = self._step(actions, clean_actions, before[1], after[1], generators)
+            states = self._step(states, clean_states, of_states, generators)
+            actions = self._step(actions, clean_actions, of_actions, generators)
         return states, actions
 
     def _call(
@@ -160,7 +176,7 @@ class Sampler:
         guidance: Guidance | None,
     ) -> tuple[Tensor, Tensor]:
         """One network call, its `moving` states moved by guidance."""
-        levels = (levels.masked_fill(levels == 0, self._stabilise) for levels in (state_levels, action_levels))
+        levels = state_levels, action_levels
         if guidance is None:
             return self._predict(states, actions, *levels)
         if guidance.gradient == NETWORK:
@@ -176,18 +192,23 @@ class Sampler:
                 (gradient,) = torch.autograd.grad(guidance.cost(source).sum(), source)
         return clean_states - guidance.step(gradient, moving), clean_actions
 
-    def _step(
-        self, noisy: Tensor, clean: Tensor, before: Tensor, after: Tensor, generators: Sequence[torch.Generator]
-    ) -> Tensor:
-        """The step from levels `before` to `after`, `(tokens,)`; tokens whose level stays are left alone."""
-        a, b = self._signal[before][:, None], self._signal[after][:, None]
-        noise = (noisy - a.sqrt() * clean) / (1 - a).sqrt().clamp_min(1e-6)
-        if self._eta == 0.0:
-            stepped = b.sqrt() * clean + (1 - b).sqrt() * noise
-        else:
-            fresh = self._eta**2 * (1 - b) / (1 - a).clamp_min(1e-6) * (1 - a / b)  # variance of the noise drawn anew
-            drawn = draw_noise(generators, *noisy.shape[1:])
-            stepped = (
-                b.sqrt() * clean + (1 - b - fresh).clamp_min(0.0).sqrt() * noise + fresh.clamp_min(0.0).sqrt() * drawn
-            )
-        return torch.where((after < before)[:, None], stepped, noisy)
+    def _steps(self, rows: Tensor) -> list[Step]:
+        """The steps between the rows `(calls + 1, tokens)` of a denoising matrix."""
+        a, b = self._signal[rows[:-1]][..., None], self._signal[rows[1:]][..., None]
+        fresh = self._eta**2 * (1 - b) / (1 - a).clamp_min(1e-6) * (1 - a / b)  # variance of the noise drawn anew
+        factors = (
+            a.sqrt(),
+            (1 - a).sqrt().clamp_min(1e-6),
+            b.sqrt(),
+            (1 - b - fresh).clamp_min(0.0).sqrt(),
+            fresh.clamp_min(0.0).sqrt(),
+        )
+        return [Step(*parts) for parts in zip(rows[1:] < rows[:-1], *factors, strict=True)]
+
+    def _step(self, noisy: Tensor, clean: Tensor, step: Step, generators: Sequence[torch.Generator]) -> Tensor:
+        """Tokens after a call that predicted them `clean`."""
+        noise = (noisy - step.signal_before * clean) / step.noise_before
+        stepped = step.signal_after * clean + step.noise_after * noise
+        if self._eta:
+            stepped = stepped + step.noise_fresh * draw_noise(generators, *noisy.shape[1:])
+        return torch.where(step.moving[:, None], stepped, noisy)

@@ -10,6 +10,7 @@ import numpy as np
 from hw.config import ConfigError, load_yaml, nearest, resolve
 from hw.hal import Array
 from policy.diffusion.config import DenoiserConfig
+from policy.diffusion.engines import ENGINES, REFERENCE, check_engine
 from policy.diffusion.schedule import (
     PYRAMID,
     TRAPEZOID,
@@ -107,6 +108,7 @@ class DiffusionSettings:
     eta: float = 0.0  # 0: DDIM, deterministic; 1: DDPM
     stabilise: int = 0  # noise level that clean tokens are shown with
     text_weight: float = 1.0  # classifier-free guidance by the instruction; 0: unread, 1: as trained
+    engine: str = REFERENCE  # what runs the network: see `policy.diffusion.engines`
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
 
     def __post_init__(self) -> None:
@@ -116,13 +118,21 @@ class DiffusionSettings:
             raise ValueError(f"delay must be 0 to replan ({self.replan} ticks), not {self.delay}")
         if self.schedule not in SCHEDULES:
             raise ValueError(f"no schedule is called '{self.schedule}': {nearest(self.schedule, SCHEDULES)}")
+        if self.engine not in ENGINES:
+            raise ValueError(f"no engine is called '{self.engine}': {nearest(self.engine, ENGINES)}")
+        if self.engine != REFERENCE and self.guidance.gradient == "network" and self.guidance.weight > 0:
+            raise ValueError(
+                f"the engine '{self.engine}' has no gradient through the network: set engine: {REFERENCE}, or "
+                "guidance.gradient: analytic"
+            )
         if not 0.0 <= self.eta <= 1.0:
             raise ValueError(f"eta must be 0 (DDIM) to 1 (DDPM), not {self.eta}")
         if self.stabilise < 0:
             raise ValueError(f"stabilise must not be negative, not {self.stabilise}")
 
     def check(self, network: DenoiserConfig) -> None:
-        """Raise ConfigError where this network cannot serve."""
+        """Raise ConfigError where this network cannot serve, or the engine is not installed."""
+        check_engine(self.engine)
         for name, ours in (("history", self.history), ("horizon", self.horizon)):
             most = getattr(network, name)
             if ours is not None and not 1 <= ours <= most:
@@ -130,7 +140,7 @@ class DiffusionSettings:
                     f"diffusion policy: {name} {ours} is asked for, and this checkpoint has 1 to {most} ticks; "
                     f"lower it, or train a model with --{name} {ours}"
                 )
-        horizon = min(self.horizon or network.horizon, int(network.action_ticks[-1]) + 1)
+        horizon = min(self.horizon or network.horizon, network.action_horizon)
         if self.replan + self.delay > horizon:
             raise ConfigError(
                 f"diffusion policy: a plan must last replan + delay = {self.replan + self.delay} ticks, "

@@ -1,9 +1,10 @@
-"""`servoid bench policy`: how long the diffusion policy takes for a plan, on one thread."""
+"""`servoid bench policy`: how long the diffusion policy takes for a plan, on one thread, by engine and runtime."""
 
 from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,91 +17,217 @@ if TYPE_CHECKING:
     from hw.hal import PlanRequest
     from hw.robot import Robot
     from policy.diffusion.checkpoint import Model
+    from policy.diffusion.engines import Engine
     from policy.diffusion.runtime import Runtime
     from policy.diffusion.settings import DiffusionSettings
 
 RANDOM = "random"
+NONE = "none"
+PAPER_SHAPE = "4,32,16"  # of Diffuse-CLoC
+RUNTIMES = {"chunked": "diffusion", "rolling": "diffuse_cloc"}  # and the settings that each is timed with
 WARM_UP = 5  # plans before the clock counts
+PEAK_SIZE = 768  # rows of the square matrices that the peak is measured with
+COLUMNS = (
+    "network",
+    "engine",
+    "runtime",
+    "gradient",
+    "calls_per_plan",
+    "call_median_ms",
+    "plan_median_ms",
+    "plan_p99_ms",
+    "plan_cpu_ms",
+    "plans_per_s",
+    "gflops",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid bench policy`."""
     parser.add_argument("--checkpoint", help=f"name or file; '{RANDOM}': weights made up (default: the shipped one)")
     parser.add_argument("--robot", default="op3", help="robot name or file (default op3)")
-    parser.add_argument("--plans", type=int, default=200, help="plans to time, guided and unguided each (default 200)")
+    parser.add_argument("--plans", type=int, default=100, help="plans to time for each row (default 100)")
     parser.add_argument("--width", type=int, default=192, help="width of made-up weights (default 192)")
     parser.add_argument("--layers", type=int, default=2, help="layers of made-up weights (default 2)")
+    parser.add_argument(
+        "--shape",
+        default=PAPER_SHAPE,
+        metavar="PAST,STATES,ACTIONS",
+        help="window of a second network, as wide and deep as the checkpoint's, its weights made up: states up to the "
+        f"present, states to come, actions to come; '{NONE}': no second network (default {PAPER_SHAPE})",
+    )
+    parser.add_argument(
+        "--engine", action="append", metavar="NAME", help="only this engine; may be repeated (default: all installed)"
+    )
+    parser.add_argument("--runtime", choices=RUNTIMES, help="only this one (default: both)")
     add_json_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Time plans and print a row for each engine, runtime and kind of guidance. Raises ConfigError."""
+    """Time plans and print a row for each network, engine, runtime and kind of guidance. Raises ConfigError."""
     with reporting(args.json) as report:
         _run(args, report)
     return 0
 
 
-def _run(args: argparse.Namespace, report: Report) -> None:
-    from dataclasses import replace
+@dataclass(frozen=True)
+class Network:
+    """A network to time; `gflop` are the floating-point operations of one call, 1e9."""
 
+    name: str
+    model: Model
+    gflop: float
+
+
+def _run(args: argparse.Namespace, report: Report) -> None:
     from hw.config import ConfigError
     from hw.robot import load_robot
-    from policy.diffusion.runtime import Runtime
+    from policy.diffusion.engines import ENGINES, check_engine, load_engine
     from policy.diffusion.settings import load_settings
-    from stack.tasks import load_task
 
     if args.plans < 1:
         raise ConfigError(f"--plans must be at least 1, not {args.plans}")
-    robot, settings = load_robot(args.robot), load_settings()
-    name, model = _model(args, robot, settings)
-    cost = load_task("walk", dt=robot.dt).cost
-    request = _request(robot, model.config.history, settings.delay)
+    robot = load_robot(args.robot)
+    runtimes = {name: load_settings(file) for name, file in RUNTIMES.items() if args.runtime in (None, name)}
+    for engine in args.engine or ():
+        check_engine(engine)
+    networks = _networks(args, robot)
+    skipped: dict[str, str] = {}
     rows = []
-    for guided, gradient in ((False, "none"), (True, "analytic"), (True, "network")):
+    for network in networks:
+        for engine in args.engine or ENGINES:
+            try:
+                loaded = load_engine(engine, network.model.denoiser)
+            except ConfigError as error:
+                skipped[f"{network.name}: {engine}"] = str(error)
+                continue
+            for runtime, settings in runtimes.items():
+                rows += _time(network, engine, loaded, runtime, settings, robot, args.plans)
+    peak = peak_gflops()
+    for row in rows:
+        row["peak_gflops"] = peak
+    for network in networks:
+        config = network.model.config
+        report.line(f"{network.name}: {network.model.denoiser.parameter_count:,} parameters, {config.tokens} tokens")
+    report.table(COLUMNS, [[_cell(row[key]) for key in COLUMNS] for row in rows])
+    between = {name: 1000 * settings.replan * robot.dt for name, settings in runtimes.items()}
+    due = ", ".join(f"{name} every {ms:g} ms" for name, ms in between.items())
+    report.line(f"one thread, peak {peak:.0f} GFLOP/s; a plan is due: {due}")
+    for what, reason in skipped.items():
+        report.line(f"skipped {what}: {reason}")
+    report.result(
+        {
+            "checkpoint": networks[0].name,
+            "ms_between_plans": next(iter(between.values())),
+            "rows": rows,
+            "skipped": skipped,
+        }
+    )
+
+
+def _time(
+    network: Network,
+    engine: str,
+    loaded: Engine,
+    runtime: str,
+    settings: DiffusionSettings,
+    robot: Robot,
+    plans: int,
+) -> list[dict[str, Any]]:
+    """Rows of one engine and runtime: unguided, and guided by each kind of gradient that the engine has."""
+    from policy.diffusion.engines import REFERENCE
+    from policy.diffusion.runtime import Runtime
+    from stack.tasks import load_task
+
+    cost = load_task("walk", dt=robot.dt).cost
+    request = _request(robot, network.model.config.history, settings.delay)
+    call_ms = _call_times(loaded, network.model, plans)
+    rows = []
+    for gradient in (NONE, "analytic", "network") if engine == REFERENCE else (NONE, "analytic"):
+        guided = gradient != NONE
         guidance = replace(settings.guidance, gradient=gradient if guided else "analytic")
         guidance = replace(guidance, weight=guidance.weight or 1.0)  # timed even where it is switched off
-        chosen = replace(settings, guidance=guidance)
-        runtime = Runtime(model, chosen, robot.dt, cost if guided else None)
-        rows.append(_row(runtime, request, args.plans, guided, gradient))
-    between = 1000 * settings.replan * robot.dt
-    keys = ("engine", "runtime", "gradient", "calls_per_plan", "call_median_ms", "plan_median_ms", "plan_p99_ms")
-    report.line(f"{name}: {rows[0]['parameters']:,} parameters, {rows[0]['tokens']} tokens, one thread")
-    report.table(keys, [[_cell(row[key]) for key in keys] for row in rows])
-    report.line(f"a plan is due every {between:g} ms")
-    report.result({"checkpoint": name, "ms_between_plans": between, "rows": rows})
+        chosen = replace(settings, engine=engine, guidance=guidance)
+        planner = Runtime(network.model, chosen, robot.dt, cost if guided else None, loaded)
+        plan_ms, cpu_ms = _plan_times(planner, request, plans)
+        rows.append(
+            {
+                "network": network.name,
+                "engine": engine,
+                "runtime": runtime,
+                "guided": guided,
+                "gradient": gradient,
+                "parameters": network.model.denoiser.parameter_count,
+                "tokens": network.model.config.tokens,
+                "calls_per_plan": planner.matrix.calls,
+                "call_median_ms": float(np.median(call_ms)),
+                "call_p99_ms": float(np.percentile(call_ms, 99)),
+                "plan_median_ms": float(np.median(plan_ms)),
+                "plan_p99_ms": float(np.percentile(plan_ms, 99)),
+                "plan_cpu_ms": float(np.median(cpu_ms)),
+                "plans_per_s": 1000 / float(np.median(plan_ms)),
+                "ms_between_plans": 1000 * settings.replan * robot.dt,
+                "gflops": network.gflop / (float(np.median(call_ms)) / 1000),
+            }
+        )
+    return rows
 
 
-def _model(args: argparse.Namespace, robot: Robot, settings: DiffusionSettings) -> tuple[str, Model]:
-    """The network to time and its name. Without a shipped checkpoint, one with random weights."""
+def _networks(args: argparse.Namespace, robot: Robot) -> list[Network]:
+    """The checkpoint, or one with random weights without it, and the network of `--shape`."""
     from policy.checkpoint import CheckpointError, resolve
     from policy.diffusion.checkpoint import load
+    from policy.diffusion.config import DenoiserConfig
+    from policy.diffusion.features import Normaliser, token_layout
+    from policy.diffusion.settings import load_settings
 
+    name, model = RANDOM, None
     if args.checkpoint != RANDOM:
         try:
-            path = resolve(args.checkpoint or settings.checkpoint)
+            path = resolve(args.checkpoint or load_settings().checkpoint)
         except CheckpointError:
             if args.checkpoint:
                 raise
         else:
-            return path.stem, load(path, robot)
-    return RANDOM, _random_model(robot, args.layers, args.width)
+            name, model = path.stem, load(path, robot)
+    if model is None:
+        import torch
+
+        n = len(robot.joints)
+        size = token_layout(n).size
+        states = Normaliser(torch.zeros(size), torch.full((size,), 0.1))
+        actions = Normaliser(torch.as_tensor(robot.home, dtype=torch.float32), torch.full((n,), 0.1))
+        config = DenoiserConfig(size, n, layers=args.layers, width=args.width)
+        model = _made_up(config, states, actions)
+    networks = [Network(name, model, _gflop(model))]
+    if args.shape != NONE:
+        past, horizon, actions_to_come = _shape(args.shape)
+        config = replace(model.config, history=past, horizon=horizon, actions=actions_to_come)
+        second = _made_up(config, model.states, model.actions)
+        networks.append(Network(args.shape, second, _gflop(second)))
+    return networks
 
 
-def _random_model(robot: Robot, layers: int, width: int) -> Model:
+def _shape(text: str) -> tuple[int, int, int]:
+    """Past states, states and actions to come. Raises ConfigError."""
+    from hw.config import ConfigError
+
+    try:
+        past, states, actions = (int(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--shape: three whole numbers, {PAPER_SHAPE} for one, or '{NONE}', not '{text}'") from None
+    return past, states, actions
+
+
+def _made_up(config: Any, states: Any, actions: Any) -> Model:
+    """A network of this shape with random weights, the same every time."""
     import torch
 
     from policy.diffusion.checkpoint import Model
-    from policy.diffusion.config import DenoiserConfig
     from policy.diffusion.denoiser import Denoiser
-    from policy.diffusion.features import Normaliser, token_layout
 
     torch.manual_seed(0)
-    n = len(robot.joints)
-    size = token_layout(n).size
-    denoiser = Denoiser(DenoiserConfig(size, n, layers=layers, width=width)).eval().requires_grad_(False)
-    states = Normaliser(torch.zeros(size), torch.full((size,), 0.1))
-    actions = Normaliser(torch.as_tensor(robot.home, dtype=torch.float32), torch.full((n,), 0.1))
-    return Model(denoiser, states, actions, {})
+    return Model(Denoiser(config).eval().requires_grad_(False), states, actions, {})
 
 
 def _request(robot: Robot, history: int, delay: int) -> PlanRequest:
@@ -117,55 +244,81 @@ def _request(robot: Robot, history: int, delay: int) -> PlanRequest:
     return PlanRequest(0, states, actions, Instruction(np.array([0.2, 0.0, 0.0]), np.array([1.0, 0.0])))
 
 
-def _row(runtime: Runtime, request: PlanRequest, plans: int, guided: bool, gradient: str) -> dict[str, Any]:
-    """Times of `plans` plans, and of as many single network calls."""
-    for i in range(WARM_UP):
-        runtime.plan(request, i)
-    plan_ms = []
-    for i in range(plans):
-        start = time.perf_counter()
-        runtime.plan(request, i)
-        plan_ms.append(1000 * (time.perf_counter() - start))
-    call_ms = _call_times(runtime, plans)
-    config = runtime.model.config
-    return {
-        "engine": "torch",
-        "runtime": "chunk",
-        "guided": guided,
-        "gradient": gradient,
-        "parameters": runtime.model.denoiser.parameter_count,
-        "tokens": config.tokens,
-        "calls_per_plan": runtime.matrix.calls,
-        "call_median_ms": float(np.median(call_ms)),
-        "call_p99_ms": float(np.percentile(call_ms, 99)),
-        "plan_median_ms": float(np.median(plan_ms)),
-        "plan_p99_ms": float(np.percentile(plan_ms, 99)),
-        "plans_per_s": 1000 / float(np.mean(plan_ms)),
-    }
+def _plan_times(planner: Runtime, request: PlanRequest, plans: int) -> tuple[list[float], list[float]]:
+    """Milliseconds of plans in a row, each `replan` ticks after the one before, which it may go on from.
+
+    By the clock, and of the processor's time: on a machine that others use too only the second can be compared.
+    """
+    previous = None
+    wall, cpu = [], []
+    for i in range(WARM_UP + plans):
+        asked = replace(request, tick=i * planner.settings.replan, previous=previous)
+        start, busy = time.perf_counter(), time.process_time()
+        previous = planner.plan(asked, 0)
+        if i >= WARM_UP:
+            wall.append(1000 * (time.perf_counter() - start))
+            cpu.append(1000 * (time.process_time() - busy))
+    return wall, cpu
 
 
-def _call_times(runtime: Runtime, calls: int) -> list[float]:
+def _call_times(engine: Engine, model: Model, calls: int) -> list[float]:
     """Milliseconds of single network calls for one robot."""
     import torch
 
     from policy.diffusion.runtime import one_thread
 
-    config = runtime.model.config
-    n_states, n_actions = len(config.state_ticks), len(config.action_ticks)
-    inputs: tuple[torch.Tensor, ...] = (
-        torch.zeros(1, n_states, config.state_size),
-        torch.zeros(1, n_actions, config.action_size),
-        torch.full((n_states,), config.levels),
-        torch.full((n_actions,), config.levels),
-    )
-    times = []
+    inputs, times = _inputs(model), []
     with one_thread(), torch.inference_mode():
         for i in range(WARM_UP + calls):
             start = time.perf_counter()
-            runtime.model.denoiser(*inputs)
+            engine(*inputs)
             if i >= WARM_UP:
                 times.append(1000 * (time.perf_counter() - start))
     return times
+
+
+def _inputs(model: Model) -> tuple[torch.Tensor, ...]:
+    """A window of noise, with an instruction where the network reads one."""
+    import torch
+
+    config = model.config
+    n_states, n_actions = len(config.state_ticks), len(config.action_ticks)
+    generator = torch.Generator().manual_seed(0)
+    inputs = (
+        torch.randn(1, n_states, config.state_size, generator=generator),
+        torch.randn(1, n_actions, config.action_size, generator=generator),
+        torch.full((n_states,), config.levels),
+        torch.full((n_actions,), config.levels),
+    )
+    return (*inputs, torch.zeros(1, config.text_size)) if config.text_size else inputs
+
+
+def _gflop(model: Model) -> float:
+    """Floating-point operations of one network call for one robot, 1e9; a multiplication and addition count as two."""
+    import torch
+    from torch.utils.flop_counter import FlopCounterMode
+
+    counter = FlopCounterMode(display=False)
+    with counter, torch.enable_grad():  # attention is spelled out then, so that it is counted
+        model.denoiser(*_inputs(model))
+    return float(counter.get_total_flops()) / 1e9
+
+
+def peak_gflops(size: int = PEAK_SIZE, repeats: int = 12) -> float:
+    """The best rate, 1e9 operations a second, of a float32 matrix product on one thread: this machine, as it is now."""
+    import torch
+
+    from policy.diffusion.runtime import one_thread
+
+    a = torch.randn(size, size, generator=torch.Generator().manual_seed(0))
+    out = torch.empty_like(a)
+    with one_thread():
+        best = float("inf")
+        for _ in range(repeats):
+            start = time.perf_counter()
+            torch.mm(a, a, out=out)
+            best = min(best, time.perf_counter() - start)
+    return 2 * size**3 / best / 1e9
 
 
 def _cell(value: object) -> str:

@@ -1,0 +1,132 @@
+"""A denoiser as an ONNX graph, for engines other than torch."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from policy.diffusion.denoiser import Denoiser
+
+OPSET = 18
+OUTPUTS = ("clean_states", "clean_actions")
+_DIGEST = 32  # bytes of a file before the graph: its SHA-256
+_VERSION = 1  # of the graph that is made of a denoiser: files of another one are not read
+
+
+def exported(denoiser: Denoiser) -> bytes:
+    """The graph of `to_onnx`, kept in the user's cache folder, for to make it takes seconds."""
+    path = cache_path(denoiser)
+    with contextlib.suppress(OSError):  # it was not made before, or the folder cannot be read
+        kept = path.read_bytes()
+        if hashlib.sha256(kept[_DIGEST:]).digest() == kept[:_DIGEST]:  # else the file is damaged
+            return kept[_DIGEST:]
+    graph = to_onnx(denoiser)
+    with contextlib.suppress(OSError):  # without a folder to write to, it is made anew the next time
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=path.stem, suffix=".partial", delete=False) as file:
+            file.write(hashlib.sha256(graph).digest() + graph)
+        os.replace(file.name, path)  # whole or not at all, also with several processes at once
+    return graph
+
+
+def cache_path(denoiser: Denoiser) -> Path:
+    """Where the graph of these weights is kept: under servoid/ in $XDG_CACHE_HOME, or ~/.cache."""
+    made_by = {"config": asdict(denoiser.config), "torch": torch.__version__, "opset": OPSET, "version": _VERSION}
+    digest = hashlib.sha256(json.dumps(made_by, sort_keys=True).encode())
+    for name, weights in sorted(denoiser.state_dict().items()):
+        digest.update(name.encode() + weights.numpy().tobytes())
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    base = Path(given) if os.path.isabs(given) else Path.home() / ".cache"  # a relative one is to be ignored
+    return base / "servoid" / "engines" / digest.hexdigest()[:32]
+
+
+def to_onnx(denoiser: Denoiser) -> bytes:
+    """The graph, its weights included.
+
+    Inputs `states` `(batch, state tokens, state_size)`, `actions` `(batch, action tokens, action_size)` float32,
+    `state_levels` and `action_levels` `(batch, tokens)` int64 and, where the network reads instructions, `text`
+    `(batch, text_size)` float32 and `told` `(batch,)` bool. Outputs `clean_states` and `clean_actions`. Any batch.
+    """
+    config = denoiser.config
+    n_states, n_actions, batch = len(config.state_ticks), len(config.action_ticks), 2  # 1 would be taken for fixed
+    inputs = {
+        "states": torch.zeros(batch, n_states, config.state_size),
+        "actions": torch.zeros(batch, n_actions, config.action_size),
+        "state_levels": torch.zeros(batch, n_states, dtype=torch.int64),
+        "action_levels": torch.zeros(batch, n_actions, dtype=torch.int64),
+    }
+    if config.text_size:
+        inputs["text"] = torch.zeros(batch, config.text_size)
+        inputs["told"] = torch.ones(batch, dtype=torch.bool)
+    any_batch = {0: torch.export.Dim("batch")}
+    # With gradients enabled attention is spelled out (see denoiser._attend), which every engine can read and fuse.
+    with _quiet(), torch.enable_grad():
+        program = torch.onnx.export(
+            denoiser,
+            tuple(inputs.values()),
+            dynamo=True,
+            verbose=False,
+            opset_version=OPSET,
+            input_names=list(inputs),
+            output_names=list(OUTPUTS),
+            dynamic_shapes=(any_batch,) * len(inputs),
+        )
+    assert program is not None
+    graph: bytes = program.model_proto.SerializeToString()
+    return graph
+
+
+def quantised(graph: bytes) -> bytes:
+    """The graph with the weights of its linear layers as int8, a scale each channel; inputs are quantised as they come.
+
+    Products of two activations, as in attention, stay in float32, and so do the layers that outputs come from: they
+    are small, and that of the states alone makes a third of all error.
+    """
+    import onnx
+    from onnxruntime.quantization import QuantType, quantize_dynamic
+    from onnxruntime.quantization.shape_inference import quant_pre_process
+
+    with tempfile.TemporaryDirectory(prefix="servoid-") as folder:
+        whole, folded, small = (Path(folder) / f"{name}.onnx" for name in ("whole", "folded", "small"))
+        whole.write_bytes(graph)
+        quant_pre_process(str(whole), str(folded), skip_symbolic_shape=True)  # weights become constants
+        last = _last_products(onnx.load(str(folded)).graph)
+        quantize_dynamic(folded, small, weight_type=QuantType.QInt8, per_channel=True, nodes_to_exclude=last)
+        return small.read_bytes()
+
+
+def _last_products(graph: Any) -> list[str]:
+    """Names of the matrix products that each output of an ONNX graph is made of."""
+    makers = {name: node for node in graph.node for name in node.output}
+    found = []
+    for output in graph.output:
+        node = makers[output.name]
+        while node.op_type not in ("MatMul", "Gemm"):  # the sum with the bias
+            node = next(makers[name] for name in node.input if name in makers)
+        found.append(node.name)
+    return found
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without what the exporter says of packages that are not needed and of names of axes."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
