@@ -17,10 +17,9 @@ def test_a_walk_goes_on_over_a_line_that_loses_packets(capsys: pytest.CaptureFix
     for _ in range(TRIES):
         assert main(["bench", "soak", "--minutes", "0.05", "--warm-up", "1", "--share", "0.02", "--json"]) == 0
         result = json.loads(capsys.readouterr().out)
-        if not (result["stopped"] or result["fell"]):  # a busy machine misses ticks of real time
+        if not result["stopped"]:
             break
     assert result["outcome"] == "succeeded", result["events"]
-    assert not result["fell"]
     assert result["packets_struck"] > 20
     assert result["answers_lost"] > 20
     assert result["ticks"] >= 100
