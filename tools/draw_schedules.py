@@ -10,7 +10,7 @@ import numpy as np
 
 from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.schedule import DenoisingMatrix
-from policy.diffusion.settings import Autoregressive, DiffusionSettings, Gradual, Rolling
+from policy.diffusion.settings import Autoregressive, DiffusionSettings, Gradual
 
 NETWORK = DenoiserConfig(108, 20)  # 4 past and 16 future states, 20 noise levels
 COMMITTED = 2  # actions that run while the plan is made
@@ -22,7 +22,7 @@ PICTURES = {
     "autoregressive": DiffusionSettings(schedule="autoregressive", steps=5, autoregressive=Autoregressive(block=4)),
     "gradual": DiffusionSettings(schedule="gradual", steps=5, gradual=Gradual(spread=5)),
     "trapezoid": DiffusionSettings(schedule="gradual", steps=5, gradual=Gradual(spread=5, shape="trapezoid")),
-    "rolling": DiffusionSettings(schedule="rolling", steps=3, replan=1, delay=1, rolling=Rolling(ramp=1)),
+    "rolling": DiffusionSettings(schedule="rolling", steps=3, replan=1, delay=1),
 }
 
 

@@ -146,8 +146,8 @@ def rolling(
     """A plan that goes on from an earlier one: the first-in, first-out buffer of Diffuse-CLoC (section 3.2).
 
     The last `fresh` frames were pushed in since and are pure noise. Of the others, states go on from `state_level` and
-    actions from `action_level`; over the `ramp` frames before the fresh ones the level rises to pure noise. Frames are
-    those of `autoregressive`.
+    actions from `action_level`; over the `ramp` frames before the fresh ones, or as many as there are, the level rises
+    to pure noise. Frames are those of `autoregressive`.
     """
     for name, level in (("states", state_level), ("actions", action_level)):
         if not 1 <= level <= levels:
@@ -156,8 +156,9 @@ def rolling(
         raise ValueError(f"fresh must not be negative and ramp must be at least 1 frame, not {fresh}, {ramp}")
 
     def starts(frames: Array, level: int) -> Array:
-        last = frames.max()  # an earlier plan may have had fewer actions than states
-        risen = np.clip(1 - (last - fresh + 1 - frames) / ramp, 0.0, 1.0)  # 1 in the fresh frames
+        last = frames.max()  # of actions, there may be fewer
+        kept = max(last + 1 - fresh, 1)
+        risen = np.clip(1 - (last + 1 - fresh - frames) / min(ramp, kept), 0.0, 1.0)  # 1 in the fresh frames
         start: Array = np.round(level + (levels - level) * risen).astype(np.int64)
         return start
 

@@ -82,10 +82,10 @@ class Rolling:
 
     state_level: int = 14
     action_level: int = 4
-    ramp: int = 1  # frames
+    ramp: int | None = None  # frames over which the level rises to pure noise; None: the whole window
 
     def __post_init__(self) -> None:
-        if min(self.state_level, self.action_level, self.ramp) < 1:
+        if min(self.state_level, self.action_level, self.ramp or 1) < 1:
             raise ValueError("state_level, action_level and ramp must be at least 1")
 
 
@@ -176,7 +176,7 @@ class DiffusionSettings:
         elif self.schedule == "rolling" and fresh is not None:
             roll = self.rolling
             start = roll.state_level, roll.action_level
-            matrix = rolling(levels, self.steps, *frames, *start, fresh, roll.ramp, lead)
+            matrix = rolling(levels, self.steps, *frames, *start, fresh, roll.ramp or horizon, lead)
         else:
             matrix = full_sequence(levels, self.steps, len(state_frames), len(action_frames), lead)
         states, actions = self.used(network)

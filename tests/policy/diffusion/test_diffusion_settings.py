@@ -74,4 +74,8 @@ def test_a_shorter_history_and_horizon_leave_the_rest_as_noise(schedule: str) ->
     assert not matrix.actions[-1, actions].any()
     if schedule == "rolling":  # what is fresh is the last frame of the plan, not of the network
         assert matrix.states[0, np.flatnonzero(NETWORK.state_ticks == 8)] == 20
-        assert matrix.states[0, np.flatnonzero(NETWORK.state_ticks == 7)] == 14
+        levels = matrix.states[0, (NETWORK.state_ticks > 0) & states]
+        assert (np.diff(levels) >= 0).all()
+        assert levels[0] == 14
+        flat = DiffusionSettings(schedule=schedule, horizon=8, rolling=Rolling(ramp=1)).matrix(NETWORK, fresh=1)
+        assert flat.states[0, np.flatnonzero(NETWORK.state_ticks == 7)] == 14
