@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,9 +24,10 @@ class Mirror:
     VECTOR: ClassVar[Mirror]  # (x, y, z)
     ROTATION: ClassVar[Mirror]  # angular velocity (x, y, z)
 
-    def __call__(self, x: Array) -> Array:
-        """Mirror `(..., n)`."""
-        return x[..., self.index] * self.sign
+    def __call__(self, x: Any) -> Any:
+        """Mirror `(..., n)`, a numpy array or a torch tensor."""
+        sign = self.sign if isinstance(x, np.ndarray) else x.new_tensor(self.sign)
+        return x[..., self.index] * sign
 
     @staticmethod
     def join(*parts: Mirror) -> Mirror:

@@ -20,24 +20,25 @@ _LIMIT = np.array([0.08, 0.06, 0.3])  # of the correction
 class Trim:
     """Call once a tick with the twist that is asked, `(..., 3)` m/s forward, m/s left, rad/s."""
 
-    def __init__(self, dt: float, rate: float) -> None:
+    def __init__(self, dt: float, rate: float, shape: tuple[int, ...] = ()) -> None:
         """`rate` [1/s] is the share of the difference that is added a second; 0 turns the correction off."""
         self._step = rate * dt
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything."""
         self._differences: deque[Array] = deque(maxlen=_CYCLE)
-        self._asked: Array | None = None
-        self._since: Array | int = 0
-        self._correction: Array | float = 0.0
+        self._asked = np.zeros((*shape, 3))
+        self._since = np.zeros(shape, int)  # ticks
+        self._correction = np.zeros((*shape, 3))
+
+    def reset(self, where: Array | None = None) -> None:
+        """Begin anew in the worlds `where` (default: all)."""
+        where = np.ones_like(self._since, bool) if where is None else where
+        self._since = np.where(where, 0, self._since)
+        self._correction = np.where(where[..., None], 0.0, self._correction)
 
     def __call__(self, state: State, asked: Array) -> Array:
         """The twist `(..., 3)` to ask for instead. Who is told to stand is told to stand."""
         asked = np.asarray(asked, dtype=float)
         measured = np.stack([state.velocity[..., 0], state.velocity[..., 1], state.angular_velocity[..., 2]], -1)
-        before = asked if self._asked is None else self._asked
-        begun = (np.abs(asked - before) > _JUMP).any(-1)
+        begun = (np.abs(asked - self._asked) > _JUMP).any(-1)
         self._differences.append(asked - measured)
         self._asked, self._since = asked, np.where(begun, 0, self._since + 1)
         settled = (self._since >= _CYCLE)[..., None]

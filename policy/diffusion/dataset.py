@@ -18,9 +18,10 @@ from torch import Tensor
 
 from hw.config import ConfigError
 from hw.hal import Array
+from hw.mirror import Mirror
 from hw.robot import Robot
 from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.features import Emphasis, Mirror, Normaliser, raw_layout, to_tokens
+from policy.diffusion.features import Emphasis, Normaliser, raw_layout, raw_mirror, to_tokens
 from policy.text.captions import MOTIONS, mirrored, motion_of
 from policy.text.encoder import load_encoder
 
@@ -147,7 +148,7 @@ class Windows:
         """
         self.config = config
         self.n_joints = len(robot.joints)
-        self._mirror = Mirror.of(robot.mirror)
+        self._mirror_raw, self._mirror_action = raw_mirror(robot), Mirror.joints(robot)
         spans = recording.spans
         first, last = config.history - 1, config.horizon  # ticks needed before and after the present
         long = spans[spans[:, 1] - spans[:, 0] > first + last]
@@ -198,8 +199,8 @@ class Windows:
         past = self.config.history - 1
         actions = torch.cat([self._applied[action_rows[:, :past]], self._action[action_rows[:, past:]]], 1)
         flip = mirrored[:, None, None]
-        raw = torch.where(flip, self._mirror.raw(raw), raw)
-        actions = torch.where(flip, self._mirror.actions(actions), actions)
+        raw = torch.where(flip, self._mirror_raw(raw), raw)
+        actions = torch.where(flip, self._mirror_action(actions), actions)
         return to_tokens(raw, raw[:, past], self.n_joints), actions
 
     def draw(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -16,6 +16,8 @@ from typing import Any, Self
 import numpy as np
 
 from hw.hal import Array, State
+from hw.mirror import Mirror
+from hw.robot import Robot
 
 AnyArray = Any  # a numpy array or a torch tensor
 
@@ -145,51 +147,11 @@ def to_raw(tokens: AnyArray, present: AnyArray, n_joints: int) -> AnyArray:
     return xp.concat(parts, -1)
 
 
-@dataclass(frozen=True)
-class Mirror:
-    """Left and right swapped, for raw rows and for actions: `x[..., index] * sign`."""
-
-    raw_index: Array
-    raw_sign: Array
-    action_index: Array
-    action_sign: Array
-
-    @classmethod
-    def of(cls, joints: tuple[Array, Array]) -> Mirror:
-        """From the robot's `mirror` (index, sign) over its joints."""
-        index, sign = joints
-        layout = raw_layout(len(index))
-        raw_index, raw_sign = np.arange(layout.size), np.ones(layout.size, dtype=np.float32)
-        # A mirror through the x-z plane turns y of a vector, x and z of a rotation.
-        for name, flipped in (
-            ("displacement", (1,)),
-            ("yaw", (0,)),
-            ("velocity", (1,)),
-            ("angular_velocity", (0, 2)),
-            ("gravity", (1,)),
-        ):
-            start = layout.slice(name).start
-            raw_sign[[start + i for i in flipped]] = -1
-        for name in ("position", "joint_velocity"):
-            part = layout.slice(name)
-            raw_index[part] = part.start + index
-            raw_sign[part] = sign
-        return cls(raw_index, raw_sign, np.asarray(index), np.asarray(sign, dtype=np.float32))
-
-    def raw(self, rows: AnyArray) -> AnyArray:
-        """Mirrored raw rows `(..., raw size)`."""
-        return _take(rows, self.raw_index, self.raw_sign)
-
-    def actions(self, actions: AnyArray) -> AnyArray:
-        """Mirrored joint targets `(..., n_joints)`."""
-        return _take(actions, self.action_index, self.action_sign)
-
-
-def _take(x: AnyArray, index: Array, sign: Array) -> AnyArray:
-    if isinstance(x, np.ndarray):
-        return x[..., index] * sign.astype(x.dtype)
-    xp = _namespace(x)
-    return x[..., xp.as_tensor(index)] * xp.as_tensor(sign, dtype=x.dtype)
+def raw_mirror(robot: Robot) -> Mirror:
+    """Of a raw row."""
+    joints = Mirror.joints(robot)
+    planes = Mirror.VECTOR, Mirror.FLIPPED, Mirror.VECTOR, Mirror.ROTATION, Mirror.VECTOR
+    return Mirror.join(*planes, joints, joints)
 
 
 @dataclass(frozen=True)

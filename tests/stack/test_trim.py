@@ -51,7 +51,7 @@ def test_a_robot_that_is_stuck_is_not_asked_for_ever_more() -> None:
 
 def test_many_robots_are_corrected_as_one_is() -> None:
     rng = np.random.default_rng(0)
-    asked, many = np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.6]]), Trim(DT, 1.0)
+    asked, many = np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.6]]), Trim(DT, 1.0, (2,))
     ones = [Trim(DT, 1.0), Trim(DT, 1.0)]
     for tick in range(120):
         if tick == 60:
@@ -60,3 +60,13 @@ def test_many_robots_are_corrected_as_one_is() -> None:
         together = many(state(measured), asked)
         for i in range(2):
             np.testing.assert_allclose(ones[i](state(measured[i]), asked[i]), together[i])
+
+
+def test_one_of_many_robots_begins_anew_alone() -> None:
+    asked, trim = np.tile([0.2, 0.0, 0.0], (2, 1)), Trim(DT, 1.0, (2,))
+    for _ in range(100):
+        told = trim(state(np.tile([0.3, 0.0, 0.0], (2, 1))), asked)
+    trim.reset(np.array([True, False]))
+    after = trim(state(np.tile([0.3, 0.0, 0.0], (2, 1))), asked)
+    np.testing.assert_allclose(after[0], asked[0])
+    assert after[1, 0] <= told[1, 0] < 0.15

@@ -20,6 +20,7 @@ def test_a_walk_goes_on_over_a_line_that_loses_packets(capsys: pytest.CaptureFix
         if not result["stopped"]:
             break
     assert result["outcome"] == "succeeded", result["events"]
+    assert not result["fell"]
     assert result["packets_struck"] > 20
     assert result["answers_lost"] > 20
     assert result["ticks"] >= 100

@@ -78,7 +78,7 @@ def soak(report: Report, args: argparse.Namespace) -> dict[str, Any]:
         counters = body.counters
         struck = sum(each["count"] for each in rig.control.statistics()["struck"])
         with contextlib.suppress(BackendError):
-            watch.look(rig)
+            watch.weigh(rig)
     late = np.array(watch.late or [0.0])
     return {
         "minutes": watch.ticks / robot.rate / 60.0,
@@ -124,14 +124,14 @@ class Watch:
             self.late.append(record.timing.late * 1e-6)
         if self.ticks == self._warm:
             self.start_mb, self.rig_start_mb = rss_mb(), rss_mb(self._rig.process.pid)
-        if self.ticks % self._rate == 0:
-            self.look(self._rig)
+        if self.ticks % self._rate == 0:  # within the task: a robot that was lowered at its end is no fallen one
+            self.fell |= bool(self._truth.fetch().fallen[0])
+            self.weigh(self._rig)
         if self.ticks % round(TELL_SECONDS * self._rate) == 0:
             self._report.line(f"{self.ticks / self._rate:.0f} s, {self.missed} missed, {self.end_mb:.1f} MB")
 
-    def look(self, rig: Any) -> None:
-        """Take the truth and the memory of now."""
-        self.fell |= bool(self._truth.fetch().fallen[0])
+    def weigh(self, rig: Any) -> None:
+        """Take the memory of now."""
         self.end_mb, self.rig_end_mb = rss_mb(), rss_mb(rig.process.pid)
 
 

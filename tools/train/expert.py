@@ -188,7 +188,7 @@ def _with_mirrored(env: Any, obs: Any, actions: Any) -> tuple[Any, Any]:
     from tensordict import TensorDict
 
     def both(x: Any, mirror: Any) -> Any:
-        return torch.cat([x, x[:, torch.as_tensor(mirror.index)] * torch.as_tensor(mirror.sign)])
+        return torch.cat([x, mirror(x)])
 
     if obs is not None:
         pair = {"actor": both(obs["actor"], env.mirror_actor), "critic": both(obs["critic"], env.mirror_critic)}

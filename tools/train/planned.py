@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hw.hal import Array, Instruction
-from policy.diffusion.features import raw_row
+from policy.diffusion.features import raw_layout, raw_row
 from stack.trim import Trim
 from tools.train.fleet import Fleet
 
@@ -26,17 +26,19 @@ class PlannedWalker:
         self.fleet, self._runtime, self._seed = fleet, runtime, seed
         self._history, self._horizon = runtime.model.config.history, runtime.actions
         self._tick = 0
-        self._states: Array | None = None  # (n, history, raw size), newest last
+        size = raw_layout(len(fleet.robot.joints)).size
+        self._states = np.zeros((fleet.n, self._history, size), np.float32)  # newest last
         self._applied = np.repeat(fleet.applied[:, None], self._history - 1, 1)
         self._plan, self._made = np.repeat(fleet.applied[:, None], self._horizon, 1), 0
         self._predicted: Array | None = None  # (n, horizon, raw size) by the plans that run; None before the first
         self._waiting: tuple[Array, Array] | None = None  # the plans that are not adopted yet
         self._requested = 0
-        self._trim = Trim(fleet.robot.dt, runtime.settings.trim)
+        self._trim = Trim(fleet.robot.dt, runtime.settings.trim, (fleet.n,))
         self._fresh = np.ones(fleet.n, bool)
 
     def reset(self, where: Array) -> None:
         """New episodes in the worlds `where`."""
+        self._trim.reset(where)
         self._fresh = self._fresh | where
 
     def act(self, command: Array) -> Array:
@@ -48,7 +50,7 @@ class PlannedWalker:
         asked = self._trim(self.fleet.state, command)
         if self._waiting is not None and tick == self._requested + settings.delay:
             (self._plan, self._predicted), self._made, self._waiting = self._waiting, self._requested, None
-        if tick % settings.replan == 0 and self._states is not None:
+        if tick % settings.replan == 0:
             ahead = np.stack([self._action(tick + i) for i in range(settings.delay)], 1) if settings.delay else None
             actions = self._applied if ahead is None else np.concatenate([self._applied, ahead], 1)
             seeds = [(self._seed + i, tick) for i in range(self.fleet.n)]
@@ -67,8 +69,6 @@ class PlannedWalker:
     def _observe(self) -> None:
         """Take in the state, and what was applied at the tick before."""
         row, applied = raw_row(self.fleet.state), self.fleet.applied
-        if self._states is None:
-            self._states = np.repeat(row[:, None], self._history, 1)
         self._states = np.concatenate([self._states[:, 1:], row[:, None]], 1)
         self._applied = np.concatenate([self._applied[:, 1:], applied[:, None]], 1)
         if (fresh := self._fresh).any():

@@ -10,10 +10,11 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from hw.mirror import Mirror
 from hw.robot import load_robot
 from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.dataset import DatasetError, Windows, read_recording
-from policy.diffusion.features import Emphasis, Mirror, Normaliser, token_layout
+from policy.diffusion.features import Emphasis, Normaliser, raw_mirror, token_layout
 from policy.text.captions import MOTIONS, motion_of
 from policy.text.encoder import load_encoder
 
@@ -76,12 +77,12 @@ def test_batches_are_normalised_and_half_of_them_mirrored(synthetic_dataset: Pat
 
 def test_mirrored_windows_are_those_of_mirrored_rows(synthetic_dataset: Path) -> None:
     recording = read_recording(synthetic_dataset, ROBOT)
-    mirror = Mirror.of(ROBOT.mirror)
+    rows, joints = raw_mirror(ROBOT), Mirror.joints(ROBOT)
     image = replace(
         recording,
-        raw=mirror.raw(recording.raw),
-        action=mirror.actions(recording.action),
-        applied=mirror.actions(recording.applied),
+        raw=rows(recording.raw),
+        action=joints(recording.action),
+        applied=joints(recording.applied),
     )
     pick = Windows(recording, ROBOT, CONFIG).training[:50]
     flipped = Windows(recording, ROBOT, CONFIG)._gather(pick, torch.ones(50, dtype=torch.bool))
