@@ -25,7 +25,7 @@ class Trim:
         self._step = rate * dt
         self._differences: deque[Array] = deque(maxlen=_CYCLE)
         self._asked = np.zeros((*shape, 3))
-        self._since = np.zeros(shape, int)  # ticks
+        self._since: Array = np.zeros(shape, int)  # ticks
         self._correction = np.zeros((*shape, 3))
 
     def reset(self, where: Array | None = None) -> None:
