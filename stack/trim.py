@@ -25,7 +25,7 @@ class Trim:
         self._step = rate * dt
         self._differences: deque[Array] = deque(maxlen=_CYCLE)
         self._asked = np.zeros((*shape, 3))
-        self._since: Array = np.zeros(shape, int)  # ticks
+        self._since = np.zeros(shape, int)  # ticks
         self._correction = np.zeros((*shape, 3))
 
     def reset(self, where: Array | None = None) -> None:
@@ -41,8 +41,8 @@ class Trim:
         begun = (np.abs(asked - self._asked) > _JUMP).any(-1)
         self._differences.append(asked - measured)
         self._asked, self._since = asked, np.where(begun, 0, self._since + 1)
-        settled = (self._since >= _CYCLE)[..., None]
-        correction = self._correction + settled * self._step * np.mean(self._differences, axis=0)
+        step = np.where(self._since >= _CYCLE, self._step, 0.0)[..., None]
+        correction = self._correction + step * np.mean(self._differences, axis=0)
         correction = np.where(begun[..., None], 0.0, np.clip(correction, -_LIMIT, _LIMIT))
         moving = (asked != 0.0).any(-1, keepdims=True)
         self._correction = np.where(moving, correction, 0.0)
