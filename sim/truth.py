@@ -16,9 +16,7 @@ FALL_TILT = np.deg2rad(60.0)
 class Truth:
     """Live views of the worlds' truth. All arrays are `(n, ...)`, world frame unless said otherwise."""
 
-    def __init__(
-        self, model: mujoco.MjModel, robot: Robot, qpos: Array, qvel: Array, sensors: Array
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, robot: Robot, qpos: Array, qvel: Array, sensors: Array) -> None:
         self._robot, self._qpos, self._qvel, self._sensors = robot, qpos, qvel, sensors
         self._at = {model.sensor(i).name: slice(int(a := model.sensor(i).adr[0]), int(a + model.sensor(i).dim[0]))
                     for i in range(model.nsensor)}  # fmt: skip

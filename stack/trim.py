@@ -38,7 +38,7 @@ class Trim:
         """The twist `(..., 3)` to ask for instead. Who is told to stand is told to stand."""
         asked = np.asarray(asked, dtype=float)
         measured = np.stack([state.velocity[..., 0], state.velocity[..., 1], state.angular_velocity[..., 2]], -1)
-        begun = (np.abs(asked - self._asked) > _JUMP).any(-1)
+        begun = np.any(np.abs(asked - self._asked) > _JUMP, axis=-1)
         self._differences.append(asked - measured)
         self._asked, self._since = asked, np.where(begun, 0, self._since + 1)
         step = np.where(self._since >= _CYCLE, self._step, 0.0)[..., None]

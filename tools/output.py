@@ -1,8 +1,8 @@
 """What a command prints. With `--json`, standard output is one line, one JSON object; the rest goes to standard error.
 
-    with reporting(args.json) as report:
-        report.line("walking ...")               # standard error with --json
-        report.result({"success_rate": 0.97})    # one line with --json, nothing otherwise
+with reporting(args.json) as report:
+    report.line("walking ...")               # standard error with --json
+    report.result({"success_rate": 0.97})    # one line with --json, nothing otherwise
 """
 
 from __future__ import annotations

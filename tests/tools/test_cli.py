@@ -55,9 +55,7 @@ def test_help_is_quick_and_loads_nothing_heavy() -> None:
         ([], "servoid: say what to do: tasks"),
     ],
 )
-def test_usage_errors_are_one_line_and_code_2(
-    argv: list[str], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_usage_errors_are_one_line_and_code_2(argv: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(argv) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith(words)
