@@ -46,6 +46,7 @@ class Health:
         full = np.array([servo.stall_torque / servo.stiffness for servo in servos])
         self._full = full / np.maximum(gain, 1e-6)  # rad of error at full output
         self._still = STILL * np.array([servo.no_load_speed for servo in servos])
+        self._weak: Array = np.ones(len(servos))  # the part of `factor` that heat and supply account for
         self._blocked = np.zeros(len(servos))  # s
         self._supply: deque[float] = deque(maxlen=LOW_TICKS)  # V, the median of the servos' at the last ticks
 
@@ -117,7 +118,7 @@ class Health:
             found.append(Finding("lowered", "temperature", text, self._names[i]))
         if limits.derate_temperature is not None:
             span = limits.temperature - limits.derate_temperature
-            for i in self._derate(_ramp((temperature - limits.derate_temperature) / span)):
+            for i in self._weaken(_ramp((temperature - limits.derate_temperature) / span)):
                 text = f"{self._names[i]} is at {temperature[i]:.0f} C: its gain goes down to {self.factor[i]:.2f}"
                 found.append(Finding("", "derated", text, self._names[i]))
         return found
@@ -138,7 +139,7 @@ class Health:
             found.append(Finding("lowered", "voltage", text, name))
         if limits.derate_voltage is not None:
             span = limits.derate_voltage - (limits.voltage or 0.0)
-            if self._derate(np.full_like(self.factor, _ramp((limits.derate_voltage - supply) / span))):
+            if self._weaken(np.full_like(self.factor, _ramp((limits.derate_voltage - supply) / span))):
                 text = f"the supply is down to {supply:.1f} V, {at}: gains go down to {self.factor.max():.2f}"
                 found.append(Finding("", "derated", text, name))
         return found
@@ -146,7 +147,8 @@ class Health:
     def _load(self, observation: Observation, applied: Array) -> list[Finding]:
         """Joints that push with all they have and do not move."""
         error = np.abs(applied - observation.position)
-        blocked = (error >= FULL * self._full) & (np.abs(observation.velocity) < self._still)
+        full = self._full / self._weak  # a weakened servo sags further before it gives all it has
+        blocked = (error >= FULL * full) & (np.abs(observation.velocity) < self._still)
         self._blocked = np.where(blocked, self._blocked + self._robot.dt, 0.0)
         soft = self._blocked > SOFT_SECONDS
         if not soft.any():
@@ -161,12 +163,21 @@ class Health:
             found.append(Finding("lowered", "overload", text, self._names[i]))
         return found
 
+    def _weaken(self, factor: Array) -> list[int]:
+        """`_derate` for heat or supply, which say nothing about what the joint pushes against."""
+        self._weak = np.minimum(self._weak, _steps(factor))
+        return self._derate(factor)
+
     def _derate(self, factor: Array) -> list[int]:
         """Take gains down to `factor` `(n_joints,)`, in steps; returns the joints that went lower."""
-        stepped = np.maximum(np.floor(factor / STEP + 1e-9) * STEP, STEP)
+        stepped = _steps(factor)
         lower = np.flatnonzero(stepped < self.factor - 1e-9)
         self.factor = np.minimum(self.factor, stepped)
         return lower.tolist()
+
+
+def _steps(factor: Array) -> Array:
+    return np.maximum(np.floor(factor / STEP + 1e-9) * STEP, STEP)
 
 
 def _ramp(share: Array | float) -> Array:

@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from hw.calibration import calibrated
 from hw.config import ConfigError
-from hw.hal import Array, Backend, Policy, Scene, Task, Trace
+from hw.hal import Array, Backend, Policy, Scene, Surroundings, Task, Trace
 from hw.robot import Robot, load_robot
 from stack.backends import backend_kind, make_backend
 from stack.clock import RealTime, Schedule, WallClock
@@ -133,6 +133,7 @@ def run(
         if hasattr(pilot, "close"):
             stack.callback(pilot.close)
         stack.callback(body.close)
+        stack.callback(setattr, interrupt, "eager", False)  # a second Ctrl-C must not break off the closing
         push = getattr(body, "push", None)
         if push is None and _pushes(task):
             raise ConfigError(f"backend '{body.name}' cannot push the robot: drop the task's push setting")
@@ -148,7 +149,7 @@ def run(
         if assembly is not None:
             guard.note("system", assembly)
         estimator = Estimator(robot, load_odometry(robot))
-        look = None if scene is None or not simulated else body.look  # type: ignore[attr-defined]
+        look = None if scene is None or not simulated else cast(Surroundings, body).look
         director = Director(robot, guard, estimator, task, pilot, push, look)
         tally = _Tally()
         listeners: list[Listener] = [tally]

@@ -42,6 +42,8 @@ class Outcome(Enum):
     FATAL = "fatal"  # named, and the robot made safe
 
 
+# An encoder error leaves a joint without a position; batching leaves the loop without samples for most of its ticks;
+# after a step of the clock nobody knows how old a sample is. None of them can be walked on with.
 EXPECTED: dict[str, Outcome] = {
     **dict.fromkeys(STATUS_KINDS, Outcome.ABSORBED),
     **dict.fromkeys(("stuffed", "garbage", "echo", "split"), Outcome.ABSORBED),

@@ -166,10 +166,15 @@ def test_a_blocked_joint_is_let_go_soft_before_its_servo_shuts_down_and_the_robo
     assert rig.guard.phase is Phase.LOWERING
 
 
-@pytest.mark.parametrize("case", ["sagging", "moving", "for a moment", "soft gains"])
+@pytest.mark.parametrize("case", ["sagging", "moving", "for a moment", "soft gains", "hot"])
 def test_work_is_not_taken_for_a_block(case: str) -> None:
     rig = Rig(gain=0.4 if case == "soft gains" else 1.0).running()
-    rig.stuck[KNEE] = ROBOT.home[KNEE] - (0.25 if case == "sagging" else 0.5)
+    if case == "hot":
+        rig.temperature[KNEE] = ROBOT.limits.temperature - 0.1
+        rig.step(10)
+        assert {event.kind for event in rig.events} == {"derated"}
+        rig.events.clear()
+    rig.stuck[KNEE] = ROBOT.home[KNEE] - (0.25 if case == "sagging" else 0.4)
     if case == "moving":
         rig.change = lambda o: replace(o, velocity=np.full(N, 0.5))
     for _ in range(10):
@@ -177,7 +182,7 @@ def test_work_is_not_taken_for_a_block(case: str) -> None:
         if case == "for a moment":
             rig.stuck[KNEE] = ROBOT.home[KNEE]
             rig.step()
-            rig.stuck[KNEE] = ROBOT.home[KNEE] - 0.5
+            rig.stuck[KNEE] = ROBOT.home[KNEE] - 0.4
     assert rig.guard.phase is Phase.RUNNING
     assert rig.events == []
 

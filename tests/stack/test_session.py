@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import itertools
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -77,6 +79,22 @@ def test_it_homes_slowly_from_where_it_is():
     assert result.outcome == "succeeded"
     moves = np.abs(np.diff([command.position for command in body.sent[:40]], axis=0)).max()
     assert moves <= ROBOT.limits.homing_speed * ROBOT.dt + 1e-9
+
+
+def test_a_second_signal_while_connecting_does_not_break_off_the_closing():
+    class Slow(Simulated):
+        def connect(self):
+            os.kill(os.getpid(), signal.SIGINT)
+            raise AssertionError("the signal came too late")
+
+        def close(self):
+            os.kill(os.getpid(), signal.SIGINT)
+            super().close()
+
+    body = Slow(ROBOT)
+    with pytest.raises(KeyboardInterrupt):
+        stand(body)
+    assert body.closed
 
 
 def test_a_policy_that_raises_ends_safe_and_is_quoted():

@@ -38,11 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worlds", type=int, default=256, help="robots at a time (default: %(default)s)")
     parser.add_argument("--policy", default="expert", help="expert, gait, or a tracker's checkpoint (default: expert)")
     parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of an episode (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=15.0, help="of an episode (default: %(default)s)")
     parser.add_argument(
         "--randomise",
         type=float,
-        default=0.25,
+        default=0.2,
         metavar="SHARE",
         help="share of episodes on a randomised robot (default: %(default)s)",
     )
@@ -50,9 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--noise",
         type=float,
         nargs=2,
-        default=[0.5, 1.3],
+        default=[0.3, 0.8],
         metavar=("LOW", "HIGH"),
-        help="scale of an episode's action noise, drawn between these (default: 0.5 1.3)",
+        help="scale of an episode's action noise, drawn between these (default: 0.3 0.8)",
     )
     parser.add_argument("--plain-odometry", action="store_true", help="leg odometry without the learned correction")
     parser.add_argument("--seed", type=int, default=0)
