@@ -34,7 +34,7 @@ MIRRORING = "applied when read (policy.diffusion.dataset): each window also serv
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the dataset, to be created")
-    parser.add_argument("--frames", type=int, default=400_000, help="ticks to keep, at least (default: %(default)s)")
+    parser.add_argument("--frames", type=int, default=450_000, help="ticks to keep, at least (default: %(default)s)")
     parser.add_argument("--worlds", type=int, default=256, help="robots at a time (default: %(default)s)")
     parser.add_argument("--policy", default="expert", help="expert, gait, or a tracker's checkpoint (default: expert)")
     parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
