@@ -11,7 +11,8 @@ tests/stack/test_safety.py:
 3. Nothing is sent before `home`; nothing that a policy proposes is sent before `start`.
 4. A target that is not finite is never sent: the last goal holds, and after PATIENCE in a row the robot is damped.
 5. DAMPED and FAULT are final: DAMP, then OFF, and never ACTIVE again.
-6. Samples older than `stale` ticks, or that never came, end in FAULT; so do tilt beyond `tilt` and a servo's error.
+6. Samples older than `stale` ticks, or that never came, end in FAULT; so do a servo's error and, once the robot was
+   brought home, tilt beyond `tilt`.
 7. A stop that leaves time for it (Ctrl-C, the stop button, heat, a low supply, a blocked joint, a full disk, the end of
    a task) lowers a standing robot first. One that was not brought home, but holds the pose that it was found in, is not
    lowered: it hangs or lies.
@@ -38,7 +39,9 @@ from stack.limits import limit
 
 PATIENCE = 3  # targets in a row that may be not finite
 LOWER_SECONDS = 1.5
-DAMP_SECONDS = 0.4  # braked before torque goes off, so that the robot settles instead of dropping; off within 0.5
+# Braked before torque goes off, so that the robot settles instead of dropping. What is fatal must be off within 0.5 s:
+# that leaves 0.1 s for torque off to be acknowledged.
+DAMP_SECONDS = 0.4
 HOME_TOLERANCE = 0.35  # rad that a joint may be from home after homing: above any sag under the robot's own weight
 MIN_JERK_PEAK = 1.875  # peak over mean speed of a minimum-jerk motion (Flash and Hogan, 1985)
 
@@ -91,7 +94,7 @@ class Guard:
         self._events: list[Event] = []
         self._command = self._make(Mode.OFF)
         self._motion: Motion | None = None
-        self._stands = True  # so that it can be lowered
+        self._stands = True  # once it is home: so it is upright, and can be lowered
         self._rejected = 0
         self._damped_ticks = 0
         self._tick = 0  # of the newest decision
@@ -269,8 +272,9 @@ class Guard:
         self._accepted = self._tick
 
     def _check(self, observation: Observation, state: State | None) -> None:
-        """Act on what is wrong. On the way home the robot may hang from a hand, tilted."""
-        found = self._health.examine(observation, state, self.applied, upright=self.phase is not Phase.HOMING)
+        """Act on what is wrong. On the way home, or held as it was found, the robot may hang from a hand, tilted."""
+        upright = self._stands and self.phase is not Phase.HOMING
+        found = self._health.examine(observation, state, self.applied, upright=upright)
         for ends, kind, text, joint in found:
             if ends == "now" and self.phase not in ENDED:
                 self.fault(kind, text, joint)

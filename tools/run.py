@@ -10,6 +10,7 @@ import argparse
 import os
 import sys
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from hw.config import ConfigError
 from tools import exit_codes
 from tools.output import Report, add_json_argument, reporting
 from tools.parser import add_set_argument, settings
+from tools.prompt import confirm
 
 EXIT_CODES = {
     "succeeded": exit_codes.DONE,
@@ -89,7 +91,7 @@ def main(args: argparse.Namespace) -> int:
         )
         live = LiveLine(sys.stderr if args.json else sys.stdout)
         try:
-            result = run(plan, on_tick=live, confirm=_ask)
+            result = run(plan, on_tick=live, confirm=partial(confirm, remedy="give --start to let the robot move"))
         finally:
             live.close()
         files: dict[str, Any] = {"log": result.log}
@@ -126,12 +128,6 @@ def _default_log(task: str) -> Path:
     stem = f"{datetime.now():%Y%m%d-%H%M%S}-{task}"
     names = (Path("runs") / f"{stem}{end}.mcap" for end in ("", *(f"-{i}" for i in range(2, 1000))))
     return next(name for name in names if not name.exists())
-
-
-def _ask(text: str) -> None:
-    print(f"{text}. Enter to begin, Ctrl-C to leave: ", end="", file=sys.stderr, flush=True)
-    if not sys.stdin.readline():
-        raise ConfigError("nobody is there to press Enter: give --start to let the robot move")
 
 
 def _prepare_video(path: Path) -> None:

@@ -60,7 +60,7 @@ class VirtualBackend:
                 rig.control.furnish(self.stage.scene, self._seed, randomise=self._randomise)
             self._rig_truth = rig.truth(None if self.stage is None else self.stage.scene)
             self._clock.attach(rig)
-            self._body = DynamixelBackend(_on_the_board(self._robot), port=rig.port, clock=self.clock, name=self.name)
+            self._body = DynamixelBackend(on_the_board(self._robot), port=rig.port, clock=self.clock, name=self.name)
             handles = self._body.connect()
         except BaseException:
             self.close()
@@ -101,7 +101,7 @@ class VirtualBackend:
         return self._rig_truth.fetch()
 
 
-def _on_the_board(robot: Robot) -> Robot:
+def on_the_board(robot: Robot) -> Robot:
     """The robot with its IMU on the bus, mounted as it is: a virtual rig has no other."""
     return replace(robot, imu=replace(robot.imu, kind="opencr", port=None))
 

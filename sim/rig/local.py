@@ -11,6 +11,7 @@ from hw.dynamixel.motors import DynamixelMotors
 from hw.dynamixel.sensors import DynamixelSensors
 from hw.hal import Array, BackendError, Clock, Truth
 from hw.robot import Robot
+from sim.rig.backend import on_the_board
 from sim.rig.faults import Fault, Scenario
 from sim.rig.rig import Rig
 
@@ -78,7 +79,7 @@ class LocalBackend:
         rig.take_accepted()
         self._line = LocalLine(rig)
         self.clock: Clock = self._line
-        self._body = DynamixelBackend(rig.robot, port=self._line, clock=self._line, name=self.name)
+        self._body = DynamixelBackend(on_the_board(rig.robot), port=self._line, clock=self._line, name=self.name)
 
     @property
     def truth(self) -> Truth:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fake_body import FakeBody, StillEstimator, observation, spoiled
+from fake_body import FakeBody, StillEstimator, observation, spoiled, tilted
 
 from hw.hal import Mode
 from hw.robot import load_robot
@@ -23,9 +23,9 @@ class Held:
         self.tick = 0
         self.guard.hold(observation(ROBOT, 0, START))
 
-    def step(self, target: np.ndarray | None = None, temperature: float = 30.0) -> None:
+    def step(self, target: np.ndarray | None = None, temperature: float = 30.0, tilt: float = 0.0) -> None:
         self.tick += 1
-        seen = observation(ROBOT, self.tick * 20_000_000, self.body.position)
+        seen = tilted(observation(ROBOT, self.tick * 20_000_000, self.body.position), tilt)
         seen.temperature[:] = temperature
         self.guard.begin(self.tick, seen.time_ns)
         self.guard.decide(seen, self.estimator.update(seen, self.guard.applied), target)
@@ -44,6 +44,30 @@ def test_holding_moves_nothing_and_a_target_waits_for_start() -> None:
     held.step(np.zeros(N))
     moved = np.abs(held.body.sent[-1].position - START)
     assert 0.0 < moved.max() <= ROBOT.limits.joint_speed * ROBOT.dt + 1e-9
+
+
+@pytest.mark.parametrize("tilt", [1.6, np.pi])
+def test_a_held_robot_may_lie_or_hang_and_still_be_moved(tilt: float) -> None:
+    """It was not brought home, so that nobody expects it to be upright; one that was falls at the same tilt."""
+    held = Held()
+    held.step(tilt=tilt)
+    assert held.guard.phase is Phase.READY
+    held.guard.start()
+    for _ in range(20):
+        held.step(np.zeros(N), tilt=tilt)
+    assert held.guard.phase is Phase.RUNNING
+    assert np.abs(held.body.sent[-1].position - START).max() > 0.0
+
+    home = Guard(ROBOT, FakeBody(ROBOT))
+    home.home(observation(ROBOT, 0, ROBOT.home))
+    for tick in range(1, 10):
+        home.begin(tick, tick * 20_000_000)
+        upright = observation(ROBOT, tick * 20_000_000, ROBOT.home)
+        home.decide(upright, held.estimator.update(upright, ROBOT.home), None)
+    assert home.phase is Phase.READY
+    fallen = tilted(upright, tilt)
+    home.decide(fallen, held.estimator.update(fallen, ROBOT.home), None)
+    assert home.phase is Phase.FAULT
 
 
 @pytest.mark.parametrize("running", [False, True])

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 
 from hw.config import ConfigError, nearest
@@ -18,8 +19,8 @@ from hw.hal import Array, BackendError
 from hw.robot import Robot, load_robot
 from tools import exit_codes
 from tools.bringup.line import Line, add_line_arguments, is_virtual, open_line
-from tools.bringup.prompt import confirm
 from tools.output import Report, reporting
+from tools.prompt import confirm
 
 if TYPE_CHECKING:
     from hw.calibration import Calibration
@@ -57,6 +58,8 @@ def main(args: argparse.Namespace) -> int:
         path = args.out or (None if virtual else calibration_path(robot))
         chosen = _chosen(args.joint, robot)
         earlier = _earlier(path, robot, chosen)
+        if path is not None:
+            check_writable(path)
         reference = _reference(args.pose, robot)
         delivery = None
         if virtual:
@@ -199,6 +202,18 @@ def _chosen(names: list[str], robot: Robot) -> list[int]:
         if name not in robot.names:
             raise ConfigError(f"{robot.name} has no joint '{name}'; {nearest(name, robot.names)}")
     return [i for i, name in enumerate(robot.names) if not names or name in names]
+
+
+def check_writable(path: Path) -> None:
+    """Raise ConfigError where no file can be written beside `path`: else twenty joints are measured for nothing."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot be written: {error.strerror}: set XDG_CONFIG_HOME to a folder of yours, or give --out FILE"
+        ) from error
 
 
 def _earlier(path: Path | None, robot: Robot, chosen: list[int]) -> Calibration | None:

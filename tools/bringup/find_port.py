@@ -1,12 +1,13 @@
 """Find the serial port of the robot.
 
-Lists the USB serial ports. Where a person is watching it then waits for an adapter to be plugged in or unplugged, and
-says which one that was.
+Lists the USB serial ports. Where a person is watching it then waits for an adapter to be plugged in, or unplugged and
+plugged in again, and says which one that was.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from dataclasses import asdict
@@ -38,22 +39,12 @@ def main(args: argparse.Namespace) -> int:
             return _virtual(args, report)
         before = usb_ports()
         _show(before, report)
-        if args.port is not None and args.port not in before:
+        if args.port is not None and os.path.realpath(args.port) not in before:
             raise BackendError(f"{args.port}: no USB serial port of that name: plug it in, or leave --port out")
         wait = args.wait or (PATIENCE if sys.stdin.isatty() and not args.json else 0.0)
         changed = None
         if wait and args.port is None:
-            report.line()
-            report.line(f"Unplug the robot's adapter now, or plug it in ({wait:g} s; Ctrl-C leaves).")
-            changed = _change(before, wait)
-            if changed is None:
-                report.line("nothing changed: is it another cable, or one that only charges?")
-            else:
-                what, port = changed
-                report.line(f"{what}: {port.path} ({port.what})")
-                if port.name != port.path:
-                    report.line(f"its name, wherever it is plugged in: {port.name}")
-                report.line(f"next: servoid bringup scan --port {port.path}")
+            changed = _watch(before, wait, report)
         report.result(
             {
                 "ports": [asdict(port) for port in before.values()],
@@ -73,15 +64,36 @@ def _show(ports: dict[str, PortInfo], report: Report) -> None:
     )
 
 
-def _change(before: dict[str, PortInfo], seconds: float) -> tuple[str, PortInfo] | None:
-    """What came or went within so many seconds."""
+def _watch(before: dict[str, PortInfo], wait: float, report: Report) -> tuple[str, PortInfo] | None:
+    """Tell what comes or goes within `wait` s, and wait as long again for what went; returns the last of it."""
+    report.line()
+    report.line(f"Unplug the robot's adapter now, or plug it in ({wait:g} s; Ctrl-C leaves).")
+    changed = _change(before, wait)
+    if changed is not None and changed[0] == "unplugged":
+        gone = changed[1]
+        report.line(f"unplugged: {gone.path} ({gone.what}). Plug it in again ({wait:g} s; Ctrl-C leaves).")
+        others = {path: port for path, port in before.items() if path != gone.path}
+        changed = _change(others, wait, coming=True) or changed  # it may have another path now
+    if changed is None:
+        report.line("nothing changed: is it another cable, or one that only charges?")
+        return None
+    how, port = changed
+    report.line(f"plugged in: {port.path} ({port.what})" if how == "plugged in" else "it is still unplugged")
+    if port.name != port.path:
+        report.line(f"its name, wherever it is plugged in: {port.name}")
+    report.line(f"next: servoid bringup scan --port {port.path}")
+    return changed
+
+
+def _change(before: dict[str, PortInfo], seconds: float, *, coming: bool = False) -> tuple[str, PortInfo] | None:
+    """What came or went within so many seconds; what came alone, where it is `coming`."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         now = usb_ports()
         if came := now.keys() - before.keys():
             time.sleep(0.5)  # until udev has made its link and given permission
             return "plugged in", usb_ports().get(min(came), now[min(came)])
-        if gone := before.keys() - now.keys():
+        if not coming and (gone := before.keys() - now.keys()):
             return "unplugged", before[min(gone)]
         time.sleep(_POLL)
     return None

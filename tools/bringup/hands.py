@@ -7,8 +7,8 @@ from typing import Protocol
 
 from hw.robot import Robot
 from sim.rig.control import Control
-from tools.bringup.prompt import confirm
 from tools.output import Report
+from tools.prompt import confirm
 
 TURN = 0.35  # rad that the virtual rig's hands turn a joint by
 

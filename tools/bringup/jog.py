@@ -17,8 +17,8 @@ from hw.hal import Array, Backend, BackendError, Sensors
 from hw.robot import Robot
 from tools import exit_codes
 from tools.bringup.line import add_line_arguments, assembled, is_virtual
-from tools.bringup.prompt import confirm
 from tools.output import Report, reporting
+from tools.prompt import confirm
 
 if TYPE_CHECKING:
     from stack.loop import TickRecord
@@ -90,7 +90,7 @@ def _jog(
         )
     with ExitStack() as stack:
         interrupt = stack.enter_context(Interrupt())
-        source = There(args.by) if args.by is not None else stack.enter_context(Keys())
+        source = There(args.by, robot.dt) if args.by is not None else stack.enter_context(Keys())
         guard = Guard(restricted, motors)
         shown = _Shown(guard, i, args.joint, here, sys.stderr)
         pilot = JogPilot(restricted, guard, i, source)

@@ -48,7 +48,7 @@ class Source(Protocol):
 
 def restrict(robot: Robot, position: Array, i: int) -> Robot:
     """The robot for the guard of a jog: joint `i` within SPAN of `position` `(n_joints,)` rad and its own range, at
-    SPEED; the others where they are; and lying down allowed."""
+    SPEED; the others where they are."""
     margin = robot.limits.margin
     joints = []
     for number, (joint, here) in enumerate(zip(robot.joints, position.tolist(), strict=True)):
@@ -57,7 +57,7 @@ def restrict(robot: Robot, position: Array, i: int) -> Robot:
             low = min(here, max(here - SPAN, joint.range[0] + margin))
             high = max(here, min(here + SPAN, joint.range[1] - margin))
         joints.append(replace(joint, range=(low - margin, high + margin)))
-    limits = replace(robot.limits, joint_speed=SPEED, tilt=math.pi)
+    limits = replace(robot.limits, joint_speed=SPEED)
     return replace(robot, joints=tuple(joints), limits=limits)
 
 
@@ -107,10 +107,10 @@ class JogPilot:
 
 
 class There:
-    """Goes by an angle [rad], waits there, comes back, and ends."""
+    """Goes by an angle [rad], in ticks of `dt` [s], waits there, comes back, and ends."""
 
-    def __init__(self, by: float) -> None:
-        self._by = by
+    def __init__(self, by: float, dt: float) -> None:
+        self._by, self._near = by, SPEED * dt / 2  # half a tick's way
         self._start: float | None = None
         self._arrived: float | None = None
 
@@ -118,9 +118,9 @@ class There:
         if self._start is None:
             self._start = angle
         back = self._arrived is not None and seconds - self._arrived >= PAUSE_SECONDS
-        left = (self._start if back else self._start + self._by) - angle
-        if abs(left) > SPEED * 0.01:  # half a tick's way
-            return Wish.UP if left > 0.0 else Wish.DOWN
+        goal, way = (self._start, -self._by) if back else (self._start + self._by, self._by)
+        if math.copysign(1.0, way) * (goal - angle) > self._near:  # never turning round: it would swing about the goal
+            return Wish.UP if way > 0.0 else Wish.DOWN
         if back:
             return Wish.END
         if self._arrived is None:

@@ -16,9 +16,9 @@ from hw.robot import Robot, load_robot
 from hw.robot_checks import MAX_ID
 from tools import exit_codes
 from tools.bringup.line import add_line_arguments, is_virtual, open_line
-from tools.bringup.prompt import confirm
 from tools.bringup.scan import check_baud
 from tools.output import Report, reporting
+from tools.prompt import confirm
 
 if TYPE_CHECKING:
     from hw.dynamixel.bus import Bus

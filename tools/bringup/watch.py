@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
+from collections import deque
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 RATE = 20  # reads a second
 SHOW_SECONDS = 0.5  # between tables on a terminal
+_KEPT = 10_000  # times of reads that the statistics are of
 _SILENT = 1.0  # s after which a servo is said to be silent
 
 
@@ -67,7 +69,8 @@ class Watched:
         self._bus, self._robot, self._coast = bus, robot, Coast()
         self._clock = line.clock if isinstance(line.clock, WallClock) else RealTime(line.clock)
         self._before = dataclasses.replace(bus.counters)
-        self._times: list[float] = []  # ms that the reads took
+        self._reads = 0
+        self._times: deque[float] = deque(maxlen=_KEPT)  # ms that the newest reads took
         self._hottest: list[float] = [float("nan")] * len(found)
         self._lowest: list[float] = [float("nan")] * len(found)
         self._newest: Observation | None = None
@@ -77,18 +80,18 @@ class Watched:
         """Read for so long, or until KeyboardInterrupt; with a report, show a table now and then."""
         import numpy as np
 
-        count, every = 0, round(SHOW_SECONDS * RATE)
-        start = self._clock.now_ns()
-        while seconds is None or count <= seconds * RATE:
-            self._clock.sleep_until(start + round(count * 1e9 / RATE))
+        from stack.clock import Schedule
+
+        schedule, tick, every = Schedule(self._clock, RATE), -1, round(SHOW_SECONDS * RATE)
+        while seconds is None or tick + 1 <= seconds * RATE:
+            tick = schedule.wait().tick
             began = self._clock.now_ns()
             self._newest = observation = self._coast.update(self._sensors.read())
             self._times.append((self._clock.now_ns() - began) * 1e-6)
-            del self._times[:-10_000]
+            self._reads += 1
             self._hottest = np.fmax(self._hottest, observation.temperature).tolist()
             self._lowest = np.fmin(self._lowest, observation.voltage).tolist()
-            count += 1
-            if report is not None and count % every == 0:
+            if report is not None and self._reads % every == 0:
                 self.show(report, redraw=True)
 
     def show(self, report: Report, *, redraw: bool = False) -> None:
@@ -143,8 +146,8 @@ class Watched:
 
         now, before = self._bus.counters, self._before
         values: dict[str, Any] = {name: getattr(now, name) - getattr(before, name) for name in _names(now)}
-        p50, p99 = np.percentile(self._times or [0.0], [50, 99])
-        return {"reads": len(self._times), "read_ms_p50": float(p50), "read_ms_p99": float(p99)} | values
+        p50, p99 = np.percentile(list(self._times) or [0.0], [50, 99])
+        return {"reads": self._reads, "read_ms_p50": float(p50), "read_ms_p99": float(p99)} | values
 
 
 _UNITS = (("rad", 3), ("V", 1), ("V", 1), ("C", 0), ("C", 0), ("N m", 2))

@@ -24,6 +24,7 @@ from hw.dynamixel.tables import table
 from hw.hal import BackendError
 
 IDS = (1, 2, 3, 14)
+TORQUE = table("xm430-w350").item("torque_enable").address
 Spoil = Callable[[int, bytes], bytes]
 
 
@@ -41,6 +42,7 @@ class Servos(threading.Thread):
         self.packets: list[Packet] = []
         self.spoil: Spoil = lambda id, answer: answer
         self.delay = 0.0
+        self.deaf = 0  # writes of torque that nobody hears
         self.babble = b""
         self.over = False
         self.start()
@@ -60,6 +62,9 @@ class Servos(threading.Thread):
         word = int.from_bytes(p[:2], "little")
         length = int.from_bytes(p[2:4], "little")
         if packet.instruction == Instruction.SYNC_WRITE:
+            if word == TORQUE and self.deaf:
+                self.deaf -= 1
+                return
             for at in range(4, len(p), 1 + length):
                 self.memory[p[at]].write(word, p[at + 1 : at + 1 + length])
         elif packet.instruction in (Instruction.SYNC_READ, Instruction.READ):
@@ -171,11 +176,15 @@ def nothing_at_first(count: int) -> Spoil:
     ],
     ids=["lost", "late", "garbled", "babbling"],
 )
-def test_a_bad_line_is_insisted_on(servos: Servos, line: Lifeline, spoil: Spoil, delay: float, babble: bytes) -> None:
+def test_a_bad_line_is_insisted_on(
+    servos: Servos, line: Lifeline, tmp_path: Path, spoil: Spoil, delay: float, babble: bytes
+) -> None:
+    """One that loses the first torque off, too: whoever does not insist leaves the robot stiff."""
     line.hold()
-    servos.spoil, servos.delay, servos.babble = spoil, delay, babble
+    servos.spoil, servos.delay, servos.babble, servos.deaf = spoil, delay, babble, 1
     line.close()
     assert servos.torque() == [0] * len(IDS)
+    assert "4 of 4" in told(tmp_path)
 
 
 def test_an_alert_and_a_lit_led_do_not_hide_an_acknowledgement(servos: Servos, line: Lifeline, tmp_path: Path) -> None:

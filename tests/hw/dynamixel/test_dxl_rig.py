@@ -13,6 +13,7 @@ from hw.faults import LATE, TORQUE_LOST, WATCHDOG
 from hw.hal import Command, Mode, Observation
 from hw.robot import load_robot
 from sim.rig.faults import Fault
+from sim.rig.local import LocalLine
 from sim.rig.rig import Rig
 
 ROBOT = load_robot("op3")
@@ -21,45 +22,12 @@ STALE = 0.06  # s: three ticks, after which the guard damps
 KNEE = ROBOT.names.index("l_knee")
 
 
-class Line:
-    """A rig in the same process as a Port and a Clock."""
-
-    name = "rig"
-
-    def __init__(self, rig: Rig) -> None:
-        self.rig, self._heard = rig, b""
-        rig.wire.host_baud = ROBOT.bus.baud
-
-    @property
-    def baud(self) -> int:
-        return self.rig.wire.host_baud
-
-    def now_ns(self) -> int:
-        return self.rig.now_ns
-
-    def sleep_until(self, time_ns: int) -> None:
-        if time_ns > self.rig.now_ns:
-            self._heard += self.rig.advance(time_ns)
-
-    def set_baud(self, baud: int) -> None:
-        self.rig.wire.host_baud = baud
-
-    def write(self, data: bytes) -> None:
-        self.rig.host_sends(data)
-
-    def read(self) -> bytes:
-        heard, self._heard = self._heard, b""
-        return heard
-
-    def close(self) -> None: ...
-
-
 class Standing:
     """A rig that stands at home with torque on."""
 
     def __init__(self) -> None:
         self.rig = Rig(ROBOT)
-        self.line = Line(self.rig)
+        self.line = LocalLine(self.rig)
         self.backend = DynamixelBackend(ROBOT, port=self.line, clock=self.line)
         self.sensors: DynamixelSensors
         self.motors: DynamixelMotors

@@ -18,6 +18,7 @@ from hw.robot import load_robot
 from sim.model import build
 from sim.rig.control import LockedClock, RigProcess
 from sim.rig.delivery import Delivery
+from tools.bringup import calibrate
 from tools.bringup.calibrate import MOVED, check_range, turned
 from tools.bringup.encoders import Encoders
 from tools.bringup.turning import describe_turns
@@ -91,6 +92,26 @@ def test_on_a_virtual_rig_of_its_own_nothing_is_kept(rig: RigProcess, bringup: A
 def test_mistakes_on_the_command_line(bringup: Any) -> None:
     code, answer, _ = bringup("calibrate", "--port", "virtual", "--joint", "l_kneee")
     assert (code, "did you mean 'l_knee'" in answer["error"]) == (2, True)
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_anybody_measures(
+    bringup: Any, configuration: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or twenty joints are turned by hand, and what was measured is lost."""
+
+    def never(*_: Any, **__: Any) -> Any:
+        raise AssertionError("the robot is measured")
+
+    monkeypatch.setattr(calibrate, "open_line", never)
+    (configuration / "file").write_text("")
+    out = configuration / "file" / "op3.yaml"
+    code, answer, _ = bringup("calibrate", "--port", "virtual", "--out", str(out))
+    assert code == 2
+    assert f"{out}: cannot be written" in answer["error"]
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(configuration / "file"))
+    code, answer, _ = bringup("calibrate", "--port", "/dev/ttyUSB0")
+    assert code == 2
+    assert "set XDG_CONFIG_HOME to a folder of yours" in answer["error"]
 
 
 # What a person does --------------------------------------------------------------------------------------------------

@@ -31,17 +31,27 @@ def plugged(monkeypatch: pytest.MonkeyPatch) -> list[list[SimpleNamespace]]:
     [
         ([[BOARD, OTHER], [BOARD, OTHER], [BOARD, OTHER, U2D2]], "plugged in", "/dev/ttyUSB0"),
         ([[BOARD, OTHER, U2D2], [BOARD, U2D2]], "unplugged", "/dev/ttyUSB1"),
+        ([[BOARD, OTHER, U2D2], [BOARD, U2D2], [BOARD, U2D2], [BOARD, OTHER, U2D2]], "plugged in", "/dev/ttyUSB1"),
+        ([[BOARD, U2D2], [BOARD], [BOARD, OTHER]], "plugged in", "/dev/ttyUSB1"),  # the kernel names it anew
+        (
+            [[BOARD, OTHER, U2D2], [BOARD, OTHER], [BOARD], [BOARD, OTHER], [BOARD, OTHER, U2D2]],  # a whole hub
+            "plugged in",
+            "/dev/ttyUSB0",
+        ),
     ],
 )
 def test_the_adapter_that_came_or_went_is_the_one(
     plugged: list[list[SimpleNamespace]], bringup: Any, states: list[list[SimpleNamespace]], what: str, path: str
 ) -> None:
     plugged[:] = states
-    code, answer, err = bringup("find-port", "--wait", "5")
+    code, answer, err = bringup("find-port", "--wait", "1")
     assert code == 0
     assert [port["path"] for port in answer["ports"]] == sorted(p.device for p in states[0] if p is not BOARD)
     assert (answer["changed"]["how"], answer["changed"]["path"]) == (what, path)
     assert f"servoid bringup scan --port {path}" in err
+    went = len(states[1]) < len(states[0])
+    assert ("Plug it in again" in err) is went, "a port that was unplugged cannot be scanned"
+    assert ("still unplugged" in err) is (what == "unplugged")
 
 
 def test_a_change_that_does_not_come_is_said_and_no_error(plugged: list[list[SimpleNamespace]], bringup: Any) -> None:
@@ -56,6 +66,17 @@ def test_a_port_that_is_not_there_is_an_error(plugged: list[list[SimpleNamespace
     code, answer, _ = bringup("find-port", "--port", "/dev/ttyUSB7")
     assert code == 3
     assert "plug it in" in answer["error"]
+
+
+def test_a_port_may_be_given_by_the_name_that_stays(
+    plugged: list[list[SimpleNamespace]], bringup: Any, tmp_path: Path
+) -> None:
+    plugged[:] = [[U2D2]]
+    link = tmp_path / "usb-ROBOTIS_U2D2"
+    link.symlink_to(U2D2.device)
+    code, answer, _ = bringup("find-port", "--port", str(link))
+    assert code == 0, answer
+    assert [port["path"] for port in answer["ports"]] == ["/dev/ttyUSB0"]
 
 
 def test_verbs_without_a_port_say_which_are_there(plugged: list[list[SimpleNamespace]], bringup: Any) -> None:

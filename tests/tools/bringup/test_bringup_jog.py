@@ -5,14 +5,21 @@ from __future__ import annotations
 import os
 import threading
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from hw.dynamixel.bus import Bus
+from hw.hal import Observation
 from hw.robot import load_robot
 from sim.rig.control import RigProcess
+from sim.rig.local import LocalLine
+from sim.rig.rig import Rig
+from tools.bringup import watch
 from tools.bringup.jogging import IDLE_SECONDS, KEY_SECONDS, SPAN, SPEED, There, Wish, reach, restrict
+from tools.bringup.line import Line
 from tools.cli import main
 
 ROBOT = load_robot()
@@ -157,20 +164,27 @@ def test_limits_of_a_jog_leave_one_joint_a_little_room_and_the_others_none() -> 
             assert (low, high) == pytest.approx((here[i] - SPAN, here[i] + 0.1 - ROBOT.limits.margin))
         else:
             assert (low, high) == pytest.approx((here[i], here[i]))
-    assert robot.limits.joint_speed == SPEED
+    assert robot.limits == replace(ROBOT.limits, joint_speed=SPEED), "no other limit of the guard gives way"
 
 
-def test_there_and_back_ends_where_it_began() -> None:
-    source, angle, path = There(-0.1), 0.5, []
-    for tick in range(500):
-        wish = source.wish(tick * 0.02, angle)
+@pytest.mark.parametrize("by", [-0.1, 0.1025, -0.105, 0.349])
+@pytest.mark.parametrize(("rate", "missed"), [(10, 0), (20, 0), (33, 0), (50, 0), (50, 1), (50, 2), (200, 0)])
+def test_there_and_back_ends_where_it_began(rate: int, missed: int, by: float) -> None:
+    """Whatever a tick's way is, also that of a machine which misses ticks, the joint must not swing about its goal."""
+    source, angle, path = There(by, 1 / rate), 0.5, []
+    way = SPEED * (1 + missed) / rate
+    for tick in range(0, 10 * rate, 1 + missed):
+        wish = source.wish(tick / rate, angle)
         if wish is Wish.END:
             break
-        angle += wish.value * SPEED * 0.02
+        angle += wish.value * way
         path.append(angle)
     assert wish is Wish.END
-    assert min(path) == pytest.approx(0.4, abs=0.005)
-    assert path[-1] == pytest.approx(0.5, abs=0.005)
+    farthest = max(path, key=lambda angle: abs(angle - 0.5))
+    assert farthest == pytest.approx(0.5 + by, abs=way)
+    assert path[-1] == pytest.approx(0.5, abs=way)
+    moves = np.diff([0.5, *path])
+    assert np.count_nonzero(np.diff(np.sign(moves[moves != 0.0]))) == 1, "there and back"
 
 
 def test_a_burst_of_keys_moves_no_further_than_one_and_idleness_ends(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,6 +229,33 @@ def test_watch_shows_every_servo_and_what_the_bus_lost(rig: RigProcess, bringup:
     assert answer["bus"]["recovered"] > 0
     assert "encoder" in err
     assert torque(rig) == 0
+
+
+def test_watch_counts_more_reads_than_it_keeps_the_times_of(
+    rig: RigProcess, bringup: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or a bus that is watched for longer than some minutes seems to lose ever more of its answers."""
+    monkeypatch.setattr(watch, "_KEPT", 10)
+    assert bringup("watch", "--seconds", "1", *VIRTUAL)[1]["bus"]["reads"] == 21
+
+
+def test_watch_does_not_hurry_after_reads_that_it_missed() -> None:
+    """A terminal that was stopped for a second must not be followed by twenty reads in a burst."""
+    line = LocalLine(Rig(ROBOT))
+    watched = watch.Watched(Line(Bus(line, line), line, None), ROBOT)
+    watched._clock = line  # its own time, which no wall keeps
+    read, times = watched._sensors.read, []
+
+    def slow() -> Observation:
+        times.append(line.now_ns())
+        if len(times) == 5:
+            line.sleep_until(line.now_ns() + 1_000_000_000)
+        return read()
+
+    watched._sensors.read = slow  # type: ignore[method-assign]
+    watched.run(2.0, None)
+    assert np.diff(times).min() > 0.02e9
+    assert watched.summary()["bus"]["reads"] == pytest.approx(21, abs=1)
 
 
 def test_watch_says_which_servo_went_silent(rig: RigProcess, bringup: Any) -> None:
