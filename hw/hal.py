@@ -256,7 +256,7 @@ class Instruction:
 
     velocity: Array  # (..., 3) m/s forward, m/s left, rad/s: base, heading frame
     goal: Array | None = None  # (..., 2) m in the heading frame, from the base
-    text: str | None = None  # a sentence that says what to do; None for policies to go by the velocity
+    text: str | None = None  # a sentence that says what to do; None: go by the velocity; empty: by neither
     path: Array | None = None  # (n, 2) m in the heading frame: where to be at the next n ticks
     obstacles: Array | None = None  # (n, 5) in the heading frame: x, y, radius m, velocity m/s; to be kept clear of
     keyframes: Keyframes | None = None

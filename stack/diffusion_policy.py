@@ -22,6 +22,7 @@ from policy.checkpoint import read_header, resolve
 from policy.diffusion.config import check_fit
 from policy.diffusion.features import raw_row
 from policy.diffusion.settings import DiffusionSettings, load_settings
+from policy.text.captions import caption
 from stack.planner import Answer, InlinePlanner, Planner, ProcessPlanner
 from stack.trim import Trim
 
@@ -77,7 +78,10 @@ class DiffusionPolicy:
         self._applied.append(np.array(applied, dtype=float))  # what ran at the tick before
         tick = self._tick
         if self._trim is not None:
-            instruction = replace(instruction, velocity=self._trim(state, instruction.velocity))
+            # What is asked has its name before it is corrected: a little drift must not turn a walk into an arc.
+            asked = instruction.velocity
+            text = caption(asked) if instruction.text is None else instruction.text
+            instruction = replace(instruction, velocity=self._trim(state, asked), text=text)
         self._adopt(tick)
         if tick % self._replan == 0 and len(self._states) == self._history:
             meanwhile = [self._action(tick + i) for i in range(self._delay)]

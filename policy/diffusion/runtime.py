@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,7 @@ from policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise
 from policy.diffusion.sampler import Diverged, Guidance, Known, Sampler, classifier_free
 from policy.diffusion.schedule import DenoisingMatrix, cosine_signal
 from policy.diffusion.settings import DiffusionSettings
-from policy.text.captions import MOTIONS, motion_of
+from policy.text.captions import MOTIONS, caption, motion_of
 from policy.text.encoder import load_encoder
 
 # (trajectory, instruction) -> cost (batch,), as tasks define it
@@ -217,13 +216,16 @@ class Runtime:
         return first + cheapest
 
     def _text(self, instruction: Instruction, batch: int) -> Tensor | None:
-        """The encoded sentence `(batch, text size)`; where the task gives none, one that names the asked motion."""
-        if self._encoder is None:
+        """The encoded sentence `(batch, text size)`; where the task gives none, one that names the asked motion.
+
+        An empty one tells nothing: motion is then unconditional.
+        """
+        if self._encoder is None or instruction.text == "":
             return None
         if instruction.text is not None:
             sentences = [instruction.text] * batch
         elif instruction.velocity.ndim == 1:
-            sentences = [_sentence(*instruction.velocity.tolist())] * batch
+            sentences = [caption(instruction.velocity)] * batch
         else:
             sentences = [MOTIONS[i].phrasings[0] for i in motion_of(instruction.velocity)]
         for sentence in set(sentences) - self._read.keys():
@@ -248,12 +250,6 @@ class Runtime:
 def load_runtime(robot: Robot, settings: DiffusionSettings, cost: Cost | None = None) -> Runtime:
     """The runtime of the checkpoint that `settings` name, for `robot`. Raises ConfigError."""
     return Runtime(load(resolve(settings.checkpoint), robot), settings, robot.dt, cost)
-
-
-@lru_cache(maxsize=256)
-def _sentence(*twist: float) -> str:
-    """What names a twist, of which many plans in a row are asked."""
-    return MOTIONS[int(motion_of(np.array(twist)))].phrasings[0]
 
 
 def _repeat(instruction: Instruction, samples: int) -> Instruction:

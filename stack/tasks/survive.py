@@ -1,8 +1,10 @@
-"""Stay up, unconditionally: no cost guides the motion."""
+"""Stay up, unconditionally: no cost guides the motion, and no sentence names it."""
 
 from __future__ import annotations
 
-from hw.hal import Trace
+from dataclasses import replace
+
+from hw.hal import Instruction, Percept, State, Trace
 from stack.tasks.walk import Walk
 
 
@@ -11,6 +13,9 @@ class Survive(Walk):
 
     name = "survive"
     description = "stay up for a minute without guidance"
+
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
+        return replace(super().instruct(tick, state, percept), text="")
 
     def metrics(self, trace: Trace) -> dict[str, float]:
         return {"episode_ticks": float(len(trace.yaw)), **super().metrics(trace)}

@@ -16,8 +16,10 @@ from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.denoiser import Denoiser
 from policy.diffusion.features import Normaliser, raw_layout
 from policy.diffusion.settings import DiffusionSettings, GuidanceSettings
+from policy.text.captions import caption
 from stack.diffusion_policy import DiffusionPolicy, diffusion_policy
 from stack.planner import InlinePlanner
+from stack.trim import Trim
 
 ROBOT = load_robot()
 INSTRUCTION = Instruction(np.array([0.1, 0.0, 0.0]))
@@ -110,6 +112,18 @@ def test_a_late_plan_is_not_adopted_and_the_last_goes_on_by_its_tick() -> None:
     assert policy.adopted == [(4, 5), (12, 13)]
     assert policy.take_events() == ("the plan requested at tick 8 was not ready at 9: that of 4 goes on",)
     assert policy.take_events() == ()
+
+
+def test_a_motion_has_the_name_of_what_was_asked_not_of_its_correction() -> None:
+    spy = Spy()
+    policy = DiffusionPolicy(spy, history=4, replan=4, delay=2, trim=Trim(ROBOT.dt, rate=5.0))
+    turning = replace(state(0), angular_velocity=np.array([0.0, 0.0, 0.4]))
+    for tick in range(200):
+        policy.act(replace(turning, time_ns=tick * 20_000_000), np.full(20, 0.5), INSTRUCTION)
+    asked = spy.requests[-1].instruction
+    assert asked.velocity[2] < -0.2, "the correction"
+    assert caption(asked.velocity) != caption(INSTRUCTION.velocity)
+    assert asked.text == caption(INSTRUCTION.velocity)
 
 
 def test_the_last_action_is_held_when_plans_stop_coming_and_it_is_said_once() -> None:

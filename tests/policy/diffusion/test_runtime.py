@@ -19,6 +19,7 @@ from policy.diffusion.denoiser import Denoiser
 from policy.diffusion.features import Normaliser, Trajectory, raw_layout
 from policy.diffusion.runtime import Runtime
 from policy.diffusion.settings import DiffusionSettings, GuidanceSettings, load_settings
+from policy.text.encoder import load_encoder
 
 ROBOT = load_robot()
 SETTINGS = DiffusionSettings(steps=4, delay=2)
@@ -57,6 +58,19 @@ def test_the_same_request_and_seed_give_the_same_plan() -> None:
     np.testing.assert_array_equal(first.states, again.states)
     assert not np.array_equal(first.actions, runtime.plan(request(), 8).actions)
     assert not np.array_equal(first.actions, runtime.plan(request(tick=41), 7).actions)
+
+
+def test_an_empty_sentence_leaves_the_velocity_untold() -> None:
+    pytest.importorskip("wordllama")
+    runtime = Runtime(model(text="words", text_size=load_encoder("words").size), SETTINGS, ROBOT.dt)
+
+    def first(text: str | None, velocity: float) -> Array:
+        asked = replace(request(), instruction=Instruction(np.array([velocity, 0.0, 0.0]), text=text))
+        return runtime.plan(asked, 7).actions
+
+    assert not np.array_equal(first(None, 0.2), first(None, -0.1))
+    assert not np.array_equal(first("", 0.2), first(None, 0.2))
+    np.testing.assert_array_equal(first("", 0.2), first("", -0.1))
 
 
 def test_committed_actions_are_part_of_the_plan() -> None:
