@@ -48,23 +48,29 @@ class Forest(BaseTask):
     settings_type = ForestSettings
 
     def __init__(self, settings: ForestSettings, dt: float) -> None:
-        """Raises ConfigError for a goal inside a pillar."""
+        """Raises ConfigError for a start or a goal inside a pillar."""
         super().__init__(settings, dt)
+        self._require_room("start", np.zeros(2), "move the pillar")
         if settings.x is not None or settings.y is not None:
-            goal = np.array([settings.x or 0.0, settings.y or 0.0])
-            for x, y, radius in settings.places:
-                if np.hypot(*(goal - [x, y])) < radius + settings.field.body:
-                    raise ConfigError(
-                        f"forest: the goal at x={goal[0]:g}, y={goal[1]:g} is inside the pillar at x={x:g}, y={y:g},"
-                        f" or too near for a robot of {settings.field.body:g} m to each side: move the goal"
-                    )
+            self._require_room("goal", np.array([settings.x or 0.0, settings.y or 0.0]), "move the goal")
+
+    def _require_room(self, what: str, place: Array, remedy: str) -> None:
+        """Raise ConfigError where a pillar of the settings leaves the robot no room at `place` `(2,)` m."""
+        body = self.settings.field.body
+        for x, y, radius in self.settings.places:
+            if np.hypot(*(place - [x, y])) < radius + body:
+                raise ConfigError(
+                    f"forest: the {what} at x={place[0]:g}, y={place[1]:g} is inside the pillar at x={x:g}, y={y:g},"
+                    f" or too near for a robot of {body:g} m to each side: {remedy}"
+                )
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Draw goal and pillars. Raises ConfigError when so many do not fit."""
+        """Draw goal and pillars. Raises ConfigError when so many do not fit, or one stands where the goal is drawn."""
         s = self.settings
         self.goal: Array = np.array([s.depth + 2 * s.clearing, rng.uniform(-s.width / 4, s.width / 4)])
         if s.x is not None or s.y is not None:
             self.goal = np.array([s.x or 0.0, s.y or 0.0])
+        self._require_room("goal", self.goal, "move the pillar, or fix the goal by x and y")
         self.pillars: Array = np.array(s.places, dtype=float).reshape(-1, 3)
         if not len(self.pillars):
             self.pillars = self._draw(rng)
@@ -72,12 +78,13 @@ class Forest(BaseTask):
 
     def _draw(self, rng: np.random.Generator) -> Array:
         s, found = self.settings, np.zeros((0, 3))
+        room = max(s.clearing, s.pillar_radius + s.field.body)  # whatever the clearing, the robot fits in at both ends
         for _ in range(_TRIES):
             if len(found) == s.pillars:
                 return found
             place = np.array([s.clearing + rng.uniform(0.0, s.depth), rng.uniform(-s.width / 2, s.width / 2)])
             ends = np.linalg.norm(np.stack([place, place - self.goal]), axis=1)
-            if ends.min() > s.clearing and (np.linalg.norm(found[:, :2] - place, axis=1) > s.spacing).all():
+            if ends.min() > room and (np.linalg.norm(found[:, :2] - place, axis=1) > s.spacing).all():
                 found = np.vstack([found, [*place, s.pillar_radius]])
         raise ConfigError(
             f"forest: {s.pillars} pillars {s.spacing:g} m apart do not fit into {s.width:g} by {s.depth:g} m:"
@@ -119,13 +126,12 @@ class Forest(BaseTask):
         return not (trace.fallen or measures.touched(trace)) and self._distance(trace) <= self.settings.radius
 
     def metrics(self, trace: Trace) -> dict[str, float]:
-        reached = self._distance(trace) <= self.settings.radius
         return {
             "final_distance_m": self._distance(trace),
             "clearance_m": measures.clearance(trace),
             "touched": float(measures.touched(trace)),
             "path_m": measures.path_length(trace, step=0.48),
-            "seconds_to_goal": len(trace.yaw) * trace.dt if reached else float("nan"),
+            "seconds_to_goal": len(trace.yaw) * trace.dt if self.success(trace) else float("nan"),
         }
 
     def _distance(self, trace: Trace) -> float:

@@ -53,9 +53,7 @@ class Path(BaseTask):
         s, points = self.settings, self.points
         if percept.goal is not None:
             points = points + (percept.goal - points[-1])  # odometry has drifted by so much
-        # The robot is at the nearest point of the stretch that comes next: a path may cross itself.
-        stretch = points[self._at : self._at + round(2.0 * s.lookahead / _SPACING) + 1]
-        self._at += int(np.argmin(np.linalg.norm(stretch - state.displacement[:2], axis=1)))
+        self._at = self._walked(self._at, points, state.displacement[:2])
         along = self._at + np.round(s.speed * self.dt * np.arange(1, s.horizon + 1) / _SPACING).astype(int)
         path = to_heading(points[np.minimum(along, len(points) - 1)], state)
         target = to_heading(points[min(self._at + round(s.lookahead / _SPACING), len(points) - 1)], state)
@@ -79,28 +77,41 @@ class Path(BaseTask):
         return self._at >= len(self.points) - round(0.4 * self.settings.tolerance / _SPACING)
 
     def success(self, trace: Trace) -> bool:
-        """Never fallen, near the path on average, and at its end. The trace is in the odometry frame."""
-        error, end = self._errors(trace)
-        return not trace.fallen and max(error, end) <= self.settings.tolerance
+        """Never fallen, near the path on average, and at its end by way of it. The trace is in the odometry frame."""
+        error, end, left = self._errors(trace)
+        return not trace.fallen and max(error, end, left) <= self.settings.tolerance
 
     def metrics(self, trace: Trace) -> dict[str, float]:
-        error, end = self._errors(trace)
+        error, end, left = self._errors(trace)
         return {
             "path_error_m": error,
             "final_distance_m": end,
+            "left_m": left,
             "length_m": _SPACING * (len(self.points) - 1),
             "path_m": measures.path_length(trace, step=0.48),
         }
 
-    def _errors(self, trace: Trace) -> tuple[float, float]:
-        """Mean distance from the nearest point of the path, and distance from its end at the end [m]."""
+    def _walked(self, at: int, points: Array, place: Array) -> int:
+        """Index of the point that a robot at `place` `(2,)` m has come to, from that with index `at`.
+
+        It is the nearest one of the stretch that comes next: a path may cross itself, or end where it began.
+        """
+        stretch = points[at : at + round(2.0 * self.settings.lookahead / _SPACING) + 1]
+        return at + int(np.argmin(np.linalg.norm(stretch - place, axis=1)))
+
+    def _errors(self, trace: Trace) -> tuple[float, float, float]:
+        """Mean distance from the nearest point of the path; at the end, distance from its end, and what is left [m]."""
         if len(trace.displacement) == 0:
-            return float("inf"), float("inf")
+            return float("inf"), float("inf"), float("inf")
         places = trace.displacement[:, :2]
         if trace.goal is not None:
             places = places - (trace.goal - self.points[-1])
         nearest = [float(np.linalg.norm(self.points - place, axis=1).min()) for place in places]
-        return float(np.mean(nearest)), float(np.linalg.norm(places[-1] - self.points[-1]))
+        at = 0
+        for place in places:
+            at = self._walked(at, self.points, place)
+        left = _SPACING * (len(self.points) - 1 - at)
+        return float(np.mean(nearest)), float(np.linalg.norm(places[-1] - self.points[-1])), left
 
 
 def _layout(settings: PathSettings) -> Array:

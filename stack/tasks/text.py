@@ -74,7 +74,10 @@ class Text(BaseTask):
         return {"followed_share": self._followed(trace)}
 
     def _followed(self, trace: Trace) -> float:
-        """Share of the sentences that the mean measured motion followed; NaN for a run too short to tell."""
+        """Share of the sentences that the mean measured motion followed; NaN for a run cut too short to tell.
+
+        A sentence that a fall left no gait cycle for was not followed.
+        """
         every, cycle = round(self.settings.every / self.dt), round(self.settings.cycle / self.dt)
         verdicts = []
         for number, motion in enumerate(self._motions):
@@ -84,6 +87,8 @@ class Text(BaseTask):
                 rows = slice(first, first + cycles * cycle)
                 twist = np.array([*trace.velocity[rows, :2].mean(0), trace.yaw_rate[rows].mean()])
                 verdicts.append(followed(motion, twist))
+            elif trace.fallen:
+                verdicts.append(False)
         return float(np.mean(verdicts)) if verdicts else float("nan")
 
 

@@ -167,6 +167,17 @@ def test_forest_is_crossed_by_a_body_that_obeys(seed: int) -> None:
     through = replace(run, obstacles=np.broadcast_to([[*run.displacement[50, :2], 0.05]], (len(run.yaw), 1, 3)))
     assert not task.success(through)  # by the estimate alone: its base was inside a pillar
     assert not task.success(replace(run, displacement=run.displacement[:-200], obstacles=run.obstacles[:-200]))
+    assert task.metrics(run)["seconds_to_goal"] == pytest.approx(DT * len(run.yaw))
+    for failed in (replace(run, touched=True), replace(run, fallen=True)):  # there, but no success
+        assert np.isnan(task.metrics(failed)["seconds_to_goal"])
+
+
+def test_forest_leaves_room_at_both_ends_whatever_the_clearing() -> None:
+    task = load_task("forest", {"clearing": "0"})
+    for seed in range(40):
+        task.reset(np.random.default_rng(seed))
+        ends = np.stack([np.zeros(2), task.goal])
+        assert np.linalg.norm(task.pillars[:, None, :2] - ends, axis=-1).min() > 0.05 + 0.17
 
 
 def test_forest_tells_goal_and_pillars_in_the_heading_frame() -> None:
@@ -181,6 +192,13 @@ def test_forest_tells_goal_and_pillars_in_the_heading_frame() -> None:
 def test_forest_refuses_what_cannot_be() -> None:
     with pytest.raises(ConfigError, match=r"goal at x=1, y=0 is inside the pillar at x=1, y=0\.1"):
         load_task("forest", {"places": "1,0.1,0.05", "x": "1", "y": "0"})
+    with pytest.raises(ConfigError, match=r"start at x=0, y=0 is inside the pillar at x=0\.1, y=0"):
+        load_task("forest", {"places": "0.1,0,0.05"})
+    wall = ":".join(f"3.2,{y:g},0.1" for y in np.linspace(-0.6, 0.6, 5))  # wherever behind the forest the goal is drawn
+    with pytest.raises(
+        ConfigError, match=r"goal at x=3\.2, y=\S+ is inside the pillar at x=3\.2.*fix the goal by x and y"
+    ):
+        load_task("forest", {"places": wall}).reset(np.random.default_rng(0))
     task = load_task("forest", {"pillars": "200"})
     with pytest.raises(ConfigError, match=r"200 pillars 0\.3 m apart do not fit into 2\.2 by 2\.5 m"):
         task.reset(np.random.default_rng(0))
@@ -218,6 +236,10 @@ def test_obstacle_rolls_toward_the_robot_and_is_told_with_its_velocity() -> None
 # --- velocity
 
 
+def test_velocities_go_up_to_the_robots_top_speed() -> None:
+    assert load_settings("velocity").speed == (0.0, 0.4)  # as measured; configs/tasks/velocity.yaml says how
+
+
 def test_velocity_is_followed_over_the_ground() -> None:
     task = load_task("velocity", {"speed": "0.05:0.25"}, DT)
     run = drive(task, 183.0)
@@ -248,6 +270,22 @@ def test_path_is_followed_by_a_body_that_obeys(settings: dict[str, str]) -> None
     beside = replace(run, displacement=run.displacement + np.array([0.0, 0.3, 0.0]))
     assert not task.success(beside)
     assert not task.success(replace(run, displacement=run.displacement[: len(run.yaw) // 2]))  # only half of it
+
+
+@pytest.mark.parametrize(
+    "settings", [{"shape": "circle"}, {"shape": "waypoints", "waypoints": "0.8,0:0.8,0.8:0,0.8:0,0"}]
+)
+def test_a_closed_path_is_not_followed_by_standing_where_it_ends(settings: dict[str, str]) -> None:
+    task = load_task("path", settings, DT)
+    run = drive(task, 60.0)
+    assert task.success(run)
+    sway = 0.02 * np.sin(np.arange(len(run.yaw)))[:, None] * [1.0, 1.0, 0.0]
+    stood = replace(run, displacement=sway)
+    assert task.metrics(stood)["final_distance_m"] < 0.03
+    assert task.metrics(stood)["left_m"] > 0.9 * task.metrics(stood)["length_m"]
+    assert not task.success(stood)
+    back = np.concatenate([run.displacement[:200], run.displacement[200::-1]])  # out along it, and home the same way
+    assert not task.success(replace(run, displacement=back))
 
 
 def test_path_shapes() -> None:
@@ -319,6 +357,18 @@ def test_text_is_judged_by_the_measured_motion() -> None:
     assert task.metrics(failed)["followed_share"] == pytest.approx(5 / 6)
     assert not task.success(failed)
     assert np.isnan(task.metrics(replace(run, yaw=run.yaw[:50]))["followed_share"])
+
+
+def test_text_counts_what_a_fall_left_undone_as_not_followed() -> None:
+    """Else a robot that does one sentence and then falls would have done everything that it was told."""
+    task = load_task("text", {}, DT)
+    run = drive(task, 30.0, seed=2)
+    first = replace(run, velocity=run.velocity[:300], yaw=run.yaw[:300], yaw_rate=run.yaw_rate[:300])
+    assert task.metrics(first)["followed_share"] == 1.0  # cut short by a person, say
+    fell = replace(first, fallen=True)
+    assert task.metrics(fell)["followed_share"] == pytest.approx(1 / 6)
+    assert not task.success(fell)
+    assert task.metrics(replace(run, yaw=run.yaw[:50], fallen=True))["followed_share"] == 0.0
 
 
 def test_text_takes_a_sentence_and_refuses_an_empty_or_foreign_one() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from hw.config import ConfigError
 from tools.evaluate.cache import key
+from tools.evaluate.code import code
 
 SECONDS = 10.0
 SEED = 7_000_000  # of the first clip; demonstrations come from other streams
@@ -28,6 +29,7 @@ def recipe(robot: str) -> dict[str, Any]:
         "robot": fingerprint(load_robot(robot)),
         "seconds": SECONDS,
         "seed": SEED,
+        "code": code(),
     }
 
 

@@ -11,6 +11,7 @@ import yaml
 
 from hw.config import ConfigError
 from tools.evaluate.cache import key
+from tools.evaluate.code import code
 from tools.evaluate.rows import Run
 
 if TYPE_CHECKING:
@@ -110,43 +111,24 @@ def _diffusion_settings(policy: str) -> DiffusionSettings | None:
     return replace(settings, checkpoint=str(resolve(settings.checkpoint).resolve()))
 
 
-def task_spec(run: Run, seconds: float | None) -> dict[str, Any]:
-    """Everything about the task of a run that its episodes depend on, the code that judges them included.
-
-    Raises ConfigError for an unknown task or setting.
-    """
-    import sys
-
-    from policy.text import captions
-    from stack import tasks
-    from stack.provenance import described, sha256
-    from stack.tasks import approach, guidance, measures
-
-    classes = [cls for cls in tasks.task_class(run.task).__mro__ if cls.__module__.startswith("stack.")]
-    modules = [*(sys.modules[cls.__module__] for cls in classes), approach, captions, guidance, measures]
-    sources = {module.__name__: sha256(Path(str(module.__file__))) for module in modules}
-    return {
-        "task": run.task,
-        "settings": described(tasks.load_settings(run.task, dict(run.set))),
-        "seconds": seconds,
-        "sources": sources,
-    }
-
-
 def spec(
     run: Run, pilots: Pilots, robot: str, seed: int, seconds: float | None, clips: str | None
 ) -> Mapping[str, Any]:
     """What the episodes of a run depend on: the same spec, the same episodes. Raises ConfigError."""
     from hw.robot import load_robot
-    from stack.provenance import fingerprint, versions
+    from stack.provenance import described, fingerprint, versions
+    from stack.tasks import load_settings
 
     return {
-        "task": task_spec(run, seconds),
+        "task": run.task,
+        "settings": described(load_settings(run.task, dict(run.set))),
+        "seconds": seconds,
         "policy": pilots.fingerprint(run),
         "robot": fingerprint(load_robot(robot)),
         "backend": run.backend,
         "randomise": run.randomise,
         "seed": seed,
         "clips": clips,
+        "code": code(),
         "versions": versions(),
     }

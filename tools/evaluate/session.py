@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Any
 from hw.config import ConfigError
 from tools.crew import each
 from tools.evaluate.cache import EpisodeCache, key
-from tools.evaluate.episode import Job, do
+from tools.evaluate.episode import Job, do, episode_seed
 from tools.evaluate.pilots import Pilots, spec
 from tools.evaluate.rows import Row, Run
 from tools.evaluate.summary import Measured
-from tools.rollout import episode_seed
 
 if TYPE_CHECKING:
     from stack.session import Settings

@@ -154,6 +154,50 @@ def test_commands_that_train_networks_can_be_typed() -> None:
             assert args.minutes == 45
 
 
+def test_stabilisation_is_about_as_noisy_as_the_papers() -> None:
+    """Levels of other schedules do not compare: 3 of our 20 is far noisier than UniPhys's 3 of 50."""
+    import numpy as np
+
+    from policy.diffusion.schedule import cosine_signal
+    from policy.diffusion.settings import load_settings
+
+    theirs = np.sqrt(1.0 - cosine_signal(50)[3])
+    stable = [int(row.run.plan["stabilise"]) for row in ROWS if row.run.plan.get("stabilise", "0") != "0"]
+    for level in {load_settings("uniphys").stabilise, *stable}:
+        assert np.sqrt(1.0 - cosine_signal(20)[level]) == pytest.approx(theirs, rel=0.2)
+
+
+def test_rows_of_the_forest_that_are_compared_differ_in_their_network_alone() -> None:
+    trained = {row.name: row.run for row in ROWS if row.run.task == "forest" and row.run.network is not None}
+    assert {"cloc/reference", "cloc/horizon-16", "cloc/horizon-64", "cloc/actions-1"} <= trained.keys()
+    assert len({repr(run.plan) for run in trained.values()}) == 1
+    assert trained["cloc/reference"] == trained["cloc/actions-16"]  # trained once, measured once
+    for name, run in trained.items():
+        train = run.network.train if run.network is not None else None
+        same = [other for other, run in trained.items() if run.network is not None and run.network.train == train]
+        assert set(same) - {name} <= {"cloc/reference", "cloc/actions-16"}, same
+
+
+def test_without_rolling_nothing_goes_over_from_plan_to_plan() -> None:
+    rows = {row.name: row for row in ROWS}
+    none, both = rows["cloc/rolling-none"], rows["cloc/rolling-both"]
+    assert none.run.plan["schedule"] == "full_sequence"  # `rolling` from any level keeps the noise of each frame
+    assert "in full" in none.note
+    for key in ("replan", "delay"):
+        assert none.run.plan[key] == both.run.plan[key]
+
+
+def test_motion_is_measured_on_episodes_that_are_done_anyway_and_beside_the_expert() -> None:
+    rows = {row.name: row for row in ROWS}
+    for name, main in (("goal-far", "uniphys/goal-far"), ("velocity", "uniphys/velocity")):
+        for kind in ("floating", "jerk", "foot-slip"):
+            row, expert = rows[f"motion/{kind}-{name}"], rows[f"motion/{kind}-{name}-expert"]
+            assert row.run == rows[main].run
+            assert expert.run.policy == "expert"
+            assert (row.metric, row.published) == (expert.metric, None)
+            assert row.figure == Beside(expert.name, 1.2)
+
+
 def test_settings_of_the_planner_are_those_that_there_are() -> None:
     from hw.overrides import override
     from policy.diffusion.settings import DiffusionSettings
