@@ -7,11 +7,49 @@ import signal
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 Job = TypeVar("Job")
 Answer = TypeVar("Answer")
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class Worker:
+    """A process that does one job after the other. What is sent on `pipe` is a job, and then there is an answer."""
+
+    def __init__(self, work: Callable[[Any], Any]) -> None:
+        """`work` must be picklable."""
+        import multiprocessing as mp
+
+        context = mp.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs, work), daemon=True)
+        with _one_thread():
+            self._process.start()
+        theirs.close()
+
+    def answer(self) -> Any:
+        """Wait for the answer. Raises what the work raised, and RuntimeError when the process died."""
+        try:
+            done, answer = self.pipe.recv()
+        except (EOFError, OSError):
+            self._process.join(1.0)
+            raise RuntimeError(
+                f"a worker process died (exit code {self._process.exitcode}); is there enough memory? try fewer with"
+                " --workers"
+            ) from None
+        if not done:
+            raise answer
+        return answer
+
+    def kill(self) -> None:
+        """End the process, whatever it does."""
+        self._process.kill()  # a run takes a polite signal for a request to lower the robot first, and goes on
+        self._process.join()
+        self.pipe.close()
 
 
 def each(
@@ -35,13 +73,10 @@ def each(
 def _spread(
     work: Callable[[Job], Answer], jobs: Iterator[Job], workers: int, deadline: float | None
 ) -> Iterator[Answer]:
-    import multiprocessing as mp
     from multiprocessing.connection import wait
 
-    context = mp.get_context("spawn")
-    processes: list[Any] = []
-    busy: list[Connection] = []
-    free: list[Connection] = []
+    free: list[Worker] = []
+    busy: dict[Any, Worker] = {}  # by their pipes
     try:
         while True:
             while len(busy) < workers:
@@ -49,50 +84,26 @@ def _spread(
                     job = next(jobs)
                 except StopIteration:
                     break
-                if not free:
-                    ours, theirs = context.Pipe()
-                    processes.append(context.Process(target=_serve, args=(theirs, work), daemon=True))
-                    processes[-1].start()
-                    theirs.close()
-                    free.append(ours)
-                busy.append(free.pop())
-                busy[-1].send(job)
+                worker = free.pop() if free else Worker(work)
+                busy[worker.pipe] = worker
+                worker.pipe.send(job)
             if not busy:
                 return
-            ready = wait(busy, None if deadline is None else max(deadline - time.monotonic(), 0.0))
+            ready = wait(list(busy), None if deadline is None else max(deadline - time.monotonic(), 0.0))
             if not ready:
                 return
             for pipe in ready:
-                assert isinstance(pipe, Connection)
-                answer = _receive(pipe)
-                busy.remove(pipe)
-                free.append(pipe)
+                answer = busy[pipe].answer()
+                free.append(busy.pop(pipe))
                 yield answer
     finally:
-        for process in processes:
-            process.kill()  # a run takes a polite signal for a request to lower the robot first, and goes on
-            process.join()
-
-
-def _receive(pipe: Connection) -> Any:
-    """An answer. Raises what the work raised."""
-    try:
-        done, answer = pipe.recv()
-    except (EOFError, OSError):
-        raise RuntimeError("a worker process died; is there enough memory? try fewer with --workers") from None
-    if not done:
-        raise answer
-    return answer
+        for worker in (*free, *busy.values()):
+            worker.kill()
 
 
 def _serve(pipe: Connection, work: Callable[[Any], Any]) -> None:
-    """A worker: answer until the other end is gone. numpy and torch use one thread: the workers are the parallelism.
-
-    Ctrl-C is the parent's.
-    """
+    """The process of a worker: answer until the other end is gone. Ctrl-C is the parent's."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
     while True:
         try:
             job = pipe.recv()
@@ -107,3 +118,19 @@ def _serve(pipe: Connection, work: Callable[[Any], Any]) -> None:
                 error.add_note(traceback.format_exc())
             message = (False, error)
         pipe.send(message)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Processes that are started meanwhile calculate on one thread each: the workers are the parallelism. Libraries
+    look when they are loaded, and those that `work` imports are, before the first line of the process is ours."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -10,9 +10,9 @@ import pytest
 
 from hw.robot import load_robot
 from sim.rig.faults import EXPECTED
-from tools.bench.faults import QUICK, hung, summarise
+from tools.bench.faults import QUICK, lost, summarise
 from tools.bench.trial import Trial, Verdict, unsafe_goals
-from tools.bench.workers import work_all
+from tools.bench.workers import Lost, work_all
 from tools.cli import main
 
 ROBOT = load_robot()
@@ -37,7 +37,7 @@ def test_a_quick_campaign_goes_as_declared(capsys: pytest.CaptureFixture[str]) -
     assert set(result["per_fault"]) == set(QUICK)
     absorbed = sum(EXPECTED[kind].value == "absorbed" for kind in QUICK)
     wanted = {"runs": len(QUICK), "ended_running": absorbed, "ended_damped": len(QUICK) - absorbed}
-    wanted |= {"unsafe_goals": 0, "unnamed_faults": 0, "hangs": 0, "falls": 0}
+    wanted |= {"unsafe_goals": 0, "unnamed_faults": 0, "hangs": 0, "deaths": 0, "falls": 0}
     assert {key: result[key] for key in wanted} == wanted
     assert 1 <= result["worst_detection_ticks"] <= 10
     assert result["worst_off_seconds"] <= 0.5
@@ -55,24 +55,47 @@ def test_goals_are_judged_by_range_and_by_speed() -> None:
     assert unsafe_goals(ROBOT, [ON, off, goal(4, 0.5), goal(5, 1.5)]) == [], "it drives nothing"
 
 
-def test_what_hangs_or_dies_is_counted_and_the_rest_is_done() -> None:
+def nap(seconds: float) -> float:
+    time.sleep(seconds)
+    return seconds
+
+
+def fail(job: int) -> int:
+    if job == 1:
+        os._exit(3)
+    if job == 2:
+        raise ValueError("no such thing")
+    return job
+
+
+def test_what_hangs_is_counted_and_the_rest_is_done() -> None:
     began = time.monotonic()
-    done = dict(work_all(time.sleep, [0.01, 600.0, 0.01], 2, 2.0, start_seconds=30.0))
-    assert done == {0: None, 1: None, 2: None}
+    done = dict(work_all(nap, [0.01, 600.0, 0.02], 2, 2.0, start_seconds=30.0))
+    assert done == {0: 0.01, 1: Lost("hung", "did not end within 2 s"), 2: 0.02}
     assert time.monotonic() - began < 120.0
-    assert list(work_all(os._exit, [3], 1, 60.0)) == [(0, None)]
-    assert sorted(work_all(abs, [-1, -2, -3], 2, 60.0)) == [(0, 1), (1, 2), (2, 3)]
 
 
-def test_the_summary_counts_what_was_not_named_and_what_hung() -> None:
+def test_what_dies_says_so_and_does_not_count_as_hung() -> None:
+    done = dict(work_all(fail, [0, 1, 2, 3], 1, 60.0))
+    assert (done[0], done[3]) == (0, 3)
+    assert done[1].how == done[2].how == "died"
+    assert "exit code 3" in done[1].text
+    assert done[2].text == "ValueError: no such thing"
+
+
+def test_the_summary_counts_what_was_not_named_what_hung_and_what_died() -> None:
     late = Verdict("dead", 1, "fatal", named=True, detection_ticks=11, ended="damped", problems=["late"])
     good = Verdict("dead", 2, "fatal", named=True, detection_ticks=3, ended="damped", off_seconds=0.4)
     calm = Verdict("drop", 1, "absorbed")
-    result = summarise([late, good, calm, hung(Trial("drop", 2), 1.0)])
-    assert (result["unnamed_faults"], result["hangs"], result["ended_running"], result["ended_damped"]) == (1, 1, 1, 2)
+    stuck = lost(Trial("drop", 2), Lost("hung", "did not end within 1 s"))
+    gone = lost(Trial("dead", 3), Lost("died", "exit code -11"))
+    result = summarise([late, good, calm, stuck, gone])
+    assert (result["unnamed_faults"], result["ended_running"], result["ended_damped"]) == (1, 1, 2)
+    assert (result["hangs"], result["deaths"]) == (1, 1)
     assert result["worst_detection_ticks"] == 11
     assert result["per_fault"]["drop"]["hangs"] == 1
     assert "--fault dead --first 1: late" in result["problems"]
+    assert "--fault dead --first 3: exit code -11" in result["problems"]
 
 
 def test_an_unknown_fault_is_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 
 import pytest
 
+from hw.dynamixel import codec
 from hw.dynamixel.codec import Parser
 from tools.bench import fuzz, targets
-from tools.bench.streams import stream
+from tools.bench.streams import IDS, WIDTH, stream
 from tools.cli import main
 
 
@@ -53,3 +54,18 @@ def test_streams_repeat_themselves_and_reach_the_parsers() -> None:
     whole = sum(len(parser.feed(b"".join(stream(0, number)))) for number in range(300))
     assert whole > 300
     assert parser.bad_crc > 10
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_the_bus_takes_whole_answers_one_after_the_other(fast: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Answers that came before they were asked for are dropped unread, and nothing of the bus would be tried."""
+    monkeypatch.setattr(targets, "_BUS_EVERY", 1)
+    driver = targets.Driver()
+    (group,) = (group for group in driver._groups if group.fast == fast)
+    for value in range(3):
+        data = bytes([value] * WIDTH)
+        plain = b"".join(codec.status(id, 0, data) for id in IDS)
+        answer = codec.fast_status([(id, 0, data) for id in IDS]) if fast else plain
+        driver.take([answer[:50], answer[50:]])
+        assert all(group.fresh)
+        assert group.data == [data] * len(IDS)

@@ -31,6 +31,7 @@ def test_it_prints_one_row_for_each_network_runtime_and_kind_of_guidance(capfd: 
     ]
     chunked, rolling = load_settings(), load_settings("diffuse_cloc")
     assert result["ms_between_plans"] == pytest.approx(1000 * chunked.replan * 0.02)
+    assert len({(row["network"], row["call_median_ms"]) for row in rows}) == 2, "a call is the same in every runtime"
     for row in rows:
         settings = chunked if row["runtime"] == "chunked" else rolling
         assert row["engine"] == "torch"

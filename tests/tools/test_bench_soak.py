@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from types import SimpleNamespace
 
 import pytest
 
@@ -26,6 +27,16 @@ def test_a_walk_goes_on_over_a_line_that_loses_packets(capsys: pytest.CaptureFix
     assert result["ticks"] >= 100
     assert result["late_p99_ms"] >= result["late_p50_ms"] >= 0.0
     assert result["rss_end_mb"] > 0.0 < result["rig_rss_end_mb"]
+
+
+@pytest.mark.parametrize("outcome", ["fell", "succeeded"])
+def test_a_fall_that_the_guard_saw_is_a_fall(
+    outcome: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The truth is looked at once a second, and a run that fell ends before the next look."""
+    monkeypatch.setattr("stack.session.run", lambda *_, **__: SimpleNamespace(outcome=outcome, events=()))
+    assert main(["bench", "soak", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["fell"] == (outcome == "fell")
 
 
 def test_memory_is_that_of_the_process_asked_for() -> None:

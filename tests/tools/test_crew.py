@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -34,6 +35,11 @@ def stubborn(job: int) -> None:
 
 def swallow(job: int) -> None:
     raise KeyboardInterrupt
+
+
+def begun_with(job: int) -> str:
+    """The environment that this process was started with."""
+    return Path("/proc/self/environ").read_text()
 
 
 def test_every_job_is_answered_on_processes_of_their_own() -> None:
@@ -73,3 +79,13 @@ def test_an_error_comes_back() -> None:
 def test_a_process_that_dies_is_noticed(work: object) -> None:
     with pytest.raises(RuntimeError, match="died"):
         list(each(work, [1], 2))  # type: ignore[arg-type]
+
+
+def test_a_worker_calculates_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From its start: numpy and torch look when they are loaded. This process keeps what it has."""
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    (environment,) = each(begun_with, [1], 2)
+    assert {"OMP_NUM_THREADS=1", "OPENBLAS_NUM_THREADS=1"} <= set(environment.split("\0"))
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert "OPENBLAS_NUM_THREADS" not in os.environ

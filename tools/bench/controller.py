@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -26,6 +27,7 @@ PRIORITY = 70  # of the rig by SCHED_FIFO, above the controller's: real servos d
 _START_SECONDS = 60.0
 _END_SECONDS = 60.0
 _GUARDIAN_SECONDS = 5.0
+_FIGURES = re.compile(r".*  tick .*|\w+: \S+|\d+ ticks, .*|log: .*")  # that a run shows, and adds to how it ended
 
 
 @contextmanager
@@ -92,6 +94,8 @@ class Controller:
 
     def interrupt(self) -> int:
         """Ctrl-C, to its whole group. Returns the rig's time just before [ns]."""
+        with contextlib.suppress(BackendError, OSError):  # it has none yet, or none any more, or has ended by itself
+            self._guardian = self.guardian()
         mark = rig_time(self.rig)
         with contextlib.suppress(ProcessLookupError):  # it has ended by itself
             os.killpg(self.process.pid, signal.SIGINT)
@@ -116,8 +120,8 @@ class Controller:
     def last_words(self) -> str:
         """What was said last of how it ended."""
         lines = [line.strip() for line in self.errors().splitlines()]
-        told = [line for line in lines if line and "  tick " not in line and not line.startswith("log:")]
-        return "; ".join(told[:2]) or "nothing was said"
+        told = [line for line in lines if line and not _FIGURES.fullmatch(line)]
+        return "; ".join(told[-2:]) or "nothing was said"
 
     def close(self) -> None:
         if self.process.poll() is None:

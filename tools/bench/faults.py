@@ -2,8 +2,8 @@
 
 Each fault is declared as to be absorbed (the run goes on), named (in the log, with the servo) or fatal (named, and the
 robot damped and off; where the bus cannot be reached, stopped by the servos' watchdog). Each goal that a servo accepted
-is judged against the joint's range and speed by the rig's own record. A trial that does not end is killed and counted;
-any trial is repeated with --fault KIND --first SEED --seeds 1.
+is judged against the joint's range and speed by the rig's own record. A trial that does not end is killed and counted,
+and so is one whose process dies; any trial is repeated with --fault KIND --first SEED --seeds 1.
 """
 
 from __future__ import annotations
@@ -62,28 +62,26 @@ def campaign(report: Report, kinds: tuple[str, ...], seeds: range, args: argpars
 
     from hw.robot import load_robot
     from tools.bench.trial import Trial, Verdict, run_trial
-    from tools.bench.workers import work_all
+    from tools.bench.workers import Lost, work_all
 
     load_robot(args.robot)
     trials = [Trial(kind, seed, args.robot) for seed in seeds for kind in kinds]
     verdicts: list[Verdict] = []
     done = work_all(run_trial, trials, args.workers or os.cpu_count() or 1, args.deadline)
-    for number, verdict in tqdm(done, total=len(trials), unit="trial", mininterval=5.0):
-        if verdict is None:
-            verdict = hung(trials[number], args.deadline)
+    for number, result in tqdm(done, total=len(trials), unit="trial", mininterval=5.0):
+        verdict = lost(trials[number], result) if isinstance(result, Lost) else result
         verdicts.append(verdict)
         for problem in verdict.problems:
             report.line(f"{verdict.kind} --first {verdict.seed}: {problem}")
     return verdicts
 
 
-def hung(trial: Any, seconds: float) -> Any:
-    """The verdict on a trial that did not end."""
+def lost(trial: Any, loss: Any) -> Any:
+    """The verdict on a trial that hung or died."""
     from sim.rig.faults import EXPECTED
     from tools.bench.trial import Verdict
 
-    problems = [f"did not end within {seconds:g} s"]
-    return Verdict(trial.kind, trial.seed, EXPECTED[trial.kind].value, ended="hung", problems=problems)
+    return Verdict(trial.kind, trial.seed, EXPECTED[trial.kind].value, ended=loss.how, problems=[loss.text])
 
 
 def summarise(verdicts: list[Any]) -> dict[str, Any]:
@@ -103,6 +101,7 @@ def _figures(verdicts: list[Any]) -> dict[str, Any]:
         "unsafe_goals": sum(v.unsafe_goals for v in verdicts),
         "unnamed_faults": sum(_unnamed(v) for v in verdicts),
         "hangs": sum(v.ended == "hung" for v in verdicts),
+        "deaths": sum(v.ended == "died" for v in verdicts),
         "ended_running": sum(v.ended == "running" for v in verdicts),
         "ended_damped": sum(v.ended == "damped" for v in verdicts),
         "falls": sum(v.fell for v in verdicts),
@@ -116,7 +115,7 @@ def _figures(verdicts: list[Any]) -> dict[str, Any]:
 def _unnamed(verdict: Any) -> bool:
     from tools.bench.trial import DETECTION_TICKS
 
-    if verdict.expected == "absorbed" or verdict.ended == "hung":
+    if verdict.expected == "absorbed" or verdict.ended in ("hung", "died"):
         return False
     return not verdict.named or verdict.detection_ticks > DETECTION_TICKS
 
@@ -131,6 +130,7 @@ def _print(report: Report, result: dict[str, Any]) -> None:
         "unsafe_goals",
         "unnamed_faults",
         "hangs",
+        "deaths",
     )
     head += ("worst_detection_ticks", "worst_off_seconds", "not_as_declared")
     rows = [[kind, *(_cell(figures[key]) for key in head)] for kind, figures in result["per_fault"].items()]

@@ -101,8 +101,9 @@ def _run(args: argparse.Namespace, report: Report) -> None:
             except ConfigError as error:
                 skipped[f"{network.name}: {engine}"] = str(error)
                 continue
+            call_ms = _call_times(loaded, network.model, args.plans)
             for runtime, settings in runtimes.items():
-                rows += _time(network, engine, loaded, runtime, settings, robot, args.plans)
+                rows += _time(network, engine, loaded, runtime, settings, robot, args.plans, call_ms)
     peak = peak_gflops()
     for row in rows:
         row["peak_gflops"] = peak
@@ -133,15 +134,18 @@ def _time(
     settings: DiffusionSettings,
     robot: Robot,
     plans: int,
+    call_ms: list[float],
 ) -> list[dict[str, Any]]:
-    """Rows of one engine and runtime: unguided, and guided by each kind of gradient that the engine has."""
+    """Rows of one engine and runtime: unguided, and guided by each kind of gradient that the engine has.
+
+    `call_ms` are times of single calls, which are the same in all of them.
+    """
     from policy.diffusion.engines import REFERENCE
     from policy.diffusion.runtime import Runtime
     from stack.tasks import load_task
 
     cost = load_task("walk", dt=robot.dt).cost
     request = _request(robot, network.model.config.history, settings.delay)
-    call_ms = _call_times(loaded, network.model, plans)
     rows = []
     for gradient in (NONE, "analytic", "network") if engine == REFERENCE else (NONE, "analytic"):
         guided = gradient != NONE

@@ -84,7 +84,7 @@ def soak(report: Report, args: argparse.Namespace) -> dict[str, Any]:
         "minutes": watch.ticks / robot.rate / 60.0,
         "outcome": outcome,
         "stopped": outcome not in ("succeeded", "failed", "timed_out"),
-        "fell": watch.fell,
+        "fell": watch.fell or outcome == "fell",  # which may be between two looks at the truth
         "ticks": watch.ticks,
         "missed": watch.missed,
         "late_p50_ms": float(np.percentile(late, 50)),

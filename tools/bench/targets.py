@@ -137,24 +137,28 @@ class Driver:
             return
         began = self._line.time
         for group in self._groups:
-            self._line.pieces = list(pieces)
+            self._line.answer(pieces)
             self._bus.read_group(group)
-        self._line.pieces = list(pieces)
+        self._line.answer(pieces)
         self._bus.ping(1, tries=1)
         if self._line.time - began > 200_000_000:
             raise Unbounded(f"three exchanges took {(self._line.time - began) * 1e-9:.3f} s of the bus's time")
 
 
 class _Line:
-    """A port and a clock: after each write, every look finds the next piece."""
+    """A port and a clock: silent until something is asked, then every look finds the next piece of the answer."""
 
     name = "fuzz"
     baud = 2_000_000
 
     def __init__(self) -> None:
         self.time = 0
-        self.pieces: list[bytes] = []
+        self._pieces: list[bytes] = []
         self._asked = False
+
+    def answer(self, pieces: Sequence[bytes]) -> None:
+        """What comes after the next write. Before it, the bus would drop it as stray."""
+        self._pieces, self._asked = list(pieces), False
 
     def now_ns(self) -> int:
         return self.time
@@ -168,6 +172,6 @@ class _Line:
         self._asked = True
 
     def read(self) -> bytes:
-        return self.pieces.pop(0) if self._asked and self.pieces else b""
+        return self._pieces.pop(0) if self._asked and self._pieces else b""
 
     def close(self) -> None: ...

@@ -7,7 +7,7 @@ the events of the run and by what it raised.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -58,14 +58,11 @@ class Verdict:
     unsafe_goals: int = 0
     named: bool = False
     detection_ticks: int | None = None
-    ended: str = "running"  # or damped, or hung
+    ended: str = "running"  # or damped, hung, died
     fell: bool = False
     off_seconds: float | None = None
     problems: list[str] = field(default_factory=list)
     said: str = ""  # what named it
-
-    def row(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 class Witnessed(LocalBackend):
@@ -150,7 +147,6 @@ def run_trial(trial: Trial) -> Verdict:
     except BackendError as failure:
         error = str(failure)
     except Exception as failure:  # a bug, found by the campaign: reported with its seed
-        error = ""
         verdict.problems.append(f"{type(failure).__name__}: {failure}")
     _judge(verdict, robot, body, watch, outcome, error)
     return verdict
