@@ -49,9 +49,7 @@ def latents_in(path: Path, head: Mapping[str, Any], tensors: Mapping[str, Array]
         return None
     made = LatentActions.from_tensors(path, head[PREFIX], checkpoint.part(tensors, PREFIX), n)
     if made.size != planned:
-        raise CheckpointError(
-            f"{path}: plans {head['config']['action_size']} numbers a tick, its latents are {made.size}"
-        )
+        raise CheckpointError(f"{path}: plans {planned} numbers a tick, and its latents have {made.size}")
     return made
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -12,13 +13,19 @@ import pytest
 import torch
 
 from hw.config import ConfigError
+from hw.mirror import Mirror
 from hw.robot import load_robot
 from policy.checkpoint import read_header
 from policy.diffusion.checkpoint import load
 from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.dataset import Windows, read_recording
+from policy.diffusion.features import raw_mirror, raw_row
+from policy.diffusion.runtime import load_runtime
+from policy.diffusion.settings import load_settings
 from policy.latent.actions import load_latents, same_latents
 from tools.train import diffusion, latent
+from tools.train.fleet import Fleet
+from tools.train.planned import PlannedWalker
 from tools.train.recoded import recoded_survival
 from tools.train.survival import closed_loop_survival
 
@@ -92,11 +99,25 @@ def test_windows_hold_the_latents_of_each_tick_and_its_state(made: Path, synthet
         tick, row = 2, int(present) + 2
         raw, target = recording.raw[row], recording.action[row]
         if mirrored:
-            from hw.mirror import Mirror
-            from policy.diffusion.features import raw_mirror
-
             raw, target = raw_mirror(ROBOT)(raw), Mirror.joints(ROBOT)(target)
         np.testing.assert_allclose(actions[0, 3 + tick], latents.encode(raw, target), atol=1e-4)
+
+
+def driven_by_the_present_state(path: Path) -> None:
+    """Between two plans the fleet's latents are decoded with each tick's own state."""
+    fleet = Fleet(ROBOT, 2, None)
+    runtime = load_runtime(ROBOT, replace(load_settings(), checkpoint=str(path)))
+    walker, everything = PlannedWalker(fleet, runtime), np.ones(2, bool)
+    fleet.reset(everything)
+    walker.reset(everything)
+    then = raw_row(fleet.observe())
+    for tick in range(runtime.settings.delay + 3):
+        row = raw_row(fleet.observe())
+        target = walker.act(np.zeros((2, 3)))
+        planned = walker._plan[:, tick - walker._made]
+        np.testing.assert_array_equal(target, runtime.model.space.decode(row, planned))
+        fleet.step(target)
+    assert np.abs(target - runtime.model.space.decode(then, planned)).max() > 1e-3
 
 
 def test_a_diffusion_model_learns_to_plan_latents_and_carries_their_decoder(
@@ -110,6 +131,7 @@ def test_a_diffusion_model_learns_to_plan_latents_and_carries_their_decoder(
     assert model.config.action_size == 5
     assert model.config.action_horizon == 12
     assert same_latents(model.latents, load_latents(made, ROBOT))
+    driven_by_the_present_state(tmp_path / "best.safetensors")
     measured = closed_loop_survival(tmp_path / "best.safetensors", 0.5, 2, 0)
     assert 0.0 <= measured["survival"] <= 1.0
     # What was learned in one space does not go on in another.
