@@ -278,17 +278,21 @@ class PlanRequest:
 
     tick: int
     states: Array  # (history, state features), oldest first, the last one being now
-    actions: Array  # (history - 1 + delay, n_joints) rad: those applied after each past state, then those yet to run
+    actions: Array  # (history - 1 + delay, action size) of each past state's tick, then those yet to run; as in a Plan
     instruction: Instruction
     previous: Plan | None = None  # the plan that runs, for planners that go on from it
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A plan indexed by tick: `actions[i]` belongs to tick `tick + i`."""
+    """A plan indexed by tick: `actions[i]` belongs to tick `tick + i`.
+
+    Actions are joint targets [rad] or, where the planner's model has them, latents, which whoever runs the plan decodes
+    with the state of their own tick.
+    """
 
     tick: int
-    actions: Array  # (horizon, n_joints) rad
+    actions: Array  # (horizon, action size), action size: n_joints, or that of a latent
     states: Array  # (horizon, state features)
     path: Array  # (horizon, 2) m: predicted displacement in the heading frame of `tick`, to be drawn and logged
     seconds: float  # how long planning took

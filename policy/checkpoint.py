@@ -135,6 +135,11 @@ def _read(path: Path, tensors: bool) -> tuple[dict[str, Any], dict[str, Array]]:
     return head, arrays
 
 
+def part(tensors: Mapping[str, Array], name: str) -> dict[str, Array]:
+    """The tensors `name.*` of a file that holds several networks, without the prefix."""
+    return {key.removeprefix(f"{name}."): value for key, value in tensors.items() if key.startswith(f"{name}.")}
+
+
 def check(path: Path, head: Mapping[str, Any], kind: str, robot: Robot) -> None:
     """Refuse a checkpoint of another kind, joint order or rate. The robot's name may differ. Raises CheckpointError."""
     if head["kind"] != kind:

@@ -19,6 +19,11 @@ class Mlp:
     def __init__(self, layers: list[tuple[Array, Array]], mean: Array, std: Array) -> None:
         self.layers, self.mean, self.std = layers, mean, std
 
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Inputs, hidden units of each layer, outputs."""
+        return (self.layers[0][0].shape[0], *(len(bias) for _, bias in self.layers))
+
     def __call__(self, x: Array) -> Array:
         """Map `(..., inputs)` to `(..., outputs)`, float64."""
         y = ((x - self.mean) / self.std).astype(np.float32)
@@ -28,12 +33,23 @@ class Mlp:
                 y = np.where(y > 0, y, np.expm1(np.minimum(y, 0)))
         return y.astype(float)
 
-    def save(self, path: Path, head: Mapping[str, Any]) -> None:
-        """Write a checkpoint with header `head`. Raises CheckpointError."""
+    def to_tensors(self) -> dict[str, Array]:
+        """Its arrays by name, float32, as a checkpoint stores them."""
         tensors = {"mean": self.mean, "std": self.std}
         for i, (weight, bias) in enumerate(self.layers):
             tensors[f"{i}.weight"], tensors[f"{i}.bias"] = weight, bias
-        checkpoint.write(path, {name: value.astype(np.float32) for name, value in tensors.items()}, head)
+        return {name: value.astype(np.float32) for name, value in tensors.items()}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Array]) -> Mlp:
+        """Inverse of `to_tensors`. Raises KeyError where one is missing."""
+        count = sum(name.endswith(".weight") for name in tensors)
+        layers = [(tensors[f"{i}.weight"], tensors[f"{i}.bias"]) for i in range(count)]
+        return cls(layers, tensors["mean"], tensors["std"])
+
+    def save(self, path: Path, head: Mapping[str, Any]) -> None:
+        """Write a checkpoint with header `head`. Raises CheckpointError."""
+        checkpoint.write(path, self.to_tensors(), head)
 
     @classmethod
     def load(cls, path: Path, kind: str, robot: Robot, inputs: int) -> tuple[Mlp, dict[str, Any]]:
@@ -44,6 +60,4 @@ class Mlp:
             raise checkpoint.CheckpointError(
                 f"{path}: takes {len(tensors['mean'])} inputs, and this program's features are {inputs}; train it again"
             )
-        count = sum(name.endswith(".weight") for name in tensors)
-        layers = [(tensors[f"{i}.weight"], tensors[f"{i}.bias"]) for i in range(count)]
-        return cls(layers, tensors["mean"], tensors["std"]), head
+        return cls.from_tensors(tensors), head

@@ -4,6 +4,11 @@ A plan requested at tick k is adopted at tick k + delay and was made for the act
 late is not adopted: the last one goes on by its tick index. So a run does not depend on how fast the machine was. A
 planner that finds no plan, because guidance diverged for one, says why: the last plan goes on, and then its last action
 is held.
+
+What a plan's actions are is up to the model: joint targets, or latents. A latent is decoded here, at its own tick and
+with the state of that tick. What is asked with a request is in the same terms: targets that ran are encoded with the
+state that they were decided on, since the guard may have changed what was decoded; of those to come the plan has the
+latents, and nobody knows the states yet.
 """
 
 from __future__ import annotations
@@ -19,6 +24,7 @@ import numpy as np
 from hw.hal import Array, Instruction, Plan, PlanRequest, State
 from hw.robot import Robot
 from policy.checkpoint import read_header, resolve
+from policy.diffusion.actions import JOINT_TARGETS, ActionSpace, load_action_space
 from policy.diffusion.config import check_fit
 from policy.diffusion.features import raw_row
 from policy.diffusion.settings import DiffusionSettings, load_settings
@@ -37,16 +43,24 @@ class DiffusionPolicy:
     """
 
     def __init__(
-        self, planner: Planner, history: int, replan: int, delay: int, wait: bool = True, trim: Trim | None = None
+        self,
+        planner: Planner,
+        history: int,
+        replan: int,
+        delay: int,
+        wait: bool = True,
+        trim: Trim | None = None,
+        space: ActionSpace = JOINT_TARGETS,
     ) -> None:
         """`history` is the number of states that a request holds. With `wait` no plan is ever late: for simulation.
 
-        `trim` corrects the velocity that is asked of the planner.
+        `trim` corrects the velocity that is asked of the planner. `space` is what its plans call actions.
         """
         if not 0 <= delay <= replan:
             raise ValueError(f"delay must be 0 to replan ({replan} ticks), not {delay}")
         self._planner = planner
         self._history, self._replan, self._delay, self._wait, self._trim = history, replan, delay, wait, trim
+        self._space = space
         self._states: deque[Array] = deque(maxlen=history)
         self._applied: deque[Array] = deque(maxlen=history - 1)
         self.only: Container[int] | None = None  # requests in time in a recorded run, where it is repeated
@@ -60,7 +74,7 @@ class DiffusionPolicy:
         self._tick = 0
         self._states.clear()
         self._applied.clear()
-        self._hold: Array | None = None
+        self._target: Array | None = None  # the last one: what is held where no plan says more
         self._requested: int | None = None
         self._ended = self._refused = False
         self._events: list[str] = []
@@ -72,10 +86,13 @@ class DiffusionPolicy:
 
         Raises PlannerError when the planner cannot plan any more.
         """
-        if self._hold is None:
-            self._hold = np.array(applied, dtype=float)
-        self._states.append(raw_row(state))
-        self._applied.append(np.array(applied, dtype=float))  # what ran at the tick before
+        applied = np.array(applied, dtype=float)
+        if self._target is None:
+            self._target = applied
+        row = raw_row(state)
+        before = self._states[-1] if self._states else row
+        self._states.append(row)
+        self._applied.append(self._space.encode(before, applied))  # what ran at the tick before
         tick = self._tick
         if self._trim is not None:
             # What is asked has its name before it is corrected: a little drift must not turn a walk into an arc.
@@ -84,19 +101,22 @@ class DiffusionPolicy:
             instruction = replace(instruction, velocity=self._trim(state, asked), text=text)
         self._adopt(tick)
         if tick % self._replan == 0 and len(self._states) == self._history:
-            meanwhile = [self._action(tick + i) for i in range(self._delay)]
+            held = self._space.encode(row, self._target)
+            meanwhile = [held if self._over(tick) else self._action(tick + i) for i in range(self._delay)]
             actions = np.stack([*self._applied, *meanwhile])
             states = np.stack(self._states)
             self._planner.submit(PlanRequest(tick, states, actions, instruction, self.latest_plan))
             self._requested = tick
             self._adopt(tick)  # at once, when there is no delay
-        if self.latest_plan is not None and tick >= self._end and not self._ended:
+        if self.latest_plan is not None and self._over(tick) and not self._ended:
             self._ended = True
             self._events.append(
                 f"the plan of tick {self.latest_plan.tick} ended before another one came: its last action is held"
             )
         self._tick += 1
-        return self._action(tick)
+        if not self._over(tick):
+            self._target = self._space.decode(row, self._action(tick))
+        return self._target.copy()
 
     def take_events(self) -> tuple[str, ...]:
         """What a person should know of, since the last call: late plans, and plans that came to their end."""
@@ -107,11 +127,10 @@ class DiffusionPolicy:
         """End the planner."""
         self._planner.close()
 
-    @property
-    def _end(self) -> int:
-        """First tick after the running plan."""
-        assert self.latest_plan is not None
-        return self.latest_plan.tick + len(self.latest_plan.actions)
+    def _over(self, tick: int) -> bool:
+        """Whether no plan says anything of `tick`: there is none, or it has ended."""
+        plan = self.latest_plan
+        return plan is None or tick >= plan.tick + len(plan.actions)
 
     def _adopt(self, tick: int) -> None:
         """Take over the plan that is due at `tick`."""
@@ -136,10 +155,8 @@ class DiffusionPolicy:
         return "the goal is held" if self.latest_plan is None else f"that of {self.latest_plan.tick} goes on"
 
     def _action(self, tick: int) -> Array:
-        """What runs at `tick` by the running plan."""
-        if self.latest_plan is None:
-            assert self._hold is not None
-            return self._hold.copy()
+        """The action of `tick` by the running plan, or its last one."""
+        assert self.latest_plan is not None
         actions = self.latest_plan.actions
         return np.array(actions[min(tick - self.latest_plan.tick, len(actions) - 1)])
 
@@ -159,19 +176,20 @@ def diffusion_policy(
     settings = settings or load_settings()
     path = resolve(settings.checkpoint)
     settings = replace(settings, checkpoint=str(path))
+    _check(robot, settings)  # here, with a plain error, rather than in the planner's process
+    space = load_action_space(path, robot)
     planner: Planner
     if process:
-        _check(robot, settings)
         planner = ProcessPlanner(partial(_build, robot, settings, cost))
     else:
         planner = InlinePlanner(_build(robot, settings, cost))
     history = int(read_header(path)["config"]["history"])
     trim = Trim(robot.dt, settings.trim) if settings.trim else None
-    return DiffusionPolicy(planner, history, settings.replan, settings.delay, wait=not process, trim=trim)
+    return DiffusionPolicy(planner, history, settings.replan, settings.delay, wait=not process, trim=trim, space=space)
 
 
 def _check(robot: Robot, settings: DiffusionSettings) -> None:
-    """Refuse here, with a plain error, what the planner process would refuse."""
+    """Refuse what the planner would refuse. Raises ConfigError."""
     path = resolve(settings.checkpoint)
     config = check_fit(path, read_header(path), robot)
     settings.check(config)

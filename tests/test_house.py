@@ -22,7 +22,10 @@ BELOW: dict[str, set[str]] = {
     "tools": {"hw", "sim", "policy", "stack"},
 }
 # Where a heavy library may be imported as soon as its module is; elsewhere it waits inside a function.
-HEAVY = {"torch": "policy/diffusion/", "mujoco": "sim/"}
+HEAVY = {
+    "torch": ("policy/diffusion/", "policy/latent/network.py", "policy/latent/demonstrations.py"),
+    "mujoco": ("sim/",),
+}
 LONGEST = 400  # lines of a file
 MODULE_NAME = re.compile(rf"({'|'.join(BELOW)})(\.\w+)+")
 

@@ -50,6 +50,7 @@ VERBS: dict[str, Verb] = {
         verbs={
             "expert": Verb("PPO: the tracker of references", "tools.train.expert"),
             "odometry": Verb("the correction of leg odometry", "tools.train.odometry"),
+            "latent": Verb("latent actions, which the diffusion model may plan in", "tools.train.latent"),
             "diffusion": Verb("the diffusion planner-controller", "tools.train.diffusion"),
         },
     ),

@@ -14,9 +14,11 @@ from hw.hal import Array
 from hw.robot import Robot
 from policy import checkpoint
 from policy.checkpoint import CheckpointError
+from policy.diffusion.actions import JOINT_TARGETS, PREFIX, ActionSpace, latents_in
 from policy.diffusion.config import KIND, DenoiserConfig, check_fit
 from policy.diffusion.denoiser import Denoiser
 from policy.diffusion.features import Normaliser, raw_layout, token_layout
+from policy.latent.actions import LatentActions
 
 
 @dataclass(frozen=True)
@@ -27,10 +29,16 @@ class Model:
     states: Normaliser
     actions: Normaliser
     header: Mapping[str, Any]
+    space: ActionSpace = JOINT_TARGETS  # what the actions are that `actions` normalises
 
     @property
     def config(self) -> DenoiserConfig:
         return self.denoiser.config
+
+    @property
+    def latents(self) -> LatentActions | None:
+        """What its actions are, where they are no joint targets."""
+        return self.space if isinstance(self.space, LatentActions) else None
 
 
 def save(
@@ -45,8 +53,12 @@ def save(
     licence: str,
     results: Mapping[str, Any],
     training: Mapping[str, Any],
+    latents: LatentActions | None = None,
 ) -> None:
-    """Write `weights` (a denoiser's state_dict) and all that is needed to run them. Raises CheckpointError."""
+    """Write `weights` (a denoiser's state_dict) and all that is needed to run them. Raises CheckpointError.
+
+    `latents` are what its actions are where they are no joint targets.
+    """
     n = len(robot.joints)
     head = checkpoint.header(
         KIND,
@@ -58,10 +70,13 @@ def save(
         training=dict(training),
         raw_layout=raw_layout(n).to_header(),
         token_layout=token_layout(n).to_header(),
+        **({} if latents is None else {PREFIX: latents.describe(n)}),
     )
     tensors: dict[str, Array] = {f"denoiser.{k}": v.detach().float().cpu().numpy() for k, v in weights.items()}
     for name, normaliser in (("states", states), ("actions", actions)):
         tensors |= {f"{name}.{key}": value for key, value in normaliser.to_numpy().items()}
+    if latents is not None:
+        tensors |= {f"{PREFIX}.{key}": value for key, value in latents.to_tensors().items()}
     checkpoint.write(path, tensors, head)
 
 
@@ -70,14 +85,11 @@ def load(path: Path, robot: Robot) -> Model:
     head, tensors = checkpoint.read(path)
     denoiser = Denoiser(check_fit(path, head, robot))
     try:
-        denoiser.load_state_dict({k: torch.from_numpy(v) for k, v in _part(tensors, "denoiser").items()})
-        states, actions = (Normaliser.from_numpy(_part(tensors, name)).to_torch() for name in ("states", "actions"))
+        denoiser.load_state_dict({k: torch.from_numpy(v) for k, v in checkpoint.part(tensors, "denoiser").items()})
+        states, actions = (
+            Normaliser.from_numpy(checkpoint.part(tensors, name)).to_torch() for name in ("states", "actions")
+        )
     except (KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{path}: its tensors do not fit its own header: {error}") from error
     denoiser.eval().requires_grad_(False)
-    return Model(denoiser, states, actions, head)
-
-
-def _part(tensors: Mapping[str, Array], name: str) -> dict[str, Array]:
-    """The tensors `name.*`, without the prefix."""
-    return {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
+    return Model(denoiser, states, actions, head, latents_in(path, head, tensors, robot) or JOINT_TARGETS)

@@ -22,6 +22,7 @@ from hw.mirror import Mirror
 from hw.robot import Robot
 from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.features import Emphasis, Normaliser, raw_layout, raw_mirror, to_tokens
+from policy.latent.actions import LatentActions
 from policy.text.captions import MOTIONS, mirrored, motion_of
 from policy.text.encoder import load_encoder
 
@@ -141,14 +142,17 @@ class Windows:
         held_out: float = 0.02,
         emphasis: float = 0.0,
         seed: int = 0,
+        latents: LatentActions | None = None,
     ) -> None:
         """A share `held_out` of the episodes, evenly spread and at least one, is kept for validation.
 
-        `emphasis` of global states, drawn from `seed`: see `features.Emphasis`; 0 for none.
+        `emphasis` of global states, drawn from `seed`: see `features.Emphasis`; 0 for none. With `latents` actions are
+        the posterior means of what was demonstrated, each given the state of its tick, instead of joint targets.
         """
         self.config = config
         self.n_joints = len(robot.joints)
-        self._mirror_raw, self._mirror_action = raw_mirror(robot), Mirror.joints(robot)
+        self.latents = latents
+        self._mirror_raw = raw_mirror(robot)
         spans = recording.spans
         first, last = config.history - 1, config.horizon  # ticks needed before and after the present
         long = spans[spans[:, 1] - spans[:, 0] > first + last]
@@ -167,8 +171,10 @@ class Windows:
         if not len(self.training) or not len(self.validation):
             raise DatasetError(f"no command lasts for the {last} ticks that a window looks ahead; use longer ones")
         self._raw = torch.from_numpy(recording.raw)
-        self._action = torch.from_numpy(recording.action)
-        self._applied = torch.from_numpy(recording.applied)
+        self._action, self._applied = (
+            self._both_sides(recording.raw, targets, Mirror.joints(robot))
+            for targets in (recording.action, recording.applied)
+        )
         self.captions = Captions(recording.command, config.text) if config.text else None
         states, actions = self._fit()
         if emphasis:
@@ -181,6 +187,13 @@ class Windows:
         rows = np.concatenate([np.arange(a + before, b - after) for a, b in spans])
         return torch.from_numpy(rows[segment[rows] == segment[rows + after - 1]])
 
+    def _both_sides(self, raw: Array, targets: Array, mirror: Mirror) -> Tensor:
+        """Actions of all rows as they are and as a mirror shows them, `(2, rows, action size)` float32."""
+        sides = [targets, mirror(targets)]
+        if self.latents is not None:
+            sides = [_encoded(self.latents, *side) for side in zip((raw, self._mirror_raw(raw)), sides, strict=True)]
+        return torch.from_numpy(np.stack(sides))
+
     def _fit(self, samples: int = 20_000) -> tuple[Normaliser, Normaliser]:
         """Normalisation over a fixed draw of windows and their mirror images."""
         generator = torch.Generator().manual_seed(0)
@@ -191,23 +204,23 @@ class Windows:
         return Normaliser.fit(states), Normaliser.fit(actions)
 
     def _gather(self, present: Tensor, mirrored: Tensor) -> tuple[Tensor, Tensor]:
-        """Tokens and actions of windows in physical units; `mirrored` `(batch,)` bool."""
+        """Tokens and actions of windows, not normalised; `mirrored` `(batch,)` bool."""
         state_rows = present[:, None] + torch.from_numpy(self.config.state_ticks)
         action_rows = present[:, None] + torch.from_numpy(self.config.action_ticks)
         raw = self._raw[state_rows]
         # The past is what really ran; the future is what the expert would do.
         past = self.config.history - 1
-        actions = torch.cat([self._applied[action_rows[:, :past]], self._action[action_rows[:, past:]]], 1)
-        flip = mirrored[:, None, None]
-        raw = torch.where(flip, self._mirror_raw(raw), raw)
-        actions = torch.where(flip, self._mirror_action(actions), actions)
+        side = mirrored.long()[:, None]
+        ran, wanted = self._applied[side, action_rows[:, :past]], self._action[side, action_rows[:, past:]]
+        actions = torch.cat([ran, wanted], 1)
+        raw = torch.where(mirrored[:, None, None], self._mirror_raw(raw), raw)
         return to_tokens(raw, raw[:, past], self.n_joints), actions
 
     def draw(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor | None]:
         """A normalised training batch, each window mirrored with probability one half.
 
-        Shapes `(batch, state tokens, state size)`, `(batch, action tokens, n_joints)`, `(batch, text size)`; without
-        an encoder the last is None.
+        Shapes `(batch, state tokens, state size)`, `(batch, action tokens, action size)`, `(batch, text size)`;
+        without an encoder the last is None.
         """
         present = self.training[torch.randint(len(self.training), (batch,), generator=generator)]
         mirrored = torch.rand(batch, generator=generator) < 0.5
@@ -225,3 +238,10 @@ class Windows:
     def _encode(self, window: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         states, actions = window
         return self.states.encode(states), self.actions.encode(actions)
+
+
+def _encoded(latents: LatentActions, raw: Array, targets: Array, chunk: int = 16_384) -> Array:
+    """Latents `(rows, size)` float32 of all rows, so many at a time: hidden layers of all would fill the memory."""
+    parts = np.arange(chunk, len(raw), chunk)
+    pairs = zip(np.split(raw, parts), np.split(targets, parts), strict=True)
+    return np.concatenate([latents.encode(*pair).astype(np.float32) for pair in pairs])

@@ -192,6 +192,11 @@ class Normaliser:
         return x * self.std + self.mean
 
 
+def joints_seen(states: Normaliser) -> int:
+    """How many joints the tokens describe that `states` normalises."""
+    return (len(states.mean) - token_layout(0).size) // 2
+
+
 GLOBAL_FIELDS = ("displacement", "heading", "height", "velocity", "angular_velocity", "gravity")
 
 

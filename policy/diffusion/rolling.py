@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hw.hal import Array
 from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.features import Normaliser, to_tokens
+from policy.diffusion.features import Normaliser, joints_seen, to_tokens
 from policy.diffusion.schedule import DenoisingMatrix
 
 _FRAME = 2**31  # sets the noise of frames apart from what is drawn for a plan
@@ -29,7 +29,7 @@ class Previous:
 
     age: int
     states: Array  # (batch, horizon, raw size), the first one a tick ahead of those plans
-    actions: Array  # (batch, actions, n_joints) rad, the first one of those plans' tick
+    actions: Array  # (batch, actions, action size) as plans have them, the first one of those plans' tick
 
 
 def clean_start(
@@ -40,7 +40,7 @@ def clean_start(
     `present` `(batch, raw size)` is now; the plan is seen from there.
     """
     batch, age = len(present), previous.age
-    rows = to_tokens(previous.states[:, age:].astype(float), np.asarray(present, dtype=float), config.action_size)
+    rows = to_tokens(previous.states[:, age:].astype(float), np.asarray(present, dtype=float), joints_seen(states))
     clean_states = torch.zeros(batch, len(config.state_ticks), config.state_size)
     clean_actions = torch.zeros(batch, len(config.action_ticks), config.action_size)
     first = config.history

@@ -22,7 +22,7 @@ from hw.robot import Robot
 from policy.checkpoint import resolve
 from policy.diffusion.checkpoint import Model, load
 from policy.diffusion.engines import Engine, load_engine
-from policy.diffusion.features import Trajectory, raw_layout, to_raw, to_tokens
+from policy.diffusion.features import Trajectory, joints_seen, raw_layout, to_raw, to_tokens
 from policy.diffusion.keyframes import imputation, keyframe_tokens
 from policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise, seeded
 from policy.diffusion.sampler import Diverged, Guidance, Known, Sampler, classifier_free
@@ -105,9 +105,11 @@ class Runtime:
         """Plans of many robots at once, each with its own (seed, tick).
 
         `states` is `(batch, history, raw size)`, the present last; `actions` is `(batch, history - 1 + delay,
-        n_joints)`: those applied, then those that will run anyway. `previous` are the plans that run, None at first;
-        only the rolling schedule reads them. Returns joint targets `(batch, actions, n_joints)` from the present tick
-        on, and predicted raw rows `(batch, horizon, raw size)`, the first one tick ahead, in the odometry frame.
+        action size)`: those applied, then those that will run anyway, as the model has actions (`Model.space`).
+        `previous` are the plans that run, None at first; only the rolling schedule reads them. Returns actions
+        `(batch, actions, action size)` from the present tick on, joint targets [rad] or latents that are decoded with
+        the state of their own tick; and predicted raw rows `(batch, horizon, raw size)`, the first one tick ahead, in
+        the odometry frame.
         Batches of different size may differ in the last bits. Raises ValueError like `plan`.
         """
         self._check(states, actions)
@@ -136,29 +138,29 @@ class Runtime:
             future, now = slice(history, history + self.horizon), slice(history - 1, history - 1 + self.actions)
             tokens = self.model.states.decode(clean[0][chosen, future])
             predicted = to_raw(tokens, raw[:, -1], self._joints)
-            targets = self.model.actions.decode(clean[1][chosen, now])
-        return targets.numpy().astype(float), predicted.numpy()
+            planned = self.model.actions.decode(clean[1][chosen, now])
+        return planned.numpy().astype(float), predicted.numpy()
 
     def warm_up(self) -> None:
         """Plan once for nothing: the first call of a process takes many times longer than those that follow."""
         config = self.model.config
         states = np.zeros((1, config.history, raw_layout(self._joints).size))
-        actions = np.zeros((1, config.history - 1 + self.settings.delay, self._joints))
+        actions = np.zeros((1, config.history - 1 + self.settings.delay, config.action_size))
         with suppress(Diverged):  # a robot that is nowhere may well be out of bounds; a real plan will say so
             self.plan_batch(states, actions, Instruction(np.zeros(3), np.zeros(2)), [(0, 0)])
 
     @property
     def _joints(self) -> int:
-        return self.model.config.action_size
+        return joints_seen(self.model.states)
 
     def _check(self, states: Array, actions: Array) -> None:
         config, rows = self.model.config, raw_layout(self._joints).size
         if states.shape[1:] != (config.history, rows):
             raise ValueError(f"plan request: states are {states.shape[1:]}, ({config.history}, {rows}) are needed")
         past = config.history - 1
-        if actions.shape[2:] != (self._joints,) or not past <= actions.shape[1] < len(config.action_ticks):
+        if actions.shape[2:] != (config.action_size,) or not past <= actions.shape[1] < len(config.action_ticks):
             raise ValueError(
-                f"plan request: actions are {actions.shape[1:]}, ({past} past + delay, {self._joints}) are needed"
+                f"plan request: actions are {actions.shape[1:]}, ({past} past + delay, {config.action_size}) are needed"
             )
         if not (np.isfinite(states).all() and np.isfinite(actions).all()):
             raise ValueError("plan request: states or actions are not finite; was every sensor read?")

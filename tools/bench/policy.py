@@ -145,7 +145,7 @@ def _time(
     from stack.tasks import load_task
 
     cost = load_task("walk", dt=robot.dt).cost
-    request = _request(robot, network.model.config.history, settings.delay)
+    request = _request(robot, network.model, settings.delay)
     rows = []
     for gradient in (NONE, "analytic", "network") if engine == REFERENCE else (NONE, "analytic"):
         guided = gradient != NONE
@@ -207,7 +207,7 @@ def _networks(args: argparse.Namespace, robot: Robot) -> list[Network]:
     if args.shape != NONE:
         past, horizon, actions_to_come = _shape(args.shape)
         config = replace(model.config, history=past, horizon=horizon, actions=actions_to_come)
-        second = _made_up(config, model.states, model.actions)
+        second = replace(_made_up(config, model.states, model.actions), space=model.space)
         networks.append(Network(args.shape, second, _gflop(second)))
     return networks
 
@@ -234,7 +234,7 @@ def _made_up(config: Any, states: Any, actions: Any) -> Model:
     return Model(Denoiser(config).eval().requires_grad_(False), states, actions, {})
 
 
-def _request(robot: Robot, history: int, delay: int) -> PlanRequest:
+def _request(robot: Robot, model: Model, delay: int) -> PlanRequest:
     """A robot that stands at home."""
     from hw.hal import Instruction, PlanRequest
     from policy.diffusion.features import raw_layout
@@ -244,7 +244,8 @@ def _request(robot: Robot, history: int, delay: int) -> PlanRequest:
     row[layout.slice("displacement")] = 0.0, 0.0, robot.standing_height
     row[layout.slice("gravity")] = 0.0, 0.0, -1.0
     row[layout.slice("position")] = robot.home
-    states, actions = np.tile(row, (history, 1)), np.tile(robot.home, (history - 1 + delay, 1))
+    history, action = model.config.history, model.space.encode(row, robot.home)
+    states, actions = np.tile(row, (history, 1)), np.tile(action, (history - 1 + delay, 1))
     return PlanRequest(0, states, actions, Instruction(np.array([0.2, 0.0, 0.0]), np.array([1.0, 0.0])))
 
 

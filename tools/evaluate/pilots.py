@@ -40,9 +40,13 @@ class Pilots:
         path = self.network(run)
         if run.network is None or path is None or path.is_file():
             return None
-        if run.network.train is None:
-            return f"`servoid train diffusion` cannot make it; put one at {path}"
-        return f"`servoid train diffusion --data {data} --out {path.parent} {run.network.train}`"
+        options, before = run.network.train, ""
+        if run.network.latents:
+            latents = self._folder / "networks" / "latents" / "latent.safetensors"
+            options += f" --latent {latents}"
+            if not latents.is_file():
+                before = f"`servoid train latent --data {data} --out {latents.parent}`, then "
+        return f"{before}`servoid train diffusion --data {data} --out {path.parent} {options}`"
 
     def name(self, run: Run) -> str:
         """The policy of a run, as `servoid run --policy` takes it. Raises ConfigError for settings that do not fit."""

@@ -16,11 +16,12 @@ from hw.config import ConfigError
 class Network:
     """A network that is not shipped. `train` are the options of `servoid train diffusion` beside --data and --out.
 
-    None where that trains no such network yet.
+    With `latents` it plans latents, which `servoid train latent` makes first.
     """
 
     name: str
-    train: str | None
+    train: str
+    latents: bool = False
 
 
 @dataclass(frozen=True)

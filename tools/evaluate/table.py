@@ -36,11 +36,9 @@ def _survive(name: str, title: str, plan: Mapping[str, str], published: float, f
     return Row(f"uniphys/{name}", UNIPHYS, title, run, LENGTH, published, "of 3000 frames", figure)
 
 
-def _trained(row: Row, train: str | None, name: str | None = None) -> Row:
+def _trained(row: Row, train: str, name: str | None = None, latents: bool = False) -> Row:
     """The row with a network of its own, trained for 45 minutes, as the reference that it is compared with."""
-    network = Network(
-        name or row.name.replace("/", "-"), None if train is None else f"--minutes 45 --width 128 {train}"
-    )
+    network = Network(name or row.name.replace("/", "-"), f"--minutes 45 --width 128 {train}", latents)
     return replace(row, run=replace(row.run, network=network), quick=False)
 
 
@@ -137,6 +135,8 @@ _SAMPLING: tuple[Row, ...] = (
 # closed-loop measurement executes more actions of a plan than some of them have.
 _SHORT = "--horizon 32 --actions 16 --committed 0 --survival-worlds 0"
 
+_CAUSAL = "--horizon 32 --mask causal"  # UniPhys's: one token a frame, 32 of them
+
 _TRAINED: tuple[Row, ...] = (
     _forest("reference", "the reference of the rows below, horizon 32 and 16 actions", 0.96, _SHORT),
     _forest("horizon-16", "horizon 16 and 16 actions", 0.0, _SHORT.replace("32", "16")),
@@ -150,14 +150,26 @@ _TRAINED: tuple[Row, ...] = (
     _forest("attention-diffuser", "Diffuser's attention", 0.0, f"{_SHORT} --mask diffuser_local"),
     _trained(
         _survive("raw-action", "Episode length, causal attention, raw action", AUTOREGRESSIVE, 238.2, None),
-        "--horizon 32 --mask causal",
+        _CAUSAL,
     ),
     _trained(
         _survive("raw-action-unstable", "Episode length, raw action, without stabilisation", UNSTABLE, 58.0, None),
-        "--horizon 32 --mask causal",
+        _CAUSAL,
         "uniphys-raw-action",
     ),
-    _trained(_survive("latent-action", "Episode length, latent action", AUTOREGRESSIVE, 2320.3, None), None),
+    _trained(
+        _survive("latent-action", "Episode length, causal attention, latent action", AUTOREGRESSIVE, 2320.3, None),
+        _CAUSAL,
+        latents=True,
+    ),
+    _trained(
+        _survive(
+            "latent-action-unstable", "Episode length, latent action, without stabilisation", UNSTABLE, 148.2, None
+        ),
+        _CAUSAL,
+        "uniphys-latent-action",
+        latents=True,
+    ),
 )
 
 _TEXTS: tuple[Row, ...] = (

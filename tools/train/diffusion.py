@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import sys
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib import import_module
@@ -15,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hw.config import ConfigError
+from tools.train.timed import Survival, TimedTrainer, same_network
 
 if TYPE_CHECKING:
     import torch
@@ -23,11 +22,7 @@ if TYPE_CHECKING:
     from policy.diffusion.config import DenoiserConfig
     from policy.diffusion.dataset import Windows
 
-# From a checkpoint's path to what was measured; "survival" in it is the share of worlds that stayed up, 0 to 1.
-Survival = Callable[[Path], Mapping[str, float]]
-
-MEANS = ("minutes", "loss", "state_loss", "action_loss", "learning_rate", "tokens_per_s")
-COLUMNS = (*MEANS, "validation_action_loss", "survival", "velocity_error")
+MEANS = ("loss", "state_loss", "action_loss", "learning_rate", "tokens_per_s")
 OBJECTIVE = ("near_actions", "far_actions", "min_snr", "action_rate", "monotone")
 
 
@@ -61,6 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--minutes", type=float, default=d.minutes, help="training time; evaluations come on top")
     parser.add_argument("--resume", action=argparse.BooleanOptionalAction, default=True, help="continue in --out")
     parser.add_argument("--init", type=Path, help="checkpoint to begin from; its normalisation is kept")
+    parser.add_argument(
+        "--latent", type=Path, help="plan latents of this file (`servoid train latent`), not joint targets"
+    )
     parser.add_argument("--batch", type=int, default=d.batch)
     parser.add_argument("--learning-rate", type=float, default=d.learning_rate)
     parser.add_argument("--layers", type=int, default=2)
@@ -68,6 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--heads", type=int, default=4)
     parser.add_argument("--history", type=int, default=4, help="past and present states (ticks)")
     parser.add_argument("--horizon", type=int, default=16, help="ticks to come")
+    parser.add_argument("--actions", type=int, default=0, help="ticks to come with actions; 0: all of --horizon")
     parser.add_argument("--levels", type=int, default=20, help="noise levels")
     parser.add_argument("--text", default="words", help="encoder of instructions; empty: a model that takes none")
     parser.add_argument("--emphasis", type=float, default=5.0, help="of global states; 0: no projection")
@@ -99,23 +98,25 @@ def main(args: argparse.Namespace) -> int:
     from policy.diffusion.config import DenoiserConfig
     from policy.diffusion.dataset import Windows, read_recording
     from policy.diffusion.features import token_layout
+    from policy.latent.actions import load_latents
     from policy.text.encoder import load_encoder
 
     survival = _survival(args) if args.survival_worlds else None
     torch.set_num_threads(args.threads)
     robot = load_robot(args.robot)
-    shape = ("layers", "width", "heads", "history", "horizon", "levels", "mask", "text")
+    shape = ("layers", "width", "heads", "history", "horizon", "actions", "levels", "mask", "text")
     n = len(robot.joints)
+    latents = load_latents(args.latent, robot) if args.latent else None
     config = DenoiserConfig(
         token_layout(n).size * (2 if args.emphasis else 1),
-        n,
+        latents.size if latents else n,
         text_size=load_encoder(args.text).size if args.text else 0,
         **{name: getattr(args, name) for name in shape},
     )
     names = ("minutes", "batch", "learning_rate", "committed", "evaluate_every", "seed", "precision", *OBJECTIVE)
     settings = Settings(**{name: getattr(args, name) for name in names})
     recording = read_recording(args.data, robot)
-    windows = Windows(recording, robot, config, emphasis=args.emphasis, seed=args.seed)
+    windows = Windows(recording, robot, config, emphasis=args.emphasis, seed=args.seed, latents=latents)
     source = f"{args.data.resolve().name}: {len(recording.spans)} episodes, {len(recording.raw)} ticks"
     trainer = Trainer(windows, robot, config, settings, args.out, source, args.licence, survival)
     if not (args.resume and trainer.resume()) and args.init is not None:
@@ -137,12 +138,12 @@ def _survival(args: argparse.Namespace) -> Survival:
     return partial(measure, seconds=seconds, worlds=worlds, seed=args.seed, robot_name=args.robot)
 
 
-class Trainer:
-    """One run in one folder.
+class Trainer(TimedTrainer):
+    """Trains a denoiser; checkpoints hold the averaged network."""
 
-    `last.safetensors` is the newest averaged network, `best.safetensors` the one with the best closed-loop survival
-    (ties: the lower validation loss of the actions), `resume.pt` all that is needed to go on.
-    """
+    LOSS = "validation_action_loss"
+    COLUMNS = ("minutes", *MEANS, LOSS, "survival", "velocity_error")
+    PANELS = (("state_loss", "action_loss", LOSS), ("survival",), ("velocity_error",))
 
     def __init__(
         self,
@@ -163,10 +164,11 @@ class Trainer:
 
         if settings.committed > config.horizon:
             raise ConfigError(f"--committed {settings.committed} is longer than the horizon of {config.horizon} ticks")
+        super().__init__(out, settings.minutes, settings.evaluate_every, survival)
         self.objective = Objective(**{name: getattr(settings, name) for name in OBJECTIVE})
         torch.manual_seed(settings.seed)
         self.windows, self.robot, self.config, self.settings = windows, robot, config, settings
-        self.out, self.source, self.licence, self.survival = out, source, licence, survival
+        self.source, self.licence = source, licence
         self.network = Denoiser(config)
         self.average = Average(self.network, settings.average)
         self.optimiser = torch.optim.AdamW(
@@ -174,81 +176,38 @@ class Trainer:
         )
         self.signal = torch.as_tensor(cosine_signal(config.levels), dtype=torch.float32)
         self.generator = torch.Generator().manual_seed(settings.seed)
-        self.step = 0
-        self.seconds = 0.0  # of training, evaluations not counted
-        self.evaluated = 0.0  # training time at the last evaluation
-        self.best: tuple[float, float] | None = None  # survival, minus the validation loss
-        out.mkdir(parents=True, exist_ok=True)
 
     def begin_from(self, path: Path) -> None:
         """Take weights and normalisation of a checkpoint, to go on with other data. Raises ConfigError."""
         from policy.diffusion.checkpoint import load
+        from policy.latent.actions import same_latents
 
         model = load(path, self.robot)
         if model.config != self.config:
             raise ConfigError(f"{path}: another network than the options ask for: {model.config}")
+        if not same_latents(model.latents, self.windows.latents):
+            raise ConfigError(f"{path}: its actions are not those that --latent gives: use the same latents, or none")
         self.network.load_state_dict(model.denoiser.state_dict())
         self.average.weights = {name: p.detach().clone() for name, p in self.network.named_parameters()}
         self.windows.states, self.windows.actions = model.states, model.actions
 
-    # -- a run -----------------------------------------------------------------------------------------------------
-
-    def run(self) -> None:
-        """Train until the time is used up. Interrupted, it saves first what `resume` needs."""
-        from tqdm import tqdm
-
-        from tools.train.journal import Journal
-
-        budget = 60 * self.settings.minutes
-        every = 60 * self.settings.evaluate_every or math.inf
+    def _title(self) -> str:
         size = f"{self.network.parameter_count:,} parameters, {self.config.tokens} tokens"
-        windows = f"{len(self.windows.training):,} windows"
-        print(f"training {size} on {windows}, {self.settings.minutes:g} minutes, in {self.out}", file=sys.stderr)
-        with (
-            Journal(self.out, COLUMNS, self.step) as journal,
-            tqdm(total=round(budget), initial=round(self.seconds), unit="s", file=sys.stderr, mininterval=2) as bar,
-        ):
-            try:
-                while self.seconds < budget:
-                    due = max(self.evaluated + every - self.seconds, 0.0)
-                    self._train_for(min(budget - self.seconds, due, 10.0), journal, bar)
-                    if self.seconds - self.evaluated >= every and self.seconds < budget:
-                        self._evaluate(journal, bar)
-                if self.evaluated < self.seconds:
-                    self._evaluate(journal, bar)
-            except KeyboardInterrupt:
-                self.save()
-                print(f"interrupted: the same command goes on from step {self.step}", file=sys.stderr)
-                raise
+        actions = "latent actions" if self.windows.latents else "joint targets"
+        return f"{size} on {len(self.windows.training):,} windows with {actions}"
 
-    def _train_for(self, seconds: float, journal: Any, bar: Any) -> None:
-        """Train for about `seconds` and log the means."""
-        sums, steps, start = [0.0, 0.0], 0, time.perf_counter()
-        before = self.seconds
-        while self.seconds - before < seconds or not steps:
-            state_loss, action_loss = self._step()
-            sums = [sums[0] + state_loss, sums[1] + action_loss]
-            steps += 1
-            self.seconds = before + time.perf_counter() - start
-        elapsed = self.seconds - before
-        state_loss, action_loss = sums[0] / steps, sums[1] / steps
-        speed = steps * self.settings.batch * self.config.tokens / elapsed
-        journal.log(
-            self.step,
-            {
-                "minutes": self.seconds / 60,
-                "loss": state_loss + action_loss,
-                "state_loss": state_loss,
-                "action_loss": action_loss,
-                "learning_rate": self.optimiser.param_groups[0]["lr"],
-                "tokens_per_s": speed,
-            },
-        )
-        bar.update(round(self.seconds) - bar.n)
-        bar.set_postfix_str(
-            f"step {self.step}, states {state_loss:.3f}, actions {action_loss:.3f}, "
-            f"{1000 * elapsed / steps:.0f} ms/step, {speed:,.0f} tokens/s"
-        )
+    def _progress(self, losses: tuple[float, ...], steps_per_s: float) -> tuple[dict[str, float], str]:
+        state_loss, action_loss = losses
+        speed = steps_per_s * self.settings.batch * self.config.tokens
+        columns = {
+            "loss": state_loss + action_loss,
+            "state_loss": state_loss,
+            "action_loss": action_loss,
+            "learning_rate": self.optimiser.param_groups[0]["lr"],
+            "tokens_per_s": speed,
+        }
+        text = f"states {state_loss:.3f}, actions {action_loss:.3f}, {1000 / steps_per_s:.0f} ms/step"
+        return columns, f"{text}, {speed:,.0f} tokens/s"
 
     def _step(self) -> tuple[float, float]:
         import torch
@@ -256,9 +215,8 @@ class Trainer:
         from policy.diffusion.training import losses
 
         settings = self.settings
-        progress = min(1.0, self.seconds / (60 * settings.minutes))
         warm = min(1.0, (self.step + 1) / settings.warmup_steps)
-        rate = settings.learning_rate * warm * (0.5 + 0.5 * math.cos(math.pi * progress))
+        rate = settings.learning_rate * warm * (0.5 + 0.5 * math.cos(math.pi * self.share))
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         states, actions, text = self.windows.draw(settings.batch, self.generator)
@@ -276,30 +234,8 @@ class Trainer:
         self.step += 1
         return parts[0].item(), parts[1].item()
 
-    # -- evaluation ------------------------------------------------------------------------------------------------
-
-    def _evaluate(self, journal: Any, bar: Any) -> None:
-        """Save, measure loss and survival of the averaged network, and keep it when it is the best so far."""
-        loss = self._validation_loss()
-        last = self.out / "last.safetensors"
-        self._ship(last, {"validation_action_loss": loss})
-        self.save()
-        results: dict[str, float] = {"validation_action_loss": loss}
-        if self.survival is not None:
-            results |= {name: float(value) for name, value in self.survival(last).items()}
-        score = (results.get("survival", 0.0), -loss)
-        if better := self.best is None or score > self.best:
-            self.best = score
-            self._ship(self.out / "best.safetensors", results)
-        self.evaluated = self.seconds
-        self.save()
-        row = {name: value for name, value in results.items() if name in COLUMNS}
-        journal.log(self.step, {"minutes": self.seconds / 60, **row})
-        panels = [["state_loss", "action_loss", "validation_action_loss"], ["survival"], ["velocity_error"]]
-        journal.plot(self.out / "learning_curve.png", panels, x="minutes")
-        text = ", ".join(f"{name} {value:.4g}" for name, value in results.items())
-        note = " (best)" if better else ""
-        bar.write(f"step {self.step}, {self.seconds / 60:.1f} min: {text}{note}", file=sys.stderr)
+    def _held_out(self) -> dict[str, float]:
+        return {self.LOSS: self._validation_loss()}
 
     def _validation_loss(self, count: int = 1024) -> float:
         """Action loss of the averaged network on held-out windows, the same noise every time."""
@@ -317,8 +253,6 @@ class Trainer:
             objective = Objective(self.objective.near_actions, self.objective.far_actions)
             return losses(network, *given, objective)[1].item()
 
-    # -- files -----------------------------------------------------------------------------------------------------
-
     def _ship(self, path: Path, results: Mapping[str, float]) -> None:
         from policy.diffusion import checkpoint
 
@@ -333,60 +267,30 @@ class Trainer:
             licence=self.licence,
             results={"step": self.step, "minutes": round(self.seconds / 60, 2), **results},
             training=asdict(self.settings),
+            latents=self.windows.latents,
         )
 
-    def save(self) -> None:
-        """Write `resume.pt`, whole or not at all."""
+    def _state(self) -> dict[str, Any]:
+        return {
+            "config": asdict(self.config),
+            "network": self.network.state_dict(),
+            "average": self.average.weights,
+            "updates": self.average.updates,
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+            "states": [self.windows.states.mean, self.windows.states.std],
+            "actions": [self.windows.actions.mean, self.windows.actions.std],
+        }
+
+    def _restore(self, path: Path, saved: Mapping[str, Any]) -> None:
         import torch
 
-        path = self.out / "resume.pt"
-        part = path.with_suffix(".part")
-        torch.save(
-            {
-                "config": asdict(self.config),
-                "network": self.network.state_dict(),
-                "average": self.average.weights,
-                "updates": self.average.updates,
-                "optimiser": self.optimiser.state_dict(),
-                "generator": self.generator.get_state(),
-                "states": [self.windows.states.mean, self.windows.states.std],
-                "actions": [self.windows.actions.mean, self.windows.actions.std],
-                "step": self.step,
-                "seconds": self.seconds,
-                "evaluated": self.evaluated,
-                "best": list(self.best) if self.best else [],
-            },
-            part,
-        )
-        part.replace(path)
-
-    def resume(self) -> bool:
-        """Go on where the run in the folder stopped, if there is one. Raises ConfigError when it does not fit."""
-        import pickle
-
-        import torch
-
-        path = self.out / "resume.pt"
-        if not path.exists():
-            return False
-        try:
-            saved: dict[str, Any] = torch.load(path, weights_only=True)
-        except (RuntimeError, EOFError, OSError, pickle.UnpicklingError) as error:
-            raise ConfigError(f"{path}: cannot be resumed ({error}); use --no-resume or another --out") from error
-        ours = asdict(self.config)
-        changed = [f"{k} was {saved['config'].get(k)}, is {v}" for k, v in ours.items() if saved["config"].get(k) != v]
-        if changed:
-            what = "; ".join(changed)
-            raise ConfigError(f"{path}: another network ({what}); use its options, --no-resume or another --out")
+        same_network(path, asdict(self.config), saved["config"])
         ours_norm: list[torch.Tensor] = [self.windows.states.mean, self.windows.actions.mean]
         if any(not torch.equal(a, saved[k][0]) for k, a in zip(("states", "actions"), ours_norm, strict=True)):
-            raise ConfigError(f"{path}: trained on other data; use --no-resume or another --out")
+            raise ConfigError(f"{path}: trained on other data, or other latents; use --no-resume or another --out")
         self.network.load_state_dict(saved["network"])
         self.average.weights = saved["average"]
         self.average.updates = saved["updates"]
         self.optimiser.load_state_dict(saved["optimiser"])
         self.generator.set_state(saved["generator"])
-        self.step, self.seconds, self.evaluated = saved["step"], saved["seconds"], saved["evaluated"]
-        self.best = (saved["best"][0], saved["best"][1]) if saved["best"] else None
-        print(f"resumed at step {self.step}, {self.seconds / 60:.1f} minutes", file=sys.stderr)
-        return True

@@ -27,9 +27,10 @@ class PlannedWalker:
         self._history, self._horizon = runtime.model.config.history, runtime.actions
         self._tick = 0
         size = raw_layout(len(fleet.robot.joints)).size
+        self._space, width = runtime.model.space, runtime.model.config.action_size
         self._states = np.zeros((fleet.n, self._history, size), np.float32)  # newest last
-        self._applied = np.repeat(fleet.applied[:, None], self._history - 1, 1)
-        self._plan, self._made = np.repeat(fleet.applied[:, None], self._horizon, 1), 0
+        self._applied = np.zeros((fleet.n, self._history - 1, width))  # actions of all states but the newest
+        self._plan, self._made = np.zeros((fleet.n, self._horizon, width)), 0
         self._predicted: Array | None = None  # (n, horizon, raw size) by the plans that run; None before the first
         self._waiting: tuple[Array, Array] | None = None  # the plans that are not adopted yet
         self._requested = 0
@@ -64,14 +65,17 @@ class PlannedWalker:
             else:
                 self._plan, self._predicted, self._made = plan, predicted, tick
         self._tick += 1
-        return self._action(tick)
+        return self._space.decode(self._states[:, -1], self._action(tick))
 
     def _observe(self) -> None:
         """Take in the state, and what was applied at the tick before."""
-        row, applied = raw_row(self.fleet.state), self.fleet.applied
+        row, target = raw_row(self.fleet.state), self.fleet.applied
+        fresh = self._fresh
+        decided = np.where(fresh[:, None], row, self._states[:, -1])  # the state that the target was decided on
+        applied = self._space.encode(decided, target)
         self._states = np.concatenate([self._states[:, 1:], row[:, None]], 1)
         self._applied = np.concatenate([self._applied[:, 1:], applied[:, None]], 1)
-        if (fresh := self._fresh).any():
+        if fresh.any():
             self._states[fresh], self._applied[fresh] = row[fresh, None], applied[fresh, None]
             still = applied[fresh, None], row[fresh, None]
             self._plan = _with(self._plan, fresh, still[0])

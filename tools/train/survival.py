@@ -1,13 +1,21 @@
-"""Closed-loop survival of a diffusion checkpoint: what chooses the one to keep, instead of the loss."""
+"""Closed-loop survival of a network: what chooses the one to keep, instead of the loss."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hw.robot import load_robot
+
+if TYPE_CHECKING:
+    from hw.robot import Robot
+    from tools.collect.recorder import Driver
+    from tools.train.fleet import Fleet
 
 _CHANGE = 125  # ticks between commands
 
@@ -15,22 +23,33 @@ _CHANGE = 125  # ticks between commands
 def closed_loop_survival(
     checkpoint: Path, seconds: float, worlds: int, seed: int, robot_name: str = "op3"
 ) -> dict[str, float]:
-    """Run a checkpoint in `worlds` nominal worlds under changing velocity commands, all planned as one batch.
+    """Run a diffusion checkpoint in `worlds` nominal worlds, all planned as one batch: see `survival_of`.
 
-    Returns `survival`, the share of worlds that never fell, and `velocity_error`, the mean planar error [m/s] of
-    those, smoothed over a cycle, from 2 s after each command. Uses the settings of configs/policies/diffusion.yaml.
+    Uses the settings of configs/policies/diffusion.yaml.
     """
     from policy.diffusion.runtime import load_runtime
     from policy.diffusion.settings import load_settings
-    from stack.odometry import load_odometry
     from stack.tasks import load_task
-    from tools.train.fleet import Fleet
     from tools.train.planned import PlannedWalker
 
     robot, settings = load_robot(robot_name), replace(load_settings(), checkpoint=str(checkpoint))
     runtime = load_runtime(robot, settings, load_task("walk", {}, robot.dt).cost)
+    return survival_of(partial(PlannedWalker, runtime=runtime, seed=seed), robot, seconds, worlds, seed)
+
+
+def survival_of(
+    drive: Callable[[Fleet], Driver], robot: Robot, seconds: float, worlds: int, seed: int
+) -> dict[str, float]:
+    """Walk in `worlds` nominal worlds under changing velocity commands, the same ones for the same `seed`.
+
+    Returns `survival`, the share of worlds that never fell, and `velocity_error`, the mean planar error [m/s] of
+    those, smoothed over a cycle, from 2 s after each command.
+    """
+    from stack.odometry import load_odometry
+    from tools.train.fleet import Fleet
+
     fleet = Fleet(robot, worlds, load_odometry(robot), seed=seed)
-    walker, everything = PlannedWalker(fleet, runtime, seed), np.ones(worlds, bool)
+    walker, everything = drive(fleet), np.ones(worlds, bool)
     fleet.reset(everything)
     walker.reset(everything)
     command = np.zeros((worlds, 3))

@@ -202,6 +202,16 @@ def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done
     assert len(measured["t/far"].records) == 2
 
 
+def test_a_network_of_latents_wants_the_latents_first(tmp_path: Path) -> None:
+    run, pilots = Run("survive", network=Network("z", "--mask causal", latents=True)), Pilots("diffusion", tmp_path)
+    latents, command = tmp_path / "networks" / "latents" / "latent.safetensors", pilots.training(run)
+    last = f"`servoid train diffusion --data runs/walks --out {tmp_path}/networks/z --mask causal --latent {latents}`"
+    assert command == f"`servoid train latent --data runs/walks --out {latents.parent}`, then {last}"
+    latents.parent.mkdir(parents=True)
+    latents.touch()
+    assert pilots.training(run) == last
+
+
 def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path, done: list[Job]) -> None:
     run = Run("goal-near", episodes=1, network=Network("full", "--mask full"))
     row = Row("t/full", "T", "Full", run, Metric("success", share=True))

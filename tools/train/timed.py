@@ -1,0 +1,175 @@
+"""A training run of a given time, in a folder where it can be resumed, that keeps the best of its checkpoints."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from hw.config import ConfigError
+
+# From a checkpoint's path to what was measured; "survival" in it is the share of worlds that stayed up, 0 to 1.
+Survival = Callable[[Path], Mapping[str, float]]
+
+
+class TimedTrainer:
+    """One run in one folder; a trainer of a network says what a step is and what its files hold.
+
+    `last.safetensors` is the newest network, `BEST` the one with the best closed-loop survival (ties: the lower `LOSS`
+    on what was held out), `resume.pt` all that is needed to go on.
+    """
+
+    BEST: ClassVar[str] = "best.safetensors"
+    LOSS: ClassVar[str]
+    COLUMNS: ClassVar[tuple[str, ...]]  # of the log: "minutes", and all that is measured
+    PANELS: ClassVar[Sequence[Sequence[str]]]  # columns that are drawn, by picture
+
+    def __init__(self, out: Path, minutes: float, evaluate_every: float, survival: Survival | None) -> None:
+        """Minutes of training, evaluations not counted; `evaluate_every` 0: only at the end."""
+        self.out, self.minutes, self.evaluate_every, self.survival = out, minutes, evaluate_every, survival
+        self.step = 0
+        self.seconds = 0.0  # of training, evaluations not counted
+        self.evaluated = 0.0  # training time at the last evaluation
+        self.best: tuple[float, float] | None = None  # survival, minus the held-out loss
+        out.mkdir(parents=True, exist_ok=True)
+
+    # -- what a trainer of a network says ----------------------------------------------------------------------------
+
+    def _title(self) -> str:
+        """What is trained on what."""
+        raise NotImplementedError
+
+    def _step(self) -> tuple[float, ...]:
+        """One step of the optimiser; returns its losses."""
+        raise NotImplementedError
+
+    def _progress(self, losses: tuple[float, ...], steps_per_s: float) -> tuple[dict[str, float], str]:
+        """What is logged of the mean losses of the last steps, by column, and what is shown of them."""
+        raise NotImplementedError
+
+    def _held_out(self) -> dict[str, float]:
+        """Losses on what was held out, `LOSS` among them."""
+        raise NotImplementedError
+
+    def _ship(self, path: Path, results: Mapping[str, float]) -> None:
+        """Write a checkpoint."""
+        raise NotImplementedError
+
+    def _state(self) -> dict[str, Any]:
+        """What `resume.pt` holds beside the run's own progress."""
+        raise NotImplementedError
+
+    def _restore(self, path: Path, saved: Mapping[str, Any]) -> None:
+        """Inverse of `_state`. Raises ConfigError naming `path` when it is of another network or of other data."""
+        raise NotImplementedError
+
+    # -- a run -----------------------------------------------------------------------------------------------------
+
+    @property
+    def share(self) -> float:
+        """Of the time that is used up, 0 to 1."""
+        return min(1.0, self.seconds / (60 * self.minutes))
+
+    def run(self) -> None:
+        """Train until the time is used up. Interrupted, it saves first what `resume` needs."""
+        from tqdm import tqdm
+
+        from tools.train.journal import Journal
+
+        budget = 60 * self.minutes
+        every = 60 * self.evaluate_every or math.inf
+        print(f"training {self._title()}, {self.minutes:g} minutes, in {self.out}", file=sys.stderr)
+        with (
+            Journal(self.out, self.COLUMNS, self.step) as journal,
+            tqdm(total=round(budget), initial=round(self.seconds), unit="s", file=sys.stderr, mininterval=2) as bar,
+        ):
+            try:
+                while self.seconds < budget:
+                    due = max(self.evaluated + every - self.seconds, 0.0)
+                    self._train_for(min(budget - self.seconds, due, 10.0), journal, bar)
+                    if self.seconds - self.evaluated >= every and self.seconds < budget:
+                        self._evaluate(journal, bar)
+                if self.evaluated < self.seconds:
+                    self._evaluate(journal, bar)
+            except KeyboardInterrupt:
+                self.save()
+                print(f"interrupted: the same command goes on from step {self.step}", file=sys.stderr)
+                raise
+
+    def _train_for(self, seconds: float, journal: Any, bar: Any) -> None:
+        """Train for about `seconds` and log the means."""
+        before, start = self.seconds, time.perf_counter()
+        losses: list[tuple[float, ...]] = []
+        while self.seconds - before < seconds or not losses:
+            losses.append(self._step())
+            self.seconds = before + time.perf_counter() - start
+        elapsed, steps = self.seconds - before, len(losses)
+        means = tuple(sum(column) / steps for column in zip(*losses, strict=True))
+        columns, text = self._progress(means, steps / elapsed)
+        journal.log(self.step, {"minutes": self.seconds / 60, **columns})
+        bar.update(round(self.seconds) - bar.n)
+        bar.set_postfix_str(f"step {self.step}, {text}")
+
+    def _evaluate(self, journal: Any, bar: Any) -> None:
+        """Save, measure the held-out loss and survival, and keep the network when it is the best so far."""
+        results = self._held_out()
+        last = self.out / "last.safetensors"
+        self._ship(last, results)
+        self.save()
+        if self.survival is not None:
+            results |= {name: float(value) for name, value in self.survival(last).items()}
+        score = (results.get("survival", 0.0), -results[self.LOSS])
+        if better := self.best is None or score > self.best:
+            self.best = score
+            self._ship(self.out / self.BEST, results)
+        self.evaluated = self.seconds
+        self.save()
+        row = {name: value for name, value in results.items() if name in self.COLUMNS}
+        journal.log(self.step, {"minutes": self.seconds / 60, **row})
+        journal.plot(self.out / "learning_curve.png", self.PANELS, x="minutes")
+        text = ", ".join(f"{name} {value:.4g}" for name, value in results.items())
+        note = " (best)" if better else ""
+        bar.write(f"step {self.step}, {self.seconds / 60:.1f} min: {text}{note}", file=sys.stderr)
+
+    # -- files -----------------------------------------------------------------------------------------------------
+
+    def save(self) -> None:
+        """Write `resume.pt`, whole or not at all."""
+        import torch
+
+        path = self.out / "resume.pt"
+        part = path.with_suffix(".part")
+        best = list(self.best) if self.best else []
+        run = {"step": self.step, "seconds": self.seconds, "evaluated": self.evaluated, "best": best}
+        torch.save({**self._state(), **run}, part)
+        part.replace(path)
+
+    def resume(self) -> bool:
+        """Go on where the run in the folder stopped, if there is one. Raises ConfigError when it does not fit."""
+        import pickle
+
+        import torch
+
+        path = self.out / "resume.pt"
+        if not path.exists():
+            return False
+        try:
+            saved: dict[str, Any] = torch.load(path, weights_only=True)
+        except (RuntimeError, EOFError, OSError, pickle.UnpicklingError) as error:
+            raise ConfigError(f"{path}: cannot be resumed ({error}); use --no-resume or another --out") from error
+        self._restore(path, saved)
+        self.step, self.seconds, self.evaluated = saved["step"], saved["seconds"], saved["evaluated"]
+        self.best = (saved["best"][0], saved["best"][1]) if saved["best"] else None
+        print(f"resumed at step {self.step}, {self.seconds / 60:.1f} minutes", file=sys.stderr)
+        return True
+
+
+def same_network(path: Path, ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> None:
+    """Refuse to resume a network of another config. Raises ConfigError naming what changed."""
+    changed = [f"{key} was {theirs.get(key)}, is {value}" for key, value in ours.items() if theirs.get(key) != value]
+    if changed:
+        what = "; ".join(changed)
+        raise ConfigError(f"{path}: another network ({what}); use its options, --no-resume or another --out")
