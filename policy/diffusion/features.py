@@ -9,7 +9,7 @@ Every function takes numpy arrays or torch tensors and returns what it was given
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
@@ -79,11 +79,6 @@ def token_layout(n_joints: int) -> Layout:
             ("joint_velocity", n_joints),  # rad/s
         )
     )
-
-
-def joints_of(layout: Layout) -> int:
-    """How many joints a layout describes."""
-    return dict(layout.fields)["position"]
 
 
 def raw_row(state: State) -> Array:
@@ -255,8 +250,3 @@ class Trajectory:
             height=token["height"][..., 0],
             dt=dt,
         )
-
-
-def layout_from_header(fields: Sequence[Sequence[Any]]) -> Layout:
-    """The layout that `Layout.to_header` stored."""
-    return Layout(tuple((str(name), int(size)) for name, size in fields))

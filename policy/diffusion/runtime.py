@@ -68,6 +68,11 @@ class Runtime:
                 f"diffusion policy: a plan must last replan + delay = {needed} ticks, and this checkpoint learned the "
                 f"actions of the next {trained['near_actions']} only; lower replan or delay"
             )
+        if settings.delay > trained.get("committed", settings.delay):
+            raise ConfigError(
+                f"diffusion policy: delay {settings.delay} is asked for, and this checkpoint was trained for at most "
+                f"{trained['committed']} ticks: lower it, or train with --committed {settings.delay}"
+            )
         self.matrix = settings.matrix(config)
         self._warm: dict[int, DenoisingMatrix] = {}  # rolling, by the number of fresh frames
         self._signal = cosine_signal(config.levels)

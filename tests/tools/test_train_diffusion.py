@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from policy.diffusion.training import (
 from tools.train import diffusion
 from tools.train.diffusion import Settings, Trainer
 from tools.train.journal import Journal
+from tools.train.survival import closed_loop_survival
 
 ROBOT = load_robot()
 CONFIG = DenoiserConfig(54, 20, layers=1, width=16, heads=2)
@@ -111,9 +113,23 @@ def test_a_run_that_does_not_fit_is_not_resumed(windows: Windows, tmp_path: Path
     wider = DenoiserConfig(54, 20, layers=1, width=32, heads=2)
     with pytest.raises(ConfigError, match="width was 16, is 32"):
         Trainer(windows, ROBOT, wider, QUICK, tmp_path, "", "", None).resume()
+    with pytest.raises(ConfigError, match="trained on made up, not on other"):
+        Trainer(windows, ROBOT, CONFIG, QUICK, tmp_path, "other", "", None).resume()
     (tmp_path / "resume.pt").write_bytes(b"PK\x03\x04 cut")
     with pytest.raises(ConfigError, match="cannot be resumed"):
         trainer(windows, tmp_path, Measured(1.0)).resume()
+
+
+def test_a_resumed_run_keeps_the_emphasis_that_it_began_with(synthetic_dataset: Path, tmp_path: Path) -> None:
+    recording = read_recording(synthetic_dataset, ROBOT)
+    wide = replace(CONFIG, state_size=2 * CONFIG.state_size)
+    first, other = (Windows(recording, ROBOT, wide, emphasis=5.0, seed=seed) for seed in (0, 1))
+    Trainer(first, ROBOT, wide, QUICK, tmp_path, "made up", "", None).save()
+    again = Trainer(other, ROBOT, wide, QUICK, tmp_path, "made up", "", None)
+    states, _ = first.held_out(4)[:2]
+    assert not torch.equal(states, other.held_out(4)[0])
+    assert again.resume()
+    torch.testing.assert_close(again.windows.held_out(4)[0], states)
 
 
 def test_training_lowers_the_loss_of_held_out_windows(windows: Windows, tmp_path: Path) -> None:
@@ -123,6 +139,14 @@ def test_training_lowers_the_loss_of_held_out_windows(windows: Windows, tmp_path
     for _ in range(60):
         run._step()
     assert run._validation_loss() < 0.7 * before
+
+
+def test_survival_is_measured_of_a_network_with_a_single_action(synthetic_dataset: Path, tmp_path: Path) -> None:
+    short = replace(CONFIG, actions=1)
+    windows = Windows(read_recording(synthetic_dataset, ROBOT), ROBOT, short)
+    run = Trainer(windows, ROBOT, short, QUICK, tmp_path, "made up", "Apache-2.0", None)
+    run._ship(tmp_path / "one.safetensors", {})
+    assert 0.0 <= closed_loop_survival(tmp_path / "one.safetensors", 0.5, 2, 0)["survival"] <= 1.0
 
 
 def test_survival_that_cannot_be_measured_stops_the_run_before_it_trains(
@@ -167,6 +191,13 @@ def test_the_command_trains_from_a_folder_and_resumes(synthetic_dataset: Path, t
     steps = [int(row.split(",")[0]) for row in (tmp_path / "log.csv").read_text().splitlines()[1:]]
     assert steps == sorted(steps)
     assert steps[-1] == second["step"]
+
+
+def test_a_history_without_what_ran_is_refused(tmp_path: Path) -> None:
+    parser = argparse.ArgumentParser()
+    diffusion.add_arguments(parser)
+    with pytest.raises(ConfigError, match="--history 1: at least 2"):
+        diffusion.main(parser.parse_args(["--data", str(tmp_path), "--out", str(tmp_path), "--history", "1"]))
 
 
 def test_the_past_is_clean_in_three_quarters_of_the_windows_and_half_share_one_level() -> None:

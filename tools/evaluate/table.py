@@ -133,7 +133,7 @@ _SAMPLING: tuple[Row, ...] = (
 
 # Diffuse-CLoC's: 32 states ahead and 16 actions. They run at no delay; and they are chosen by their loss, because the
 # closed-loop measurement executes more actions of a plan than some of them have.
-_SHORT = "--horizon 32 --actions 16 --committed 0 --survival-worlds 0"
+_SHORT = "--horizon 32 --actions 16 --committed 0"
 
 _CAUSAL = "--horizon 32 --mask causal"  # UniPhys's: one token a frame, 32 of them
 

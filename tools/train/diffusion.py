@@ -12,7 +12,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from hw.config import ConfigError
+from hw.hal import Array
 from tools.train.timed import Survival, TimedTrainer, same_network
 
 if TYPE_CHECKING:
@@ -101,6 +104,8 @@ def main(args: argparse.Namespace) -> int:
     from policy.latent.actions import load_latents
     from policy.text.encoder import load_encoder
 
+    if args.history < 2:
+        raise ConfigError(f"--history {args.history}: at least 2 is needed, for what ran last is an action of the past")
     survival = _survival(args) if args.survival_worlds else None
     torch.set_num_threads(args.threads)
     robot = load_robot(args.robot)
@@ -278,19 +283,41 @@ class Trainer(TimedTrainer):
             "updates": self.average.updates,
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
-            "states": [self.windows.states.mean, self.windows.states.std],
-            "actions": [self.windows.actions.mean, self.windows.actions.std],
+            "source": self.source,
+            "latents": _tensors(self.windows.latents.to_tensors() if self.windows.latents else {}),
+            # Whole, with the matrix of the emphasis: another seed or --init may have made them.
+            "states": _tensors(self.windows.states.to_numpy()),
+            "actions": _tensors(self.windows.actions.to_numpy()),
         }
 
     def _restore(self, path: Path, saved: Mapping[str, Any]) -> None:
-        import torch
+        from policy.diffusion.features import Normaliser
 
         same_network(path, asdict(self.config), saved["config"])
-        ours_norm: list[torch.Tensor] = [self.windows.states.mean, self.windows.actions.mean]
-        if any(not torch.equal(a, saved[k][0]) for k, a in zip(("states", "actions"), ours_norm, strict=True)):
-            raise ConfigError(f"{path}: trained on other data, or other latents; use --no-resume or another --out")
+        if saved["source"] != self.source:
+            raise ConfigError(
+                f"{path}: trained on {saved['source']}, not on {self.source}; use --no-resume or another --out"
+            )
+        latents = _arrays(saved["latents"])
+        ours = self.windows.latents.to_tensors() if self.windows.latents else {}
+        if ours.keys() != latents.keys() or any((ours[name] != latents[name]).any() for name in ours):
+            raise ConfigError(f"{path}: trained with other latents; use --no-resume or another --out")
+        self.windows.states, self.windows.actions = (
+            Normaliser.from_numpy(_arrays(saved[name])).to_torch() for name in ("states", "actions")
+        )
         self.network.load_state_dict(saved["network"])
         self.average.weights = saved["average"]
         self.average.updates = saved["updates"]
         self.optimiser.load_state_dict(saved["optimiser"])
         self.generator.set_state(saved["generator"])
+
+
+def _tensors(arrays: Mapping[str, Array]) -> dict[str, torch.Tensor]:
+    """Arrays as `torch.load` takes them back without pickle."""
+    import torch
+
+    return {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
+
+
+def _arrays(tensors: Mapping[str, torch.Tensor]) -> dict[str, Array]:
+    return {name: value.numpy() for name, value in tensors.items()}

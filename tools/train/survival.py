@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from tools.train.fleet import Fleet
 
 _CHANGE = 125  # ticks between commands
+_PUSH_EVERY = 50  # ticks
+_PUSH = 0.3  # m/s, in a random direction
 
 
 def closed_loop_survival(
@@ -25,14 +27,21 @@ def closed_loop_survival(
 ) -> dict[str, float]:
     """Run a diffusion checkpoint in `worlds` nominal worlds, all planned as one batch: see `survival_of`.
 
-    Uses the settings of configs/policies/diffusion.yaml.
+    Uses the settings of configs/policies/diffusion.yaml, with shorter delay and chunks where the network has too few
+    actions for them, or was trained for less delay.
     """
+    from policy.checkpoint import read_header
+    from policy.diffusion.config import check_fit
     from policy.diffusion.runtime import load_runtime
     from policy.diffusion.settings import load_settings
     from stack.tasks import load_task
     from tools.train.planned import PlannedWalker
 
     robot, settings = load_robot(robot_name), replace(load_settings(), checkpoint=str(checkpoint))
+    head = read_header(checkpoint)
+    actions = check_fit(checkpoint, head, robot).action_horizon
+    delay = min(settings.delay, head["training"]["committed"], actions - 1)
+    settings = replace(settings, delay=delay, replan=min(settings.replan, actions - delay))
     runtime = load_runtime(robot, settings, load_task("walk", {}, robot.dt).cost)
     return survival_of(partial(PlannedWalker, runtime=runtime, seed=seed), robot, seconds, worlds, seed)
 
@@ -40,7 +49,9 @@ def closed_loop_survival(
 def survival_of(
     drive: Callable[[Fleet], Driver], robot: Robot, seconds: float, worlds: int, seed: int
 ) -> dict[str, float]:
-    """Walk in `worlds` nominal worlds under changing velocity commands, the same ones for the same `seed`.
+    """Walk in `worlds` nominal worlds under changing velocity commands and pushes, the same ones for the same `seed`.
+
+    Without pushes every network that walks at all survives, and none is better than another.
 
     Returns `survival`, the share of worlds that never fell, and `velocity_error`, the mean planar error [m/s] of
     those, smoothed over a cycle, from 2 s after each command.
@@ -58,6 +69,9 @@ def survival_of(
     for tick in range(round(seconds * robot.rate)):
         if tick % _CHANGE == 25:
             command = np.array([rng.uniform([-0.1, -0.1, -0.8], [0.3, 0.1, 0.8]) for rng in fleet.rngs])
+        if tick % _PUSH_EVERY == 0 and tick:
+            bearing = np.array([rng.uniform(-np.pi, np.pi) for rng in fleet.rngs])
+            fleet.worlds.push(_PUSH * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1))
         fleet.observe()
         fleet.step(walker.act(command))
         alive &= ~fleet.truth.fallen

@@ -143,6 +143,13 @@ def test_settings_that_a_network_cannot_serve_are_refused() -> None:
         GuidanceSettings(gradient="numeric")
 
 
+def test_a_delay_that_a_network_was_not_trained_for_is_refused() -> None:
+    trained = replace(model(), header={"training": {"committed": 1, "near_actions": 8}})
+    with pytest.raises(ConfigError, match="trained for at most 1 ticks"):
+        Runtime(trained, SETTINGS, ROBOT.dt)
+    Runtime(trained, replace(SETTINGS, delay=1), ROBOT.dt)
+
+
 def test_the_shipped_settings_load() -> None:
     settings = load_settings()
     assert settings.guidance.weight > 0
