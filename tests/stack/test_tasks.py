@@ -347,3 +347,12 @@ def test_cost_weighs_each_part_and_keeps_batches_apart() -> None:
     # one instruction for each of a batch
     each = twist_cost(moved, np.stack([twist, twist, twist + np.array([0, 0, 2.0])]), Weights(0, 1, 0, 0))
     np.testing.assert_allclose(each.detach(), [0.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_survival_tells_a_planner_nothing() -> None:
+    task = load_task("survive", {}, DT)
+    task.reset(np.random.default_rng(0))
+    asked = task.instruct(0, state(), NOTHING)
+    assert asked.text == ""
+    assert np.abs(asked.velocity).max() > 0.0, "what policies walk by that do not plan"
+    assert not any(getattr(task.settings.cost, name) for name in ("velocity", "displacement", "yaw", "stand", "goal"))

@@ -50,6 +50,12 @@ def _forest(name: str, title: str, published: float, train: str, network: str | 
 
 _FAR = Run("goal-far")
 _VELOCITY = Run("velocity", quick_seconds=61.0)
+# Guided as in the papers, by the distance from the goal alone: no velocity that the task works out, and no sentence.
+_ALONE = dict.fromkeys(("cost.velocity", "cost.yaw_rate", "cost.displacement", "cost.yaw", "cost.stand"), "0") | {
+    "cost.goal": "1", "cost.facing": "0.5",
+}  # fmt: skip
+_UNTOLD = {"text_weight": "0"}
+
 _FOREST = Run("forest")
 _INBETWEEN = Run("inbetween", clips=6)
 _TEXT = Run("text")
@@ -94,20 +100,31 @@ _SAMPLING: tuple[Row, ...] = (
     _survive("length-gradual", "Episode length: gradual", GRADUAL, 1817.6, None),
     _survive("length-full-sequence", "Episode length: full-sequence", FULL, 231.6, None),
     _survive("length-unstable", "Episode length: autoregressive, without stabilisation", UNSTABLE, 148.2, None),
+    Row(
+        "uniphys/goal-near-alone", UNIPHYS, "Goal, near, by its distance alone: success",
+        Run("goal-near", set=_ALONE, plan={**GRADUAL, **_UNTOLD}), SUCCESS, 1.0, quick=False,
+    ),
     *(
         Row(
-            f"uniphys/monte-carlo-{n}", UNIPHYS, f"Monte-Carlo guidance, N = {n}: success",
-            Run("goal-far", plan={"guidance.samples": str(n)}), SUCCESS, share,
+            f"uniphys/monte-carlo-{n}", UNIPHYS, f"Goal, far, by its distance alone, Monte-Carlo N = {n}: success",
+            Run("goal-far", set=_ALONE, plan={**GRADUAL, **_UNTOLD, "guidance.samples": str(n)}), SUCCESS, share,
         )
         for n, share in ((1, 0.26), (3, 0.82), (5, 0.98))
     ),
     *(
         Row(
-            f"uniphys/best-of-{n}", UNIPHYS, f"Guidance, the best of N = {n}: success",
-            Run("goal-far", plan={"guidance.samples": str(n), "guidance.choose": "best"}), SUCCESS,
-            quick=False, note="not in the paper's table",
+            f"uniphys/best-of-{n}", UNIPHYS, f"The same, the best of N = {n}: success",
+            Run(
+                "goal-far", set=_ALONE,
+                plan={**GRADUAL, **_UNTOLD, "guidance.samples": str(n), "guidance.choose": "best"},
+            ),
+            SUCCESS, quick=False, note="not in the paper's table",
         )
         for n in (3, 5)
+    ),
+    Row(
+        "cloc/forest-alone", CLOC, "Forest, by goal and pillars alone, rolling: success",
+        Run("forest", set=_ALONE, plan={**ROLLING, **_UNTOLD}), SUCCESS, 0.96, quick=False,
     ),
     *(
         Row(
