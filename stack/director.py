@@ -5,13 +5,12 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable
 
-import numpy as np
-
-from hw.hal import Array, Instruction, Observation, Percept, Policy, State, Task, Trace
+from hw.hal import Array, Observation, Percept, Policy, State, Task, Trace
 from hw.robot import Robot
 from stack.coast import missing
 from stack.loop import Adopted, Estimator, Proposal
 from stack.safety import Guard, Phase
+from stack.tape import Tape
 
 WAIT_SECONDS = 1.0  # for a first sample from every sensor
 STILL_SECONDS = 0.5  # after homing, when the body has stopped swinging: gravity is taken from there, not from the way
@@ -40,12 +39,12 @@ class Director:
         self._look = task.percept if look is None else look
         self._settled = 0
         self._plans = 0  # adopted so far
-        self._rows: list[tuple[State, Instruction, Percept]] = []
+        self._tape = Tape(len(robot.joints), round(task.seconds / robot.dt))
         self.ended: str | None = None  # "done" or "time", if the task ended by itself
 
     @property
     def task_ticks(self) -> int:
-        return len(self._rows)
+        return len(self._tape)
 
     def act(self, tick: int, observation: Observation, state: State | None) -> Proposal:
         phase = self._guard.phase
@@ -64,23 +63,8 @@ class Director:
 
     def trace(self) -> Trace:
         """What the robot believes to have gone through in the task."""
-        states = [state for state, _, _ in self._rows]
-        percepts = [percept for _, _, percept in self._rows]
-        gravity = np.array([state.gravity for state in states]).reshape(-1, 3)
-        rates = np.array([state.angular_velocity for state in states]).reshape(-1, 3)
-        return Trace(
-            dt=self._robot.dt,
-            displacement=np.array([state.displacement for state in states]).reshape(-1, 3),
-            yaw=np.array([state.yaw for state in states], dtype=float),
-            velocity=np.array([state.velocity for state in states]).reshape(-1, 3),
-            yaw_rate=-(gravity * rates).sum(-1),  # about the vertical
-            command=np.array([instruction.velocity for _, instruction, _ in self._rows]).reshape(-1, 3),
-            fallen=self._guard.phase is Phase.FAULT and self._guard.cause == "fall" and self.ended is None,
-            joints=np.array([state.position for state in states]).reshape(-1, len(self._robot.joints)),
-            goal=_stacked([percept.goal for percept in percepts]),
-            obstacles=_stacked([percept.obstacles for percept in percepts]),
-            robots=_stacked([percept.robots for percept in percepts]),
-        )
+        fallen = self._guard.phase is Phase.FAULT and self._guard.cause == "fall" and self.ended is None
+        return self._tape.trace(self._robot.dt, fallen)
 
     def _wake(self, tick: int, observation: Observation, state: State | None) -> None:
         if state is not None:
@@ -93,7 +77,7 @@ class Director:
         tick = self.task_ticks
         percept = self._look(state)
         instruction = self._task.instruct(tick, state, percept)
-        self._rows.append((state, instruction, percept))
+        self._tape.add(state, instruction, percept)
         shown = Proposal(instruction=instruction, percept=percept)
         if self._task.done(state):
             self._end("done", DONE)
@@ -126,9 +110,3 @@ class Director:
     def _end(self, how: str, text: str) -> None:
         self.ended = how
         self._guard.stop("task", text)
-
-
-def _stacked(rows: list[Array | None]) -> Array | None:
-    """Rows `(ticks, ...)` of what was perceived; None where there was nothing to perceive."""
-    present = [row for row in rows if row is not None]
-    return np.array(present) if present and len(present) == len(rows) else None

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 from hw.clock import WallClock
-from hw.dynamixel.bus import Bus, Counters
+from hw.dynamixel.bus import LONGEST_RETURN_DELAY, Bus, Counters
 from hw.dynamixel.lifeline import Lifeline
 from hw.dynamixel.motors import DynamixelMotors
 from hw.dynamixel.port import Port, SerialPort
@@ -73,7 +73,7 @@ class DynamixelBackend:
     def _connect(self, bus: Bus) -> tuple[DynamixelSensors, DynamixelMotors]:
         if self._robot.imu.kind != "opencr":
             self._imu = SerialImu(self._robot.imu, self._robot.rate, clock=self.clock)
-        bus.return_delay = 254 * 2e-6  # until the servos' own is known
+        bus.return_delay = LONGEST_RETURN_DELAY  # until the servos' own is known
         find_board(bus, self._robot)
         found = find_servos(bus, self._robot)
         differences = compare(self._robot, found)

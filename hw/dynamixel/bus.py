@@ -21,6 +21,7 @@ from hw.dynamixel.tables import Item
 from hw.hal import Clock
 
 MARGIN = 0.0035  # s after the predicted end: a USB adapter's latency timer of 1 ms, and what may hold up host or servo
+LONGEST_RETURN_DELAY = 254 * 2e-6  # s that a servo may be set to wait before it answers
 GAP_NS = 2_000  # before an answer, at return delay 0
 BITS = 10  # of a byte on the wire
 PING_DATA = 3  # bytes: model number, firmware
@@ -198,7 +199,7 @@ class Bus:
 
     def ping(self, id: int, tries: int = 2) -> Ping | None:
         status = self._ask(codec.ping(id), id, PING_DATA, tries)
-        return _as_ping(status) if status else None
+        return _as_ping(status) if status and not status.error else None  # an error comes without the model
 
     def read(self, id: int, address: int, length: int, tries: int = 3) -> Status | None:
         """Read bytes. The status has an error and no data if the servo refused."""

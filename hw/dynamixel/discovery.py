@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from hw.config import ConfigError
-from hw.dynamixel.bus import Bus, Ping
+from hw.dynamixel.bus import LONGEST_RETURN_DELAY, Bus, Ping
 from hw.dynamixel.codec import MAX_ID, OVERHEAD
 from hw.dynamixel.survey import EEPROM_BYTES, RAM_BYTES
 from hw.dynamixel.tables import ControlTable, table
@@ -21,7 +21,6 @@ PING_ANSWER = 14  # bytes
 _ECHO = 14  # bytes at most of a request that some adapters hand back
 _LONGEST_ANSWER = OVERHEAD + RAM_BYTES  # bytes of anything that is asked here
 _BOARD_BYTES = 32  # up to its voltage
-_LONGEST_DELAY = 254 * 2e-6  # s that a servo may be set to wait before it answers
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ def power_on(bus: Bus, board_id: int, bauds: Sequence[int]) -> str | None:
 def census(bus: Bus, bauds: Iterable[int], told: Callable[[str], None] = lambda text: None) -> Census:
     """Ask everybody at each baud. `told` hears what is being done. Raises BackendError when the port is gone."""
     found = Census()
-    bus.return_delay = _LONGEST_DELAY
+    bus.return_delay = LONGEST_RETURN_DELAY
     for baud in bauds:
         if not _tuned(bus, baud):
             found.skipped.append(baud)

@@ -31,9 +31,9 @@ _FIGURES = re.compile(r".*  tick .*|\w+: \S+|\d+ ticks, .*|log: .*")  # that a r
 
 
 @contextmanager
-def free_rig() -> Iterator[RigProcess]:
+def free_rig(robot: str = "op3", seed: int = 0) -> Iterator[RigProcess]:
     """A rig in real time. Without the right to SCHED_FIFO it lags where the machine is busy, and so do its answers."""
-    with RigProcess(clock="real") as rig:
+    with RigProcess(robot, clock="real", seed=seed) as rig:
         with contextlib.suppress(PermissionError):
             os.sched_setscheduler(rig.process.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
         yield rig

@@ -7,7 +7,6 @@ the same backend. Wanted are no stop, no fall, and no memory that grows.
 from __future__ import annotations
 
 import argparse
-import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +50,8 @@ def soak(report: Report, args: argparse.Namespace) -> dict[str, Any]:
     from hw.dynamixel.backend import DynamixelBackend
     from hw.hal import BackendError
     from hw.robot import load_robot
-    from sim.rig.control import RigProcess
     from stack.session import Settings, run
+    from tools.bench.controller import free_rig
 
     robot = load_robot(args.robot)
     settings = Settings(
@@ -67,7 +66,7 @@ def soak(report: Report, args: argparse.Namespace) -> dict[str, Any]:
     )
     outcome = "error"
     events: list[Any] = []
-    with RigProcess(robot, clock="real", seed=args.seed) as rig:
+    with free_rig(args.robot, args.seed) as rig:
         body = DynamixelBackend(robot, port=rig.port)
         watch = Watch(rig, robot.rate, args, report)
         try:
@@ -77,8 +76,6 @@ def soak(report: Report, args: argparse.Namespace) -> dict[str, Any]:
             events = [str(error)]
         counters = body.counters
         struck = sum(each["count"] for each in rig.control.statistics()["struck"])
-        with contextlib.suppress(BackendError):
-            watch.weigh(rig)
     late = np.array(watch.late or [0.0])
     return {
         "minutes": watch.ticks / robot.rate / 60.0,
@@ -126,13 +123,9 @@ class Watch:
             self.start_mb, self.rig_start_mb = rss_mb(), rss_mb(self._rig.process.pid)
         if self.ticks % self._rate == 0:  # within the task: a robot that was lowered at its end is no fallen one
             self.fell |= bool(self._truth.fetch().fallen[0])
-            self.weigh(self._rig)
+            self.end_mb, self.rig_end_mb = rss_mb(), rss_mb(self._rig.process.pid)
         if self.ticks % round(TELL_SECONDS * self._rate) == 0:
             self._report.line(f"{self.ticks / self._rate:.0f} s, {self.missed} missed, {self.end_mb:.1f} MB")
-
-    def weigh(self, rig: Any) -> None:
-        """Take the memory of now."""
-        self.end_mb, self.rig_end_mb = rss_mb(), rss_mb(rig.process.pid)
 
 
 def rss_mb(process: int | str = "self") -> float:

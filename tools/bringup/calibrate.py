@@ -90,6 +90,7 @@ def _measure(
     """Zeros [rad] and directions `(n_joints,)`."""
     import numpy as np
 
+    from hw.dynamixel.bus import LONGEST_RETURN_DELAY
     from hw.dynamixel.discovery import BAUDS, power_on
     from hw.dynamixel.survey import find_servos
     from tools.bringup.encoders import Encoders, short
@@ -98,7 +99,7 @@ def _measure(
     power_on(line.bus, robot.bus.board_id, [robot.bus.baud, *BAUDS])
     if line.bus.port.baud != robot.bus.baud:
         line.bus.set_baud(robot.bus.baud)
-    line.bus.return_delay = 254 * 2e-6  # until the servos' own is known
+    line.bus.return_delay = LONGEST_RETURN_DELAY  # until the servos' own is known
     found = find_servos(line.bus, robot)
     refuse(found)
     encoders = Encoders(line.bus, line.clock, robot, found)

@@ -21,11 +21,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
+        from hw.dynamixel.bus import LONGEST_RETURN_DELAY
         from hw.dynamixel.survey import as_table, compare, correct, find_board, find_servos
 
         robot = assembled(args, report)
         with open_line(args, robot) as line:
-            line.bus.return_delay = 254 * 2e-6  # until the servos' own is known
+            line.bus.return_delay = LONGEST_RETURN_DELAY  # until the servos' own is known
             find_board(line.bus, robot)
             found = find_servos(line.bus, robot)
             before = left = compare(robot, found)

@@ -52,6 +52,7 @@ class Watched:
 
     def __init__(self, line: Line, robot: Robot) -> None:
         """Raises BackendError when a servo or the board does not answer."""
+        from hw.dynamixel.bus import LONGEST_RETURN_DELAY
         from hw.dynamixel.sensors import DynamixelSensors, present
         from hw.dynamixel.survey import find_board, find_servos
         from hw.dynamixel.units import Units
@@ -60,7 +61,7 @@ class Watched:
         from stack.coast import Coast
 
         bus = line.bus
-        bus.return_delay = 254 * 2e-6  # until the servos' own is known
+        bus.return_delay = LONGEST_RETURN_DELAY  # until the servos' own is known
         find_board(bus, robot)
         found = find_servos(bus, robot)
         bus.return_delay = max(servo.get("return_delay_time") for servo in found) * 2e-6

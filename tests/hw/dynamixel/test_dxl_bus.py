@@ -202,6 +202,13 @@ def test_an_error_without_data_is_an_answer_without_a_value() -> None:
     assert positions(group)[1] == 1002
 
 
+def test_a_ping_that_is_answered_with_an_error_found_no_servo() -> None:
+    line, bus = rig(1)
+    assert bus.ping(1) is not None
+    line.fault = lambda id, data: [(codec.status(1, 3, b""), 0)]
+    assert bus.ping(1, tries=1) is None
+
+
 def test_an_alert_comes_with_valid_data() -> None:
     for fast in (False, True):
         line, bus = rig(3)
