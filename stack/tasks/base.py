@@ -31,7 +31,6 @@ class BaseTask:
     name: str
     description: str
     settings_type: ClassVar[type[Settings]] = Settings
-    others: tuple[BaseTask, ...] = ()  # of the other robots of its scene, drawn with the episode
 
     def __init__(self, settings: Any, dt: float) -> None:
         self.settings = settings
@@ -71,9 +70,6 @@ class BaseTask:
     def done(self, state: State) -> bool:
         """Whether the episode may end before its time."""
         return False
-
-    def lost(self) -> None:
-        """The robot of this task, one of `others`, has ended before the first one."""
 
     def success(self, trace: Trace) -> bool:
         raise NotImplementedError(f"task {self.name} has no measure of success")

@@ -122,8 +122,12 @@ def task_spec(run: Run, seconds: float | None) -> dict[str, Any]:
     from stack.provenance import described, sha256
     from stack.tasks import approach, guidance, measures
 
-    classes = [cls for cls in tasks.task_class(run.task).__mro__ if cls.__module__.startswith("stack.")]
-    modules = [*(sys.modules[cls.__module__] for cls in classes), approach, captions, guidance, measures]
+    task = tasks.task_class(run.task)
+    own = [
+        *(cls.__module__ for cls in task.__mro__ if cls.__module__.startswith("stack.")),
+        *getattr(task, "helpers", ()),
+    ]
+    modules = [*(sys.modules[name] for name in own), approach, captions, guidance, measures]
     sources = {module.__name__: sha256(Path(str(module.__file__))) for module in modules}
     return {
         "task": run.task,
