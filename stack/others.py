@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from hw.hal import Clock, Policy
+from hw.hal import Clock, Policy, Task
 from hw.robot import Robot
 from stack.clock import Schedule
 from stack.director import Director
@@ -19,16 +19,23 @@ from stack.interrupt import Interrupt, Stops
 from stack.loop import Loop, TickRecord
 from stack.odometry import load_odometry
 from stack.safety import ENDED, Guard, Phase
-from stack.tasks.base import BaseTask
 
 _ENDING = {Phase.LOWERING, *ENDED}
 _QUIET = {"phase", "task", "first"}  # kinds of events of others that the first robot's log does without
 
 
+class OtherTask(Task, Protocol):
+    """What a robot other than the first is asked to do: one of the `others` of the first one's task."""
+
+    def lost(self) -> None:
+        """Its robot has ended, maybe before the first one."""
+        ...
+
+
 @dataclass(frozen=True)
 class _Member:
     number: int
-    task: BaseTask
+    task: OtherTask
     guard: Guard
     loop: Loop
 
@@ -44,8 +51,8 @@ class Others:
         self,
         robot: Robot,
         body: Any,
-        tasks: tuple[BaseTask, ...],
-        make: Callable[[BaseTask], Policy],
+        tasks: tuple[OtherTask, ...],
+        make: Callable[[OtherTask], Policy],
         first: Guard,
         interrupt: Interrupt,
         seed: int,

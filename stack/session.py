@@ -22,11 +22,11 @@ from stack.event import Event
 from stack.interrupt import Interrupt, Stops
 from stack.loop import Listener, Loop, TickRecord
 from stack.odometry import load_odometry
-from stack.others import Others
+from stack.others import Others, OtherTask
 from stack.policies import make_policy, policy_fingerprint
 from stack.safety import Guard, Phase
 from stack.steady import steady
-from stack.tasks import BaseTask, load_task
+from stack.tasks import load_task
 
 MAX_GAIN = 2.0  # times the firmware's configured gain; above, a servo of this class rings
 TASK_STREAM = 1  # distinguishes the task's random stream from others of the same seed
@@ -124,7 +124,7 @@ def run(
     )
     if scene is not None and simulated and getattr(body, "stage", None) is None:
         raise ConfigError(f"task '{task.name}' has a scene: make the backend with it (stack.session.prepare does)")
-    tasks: tuple[BaseTask, ...] = getattr(task, "others", ())
+    tasks: tuple[OtherTask, ...] = getattr(task, "others", ())
     if tasks and policy is not None:
         raise ConfigError(f"task '{task.name}' has {len(tasks) + 1} robots, each with its own policy: name one instead")
     with ExitStack() as stack:

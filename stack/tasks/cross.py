@@ -55,6 +55,8 @@ class Cross(BaseTask):
     name = "cross"
     description = "cross a circle together with other robots, to the opposite side, without touching one"
     settings_type = CrossSettings
+    helpers = ("stack.tasks.passing",)  # modules that an episode also depends on
+    others: tuple[Cross, ...] = ()  # of the first robot's task: those of the other robots
 
     def __init__(self, settings: CrossSettings, dt: float) -> None:
         super().__init__(settings, dt)
@@ -65,6 +67,7 @@ class Cross(BaseTask):
         self.arrived = self.ended = False
         self._bearing = 0.0  # rad in the odometry frame, of the way that was chosen
         self._motion = Motion(self.settings.passing.window, self.dt)
+        self._others: Array = np.zeros((0, 5))  # rows of the scene's robots
 
     def reset(self, rng: np.random.Generator) -> None:
         """Draw where on the circle the others start."""
@@ -75,7 +78,7 @@ class Cross(BaseTask):
         rim = s.circle * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
         middle = np.array([s.circle, 0.0])
         self._others = np.column_stack([middle + rim, angles - math.pi, middle - rim])
-        self.others: tuple[Cross, ...] = tuple(Cross(s, self.dt) for _ in range(s.robots - 1))
+        self.others = tuple(Cross(s, self.dt) for _ in range(s.robots - 1))
 
     def scene(self) -> Scene:
         return Scene(np.zeros((0, 3)), np.zeros((0, 4)), self.goal, self._others)
