@@ -20,10 +20,13 @@ _FOUND, _FORCE, _NET = 1, 2, 3  # data bits and reduction of MuJoCo's contact se
 def build(robot: Robot, scene: Scene | None = None) -> mujoco.MjModel:
     """Compile the model of `robot` on a floor, with a scene. Actuator i drives joint i of the robot's file.
 
-    The MJCF's own actuators, sensors and keyframes are replaced. Raises ConfigError naming what the MJCF lacks.
+    The MJCF's own actuators, sensors and keyframes are replaced. Raises ConfigError naming what the MJCF lacks, and
+    ValueError for a scene of other robots and obstacles: what a robot feels is told by its place among robots alone.
     """
-    result = spec(robot, count_robots(scene))
+    result = spec(robot, robots := count_robots(scene))
     if scene is not None:
+        if robots > 1 and len(scene.pillars) + len(scene.spheres):
+            raise ValueError("a scene has other robots, or pillars and spheres, but not yet both")
         add_scene(result, scene)
     return result.compile()
 
@@ -164,6 +167,6 @@ def _add_sensors(model: mujoco.MjSpec, robot: Robot, number: int, robots: int) -
         add(f"{name}_position", kind.mjSENS_FRAMEPOS, obj.mjOBJ_SITE, own + site)
         add(f"{name}_velocity", kind.mjSENS_FRAMELINVEL, obj.mjOBJ_SITE, own + site)
         add(f"{name}_up", kind.mjSENS_FRAMEZAXIS, obj.mjOBJ_SITE, own + site)
-    for other in set(range(robots)) - {number}:  # by the scene's prefix, since to be touched is the scene's matter
+    for other in (i for i in range(robots) if i != number):  # of the scene's sensors: what it touches beside the floor
         base = prefix(other) + robot.base
         add(f"{PREFIX}robot{other}", kind.mjSENS_CONTACT, obj.mjOBJ_XBODY, base, intprm=[_FOUND, 0, 1], **whole)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_scene import TICK, state
@@ -70,6 +72,8 @@ def test_rows_are_views_of_the_one_world(robot: Robot) -> None:
         crowd.reset(np.array([0]))
     with pytest.raises(ValueError, match="not a world of 2 robots"):
         Crowd(one, 2)
+    with pytest.raises(ValueError, match="not yet both"):
+        build(robot, replace(scene((1.0, 0.0, 0.0)), pillars=np.ones((1, 3))))
 
 
 @pytest.mark.parametrize("randomise", [False, True])
