@@ -79,7 +79,11 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Percept:
-    """What else a task may know, in the odometry frame, with its age and where it came from."""
+    """What else a task may know, in the odometry frame, with its age and where it came from.
+
+    `robots` are the others that share the floor, as a camera sees them: where their bases are and where they face. How
+    fast they go, a task tells from where they were before.
+    """
 
     source: str  # "task", "scene", or the name of an external feed
     age: float  # s
@@ -98,6 +102,7 @@ class Scene:
     pillars: Array  # (n, 3) m: x, y, radius; they stand where they are
     spheres: Array  # (m, 4): x, y, radius m and speed m/s; they roll straight toward the robot
     goal: Array | None = None  # (2,) m, a mark on the floor that the robot sees
+    robots: Array | None = None  # (n, 5): where the other robots start, x, y m and heading rad, and their goals, x, y m
 
 
 class Surroundings(Protocol):
@@ -301,7 +306,10 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """What a run went through, by the estimate or by the truth; one row a tick."""
+    """What a run went through, by the estimate or by the truth; one row a tick.
+
+    The truth of a world of several robots says of any of them whether it fell or touched something.
+    """
 
     dt: float
     displacement: Array  # (ticks, 3) m

@@ -1,13 +1,18 @@
-"""The simulated body behind the hardware contracts: one world, whose time advances when its clock is slept on."""
+"""The simulated body behind the hardware contracts: one world, whose time advances when its clock is slept on.
+
+Where the scene has other robots, they are in the same world, each a body of its own behind the same contracts.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
 from hw.hal import Array, Command, Mode, Observation, Percept, Scene, State
 from hw.robot import Robot
 from sim.model import build
-from sim.scene import Stage
+from sim.scene import Stage, count_robots
 from sim.truth import Truth
 from sim.worlds import Worlds
 
@@ -15,24 +20,35 @@ from sim.worlds import Worlds
 class SimBackend:
     """A robot in MuJoCo. `truth` and `stage` are for evaluation; of them, the loop is only shown what `look` sees.
 
-    `stage` is the scene in play, None without one.
+    `stage` is the scene in play, None without one. `others` are the bodies of the scene's other robots; `before_step`
+    is called before time goes on by a tick, for whoever drives them.
     """
 
     name = "sim"
 
     def __init__(self, robot: Robot, *, seed: int = 0, randomise: bool = False, scene: Scene | None = None) -> None:
+        n = count_robots(scene)
         self._robot = robot
-        self._worlds = Worlds(robot, 1, threads=1, randomise=float(randomise), model=build(robot, scene))
-        self._worlds.reset(np.array([0]), [np.random.default_rng([seed, 0])])
-        self._command = Command(robot.home[None], np.zeros((1, len(robot.joints))), Mode.OFF)
+        self._worlds = Worlds(
+            robot, n, threads=1, randomise=float(randomise), model=build(robot, scene), together=n > 1
+        )
+        rngs = [np.random.default_rng([seed, number]) for number in range(n)]
+        places = np.zeros((n, 3))
+        if scene is not None and scene.robots is not None:
+            places[1:] = scene.robots[:, :3]
+        self._worlds.reset(np.arange(n), rngs, places=places if n > 1 else None)
+        self._commands = [Command(robot.home, np.zeros(len(robot.joints)), Mode.OFF)] * n
         self.clock = SimClock(self)
+        self.before_step: Callable[[], None] = lambda: None
         self.stage: Stage | None = None
+        self.others: tuple[OtherBody, ...] = ()
         if scene is not None:
             self.stage = Stage(scene, self.truth, robot.dt, lambda places: self._worlds.move(0, places))
+            self.others = tuple(OtherBody(self, scene, number) for number in range(1, n))
 
     @property
     def truth(self) -> Truth:
-        """The world's truth; arrays have a leading dimension of one."""
+        """The world's truth; arrays have a leading dimension of one, or of all robots, this one first."""
         return self._worlds.truth
 
     @property
@@ -42,11 +58,13 @@ class SimBackend:
 
     def connect(self) -> tuple[SimSensors, SimMotors]:
         """The robot stands on the ground at its home pose with torque off."""
-        return SimSensors(self._worlds), SimMotors(self)
+        return SimSensors(self._worlds, 0), SimMotors(self, 0)
 
     def push(self, velocity: Array) -> None:
         """Change the base's velocity by `(2,)` m/s, world frame."""
-        self._worlds.push(np.asarray(velocity)[None])
+        changes = np.zeros((self._worlds.n, 2))
+        changes[0] = velocity
+        self._worlds.push(changes)
 
     def look(self, state: State) -> Percept:
         """What the robot sees of the scene (see `hw.hal.Surroundings`)."""
@@ -54,7 +72,35 @@ class SimBackend:
         return self.stage.look(state)
 
     def close(self) -> None:
-        self._command = Command(self._command.position, self._command.gain, Mode.OFF)
+        self._commands[0] = _off(self._commands[0])
+
+    def _step(self) -> None:
+        """Let time go on by a tick."""
+        self.before_step()
+        position, gain = (np.stack([getattr(c, part) for c in self._commands]) for part in ("position", "gain"))
+        modes = np.array([command.mode for command in self._commands])
+        self._worlds.step(Command(position, gain, self._commands[0].mode), modes)
+
+
+class OtherBody:
+    """Another robot of the same world, by its number from 1 on. Its time goes on with the first one's."""
+
+    def __init__(self, world: SimBackend, scene: Scene, number: int) -> None:
+        self.name = world.name
+        self._world, self._number = world, number
+        self._stage = Stage(scene, world.truth, world._robot.dt, lambda places: None, number)
+        self.clock = OtherClock(world.clock)
+
+    def connect(self) -> tuple[SimSensors, SimMotors]:
+        """It stands where the scene puts it, at its home pose with torque off."""
+        return SimSensors(self._world._worlds, self._number), SimMotors(self._world, self._number)
+
+    def look(self, state: State) -> Percept:
+        """What it sees of the scene (see `hw.hal.Surroundings`)."""
+        return self._stage.look(state)
+
+    def close(self) -> None:
+        self._world._commands[self._number] = _off(self._world._commands[self._number])
 
 
 class SimClock:
@@ -69,38 +115,56 @@ class SimClock:
 
     def sleep_until(self, time_ns: int) -> None:
         while self.now_ns() + self._tick_ns <= time_ns:
-            self._backend._worlds.step(self._backend._command)
+            self._backend._step()
+
+
+class OtherClock:
+    """Simulated time [ns] of a robot that is driven between two steps of the world, and never sleeps by itself."""
+
+    def __init__(self, clock: SimClock) -> None:
+        self._clock = clock
+
+    def now_ns(self) -> int:
+        return self._clock.now_ns()
+
+    def sleep_until(self, time_ns: int) -> None:
+        if time_ns > self.now_ns():
+            raise RuntimeError("the time of a world of several robots goes on by the first one's clock alone")
 
 
 class SimSensors:
-    """Reads the world's sensors. Reading twice within a tick draws noise once."""
+    """Reads the sensors of a body of the world. Reading twice within a tick draws noise once."""
 
-    def __init__(self, worlds: Worlds) -> None:
-        self._worlds = worlds
+    def __init__(self, worlds: Worlds, number: int) -> None:
+        self._worlds, self._number = worlds, number
 
     def read(self) -> Observation:
-        o = self._worlds.observe()
+        o, i = self._worlds.observe(), self._number
         return Observation(
             time_ns=o.time_ns,
-            position=o.position[0],
-            velocity=o.velocity[0],
-            effort=o.effort[0],
-            temperature=o.temperature[0],
-            voltage=o.voltage[0],
-            age=o.age[0],
-            fault=o.fault[0],
-            orientation=o.orientation[0],
-            angular_velocity=o.angular_velocity[0],
-            specific_force=o.specific_force[0],
-            imu_age=o.imu_age[0],
+            position=o.position[i],
+            velocity=o.velocity[i],
+            effort=o.effort[i],
+            temperature=o.temperature[i],
+            voltage=o.voltage[i],
+            age=o.age[i],
+            fault=o.fault[i],
+            orientation=o.orientation[i],
+            angular_velocity=o.angular_velocity[i],
+            specific_force=o.specific_force[i],
+            imu_age=o.imu_age[i],
         )
 
 
 class SimMotors:
     """Takes commands; they act from the next tick on, after the servo's own delay."""
 
-    def __init__(self, backend: SimBackend) -> None:
-        self._backend = backend
+    def __init__(self, backend: SimBackend, number: int) -> None:
+        self._backend, self._number = backend, number
 
     def write(self, command: Command) -> None:
-        self._backend._command = Command(command.position[None].copy(), command.gain[None].copy(), command.mode)
+        self._backend._commands[self._number] = Command(command.position.copy(), command.gain.copy(), command.mode)
+
+
+def _off(command: Command) -> Command:
+    return Command(command.position, command.gain, Mode.OFF)

@@ -10,7 +10,8 @@ import mujoco
 from hw.config import ConfigError
 from hw.hal import Scene
 from hw.robot import Robot, Servo
-from sim.scene import add_scene
+from sim.crowd import add_others, prefix
+from sim.scene import PREFIX, add_scene, count_robots
 
 TIMESTEP = 0.004  # s
 _FOUND, _FORCE, _NET = 1, 2, 3  # data bits and reduction of MuJoCo's contact sensor
@@ -19,16 +20,36 @@ _FOUND, _FORCE, _NET = 1, 2, 3  # data bits and reduction of MuJoCo's contact se
 def build(robot: Robot, scene: Scene | None = None) -> mujoco.MjModel:
     """Compile the model of `robot` on a floor, with a scene. Actuator i drives joint i of the robot's file.
 
-    The MJCF's own actuators, sensors and keyframes are replaced. Raises ConfigError naming what the MJCF lacks.
+    The MJCF's own actuators, sensors and keyframes are replaced. Raises ConfigError naming what the MJCF lacks, and
+    ValueError for a scene of other robots and obstacles: what a robot feels is told by its place among robots alone.
     """
-    result = spec(robot)
+    result = spec(robot, robots := count_robots(scene))
     if scene is not None:
+        if robots > 1 and len(scene.pillars) + len(scene.spheres):
+            raise ValueError("a scene has other robots, or pillars and spheres, but not yet both")
         add_scene(result, scene)
     return result.compile()
 
 
-def spec(robot: Robot) -> mujoco.MjSpec:
-    """The editable model of `robot`, for scenes that add bodies to it. Raises ConfigError."""
+def spec(robot: Robot, robots: int = 1) -> mujoco.MjSpec:
+    """The editable model of so many times `robot`, for scenes that add bodies to it. Raises ConfigError."""
+    result = _load(robot)
+    result.option.timestep = TIMESTEP
+    result.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    result.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # 4.0.0's sparse Newton solver has a bug
+    result.option.iterations, result.option.ls_iterations = 10, 10
+    _add_floor(result)
+    if robots > 1:
+        add_others(result, robot.base, lambda: _load(robot), robots)
+    for number in range(robots):
+        for joint, servo in zip(robot.joints, robot.servos, strict=True):
+            _add_servo(result, prefix(number) + joint.name, servo)
+        _add_sensors(result, robot, number, robots)
+    return result
+
+
+def _load(robot: Robot) -> mujoco.MjSpec:
+    """The body of `robot` alone. Raises ConfigError."""
     path = Path(robot.mjcf)
     if not path.is_file():
         raise ConfigError(f"{robot.name}: mjcf: no such file: {path}")
@@ -39,14 +60,6 @@ def spec(robot: Robot) -> mujoco.MjSpec:
     _check(result, robot, path)
     for element in [*result.actuators, *result.sensors, *result.keys]:
         result.delete(element)
-    result.option.timestep = TIMESTEP
-    result.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    result.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # 4.0.0's sparse Newton solver has a bug
-    result.option.iterations, result.option.ls_iterations = 10, 10
-    _add_floor(result)
-    for joint, servo in zip(robot.joints, robot.servos, strict=True):
-        _add_servo(result, joint.name, servo)
-    _add_sensors(result, robot)
     return result
 
 
@@ -134,24 +147,26 @@ def _add_servo(model: mujoco.MjSpec, name: str, servo: Servo) -> None:
     )
 
 
-def _add_sensors(model: mujoco.MjSpec, robot: Robot) -> None:
-    """IMU for the estimator; soles and contacts for the truth."""
-    kind, obj = mujoco.mjtSensor, mujoco.mjtObj
+def _add_sensors(model: mujoco.MjSpec, robot: Robot, number: int, robots: int) -> None:
+    """Sensors of one of the robots: IMU for the estimator; soles and contacts for the truth."""
+    kind, obj, own = mujoco.mjtSensor, mujoco.mjtObj, prefix(number)
 
     def add(name: str, sensor: int, objtype: int, objname: str, **more: object) -> None:
-        model.add_sensor(name=name, type=sensor, objtype=objtype, objname=objname, **more)
+        model.add_sensor(name=own + name, type=sensor, objtype=objtype, objname=objname, **more)
 
-    add("gyro", kind.mjSENS_GYRO, obj.mjOBJ_SITE, robot.imu_site)
-    add("accelerometer", kind.mjSENS_ACCELEROMETER, obj.mjOBJ_SITE, robot.imu_site)
-    floor = {"objtype": obj.mjOBJ_GEOM, "objname": "floor"}
-    model.add_sensor(name="floor", type=kind.mjSENS_CONTACT, intprm=[_FOUND, 0, 1], **floor)
+    add("gyro", kind.mjSENS_GYRO, obj.mjOBJ_SITE, own + robot.imu_site)
+    add("accelerometer", kind.mjSENS_ACCELEROMETER, obj.mjOBJ_SITE, own + robot.imu_site)
+    whole = {"reftype": obj.mjOBJ_XBODY, "refname": own + robot.base}
+    add("floor", kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, "floor", intprm=[_FOUND, 0, 1], **whole)
     for name, foot in robot.feet.items():
-        body = model.geom(foot.geoms[0]).parent
-        body.add_site(name=f"{name}_foot", pos=foot.sole, group=4)
-        reftype = {"reftype": obj.mjOBJ_BODY, "refname": body.name}
-        model.add_sensor(
-            name=f"{name}_contact", type=kind.mjSENS_CONTACT, intprm=[_FOUND | _FORCE, _NET, 1], **floor, **reftype
-        )
-        add(f"{name}_position", kind.mjSENS_FRAMEPOS, obj.mjOBJ_SITE, f"{name}_foot")
-        add(f"{name}_velocity", kind.mjSENS_FRAMELINVEL, obj.mjOBJ_SITE, f"{name}_foot")
-        add(f"{name}_up", kind.mjSENS_FRAMEZAXIS, obj.mjOBJ_SITE, f"{name}_foot")
+        body = model.geom(own + foot.geoms[0]).parent
+        site = f"{name}_foot"
+        body.add_site(name=own + site, pos=foot.sole, group=4)
+        sole = {"reftype": obj.mjOBJ_BODY, "refname": body.name}
+        add(f"{name}_contact", kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, "floor", intprm=[_FOUND | _FORCE, _NET, 1], **sole)
+        add(f"{name}_position", kind.mjSENS_FRAMEPOS, obj.mjOBJ_SITE, own + site)
+        add(f"{name}_velocity", kind.mjSENS_FRAMELINVEL, obj.mjOBJ_SITE, own + site)
+        add(f"{name}_up", kind.mjSENS_FRAMEZAXIS, obj.mjOBJ_SITE, own + site)
+    for other in (i for i in range(robots) if i != number):  # of the scene's sensors: what it touches beside the floor
+        base = prefix(other) + robot.base
+        add(f"{PREFIX}robot{other}", kind.mjSENS_CONTACT, obj.mjOBJ_XBODY, base, intprm=[_FOUND, 0, 1], **whole)

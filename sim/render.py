@@ -13,10 +13,12 @@ import numpy as np
 
 from hw.hal import Array
 from hw.robot import Robot
-from sim.model import build
+from sim.crowd import prefix
+from sim.model import spec
 from sim.scene import PILLAR_COLOUR, PILLAR_HEIGHT, SPHERE_COLOUR
 
 AZIMUTH, ELEVATION, DISTANCE = 140.0, -20.0, 1.3  # degrees and m, of the camera that follows the robot
+ABOVE, ROOM = -40.0, 0.8  # degrees, and m for each m between robots, of the camera that shows several of them
 ASIDE = 30.0  # degrees that it looks past the goal, where there is one: both are in the picture all the way
 FOLLOW = 0.08  # share of the way to the robot that the camera goes each frame: calm, yet never far behind
 GOAL_COLOUR = (0.15, 0.65, 0.30, 0.8)
@@ -40,11 +42,16 @@ class Frame:
     plan: Array | None = None  # (n, 2) m: where the robot means to go
     pillars: Array | None = None  # (n, 3) m: x, y, radius
     spheres: Array | None = None  # (n, 3) m: x, y, radius; they lie on the ground
+    robots: Array | None = None  # (n, 3): x, y m and heading rad; of their joints nothing is known: at home
 
 
 def render(robot: Robot, frames: list[Frame], width: int = 640, height: int = 480) -> Iterator[Array]:
-    """Pictures `(height, width, 3)` uint8 of `frames`. Raises RenderError when there is no way to draw."""
-    model = build(robot)
+    """Pictures `(height, width, 3)` uint8 of `frames`, which all show as many robots.
+
+    Raises RenderError when there is no way to draw.
+    """
+    others = 0 if not frames or frames[0].robots is None else len(frames[0].robots)
+    model = spec(robot, 1 + others).compile()
     model.vis.quality.offsamples = 0  # in software, smoothing costs 28 against 400 ms a picture
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     data = mujoco.MjData(model)
@@ -63,17 +70,39 @@ def render(robot: Robot, frames: list[Frame], width: int = 640, height: int = 48
             if frames[0].goal is not None:
                 ahead = frames[0].goal - frames[0].place[:2]
                 camera.azimuth = np.degrees(np.arctan2(ahead[1], ahead[0])) + ASIDE
+            if others:
+                places = _places(frames[0])
+                camera.lookat[:2], camera.elevation = places.mean(0), ABOVE
+                camera.distance = DISTANCE + ROOM * float(np.ptp(places, axis=0).max())
         trail: list[Array] = []
         for frame in frames:
             data.qpos[0:3], data.qpos[3:7], data.qpos[joints] = frame.place, frame.orientation, frame.joints
+            for number in range(1, others + 1):
+                _stand(model, data, robot, number, frame)
             mujoco.mj_kinematics(model, data)
             mujoco.mj_camlight(model, data)
-            camera.lookat[:2] += FOLLOW * (frame.place[:2] - camera.lookat[:2])
+            places = _places(frame)
+            camera.lookat[:2] += FOLLOW * (places.mean(0) - camera.lookat[:2])
             renderer.update_scene(data, camera)
-            if not trail or np.linalg.norm(frame.place[:2] - trail[-1]) > 0.02:
-                trail.append(frame.place[:2].copy())
+            if not trail or np.linalg.norm(frame.place[:2] - trail[-len(places)]) > 0.02:
+                trail += list(places)
             _draw(renderer.scene, frame, trail)
             yield renderer.render()
+
+
+def _places(frame: Frame) -> Array:
+    """Where robots are in a frame `(n, 2)` m, the one that is shown moving first."""
+    return np.vstack([frame.place[:2], *(frame.robots[:, :2] if frame.robots is not None else ())])
+
+
+def _stand(model: mujoco.MjModel, data: mujoco.MjData, robot: Robot, number: int, frame: Frame) -> None:
+    """Put another robot, by its number, where the frame has it."""
+    assert frame.robots is not None
+    x, y, heading = frame.robots[number - 1]
+    joints = [int(model.joint(prefix(number) + name).qposadr[0]) for name in robot.names]
+    base = number * (model.nq // (1 + len(frame.robots)))
+    data.qpos[base : base + 7] = x, y, robot.standing_height, np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)
+    data.qpos[joints] = robot.home
 
 
 def _draw(scene: mujoco.MjvScene, frame: Frame, trail: list[Array]) -> None:

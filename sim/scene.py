@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from hw.hal import Array, Percept, Scene, State, Truth
+from sim.crowd import prefix
 
 PREFIX = "scene/"  # of the names of a scene's bodies, which follow the robot's
 PILLAR_HEIGHT = 0.4  # m: taller than the robot's shoulders
@@ -47,9 +48,14 @@ def _add_geom(
     )
 
 
+def count_robots(scene: Scene | None) -> int:
+    """How many robots are in a world with this scene."""
+    return 1 if scene is None or scene.robots is None else 1 + len(scene.robots)
+
+
 def robot_bodies(model: mujoco.MjModel) -> int:
-    """How many of a model's bodies, the first ones, are the world's and the robot's, and not a scene's."""
-    return next((i for i in range(model.nbody) if model.body(i).name.startswith(PREFIX)), model.nbody)
+    """How many of a model's bodies, the first ones, are the world's and the first robot's, and not a scene's."""
+    return next((i for i in range(model.nbody) if model.body(i).name.startswith((PREFIX, prefix(1)))), model.nbody)
 
 
 def scene_sensors(model: mujoco.MjModel) -> Array:
@@ -74,11 +80,15 @@ def from_plain(values: dict[str, Any]) -> Scene:
 
 
 class Stage:
-    """A scene in play. `move` puts the spheres' centres `(m, 3)` m into the world, before time goes on."""
+    """A scene in play, as one of its robots sees it: by default the first, whom spheres pursue.
 
-    def __init__(self, scene: Scene, truth: Truth, dt: float, move: Callable[[Array], None]) -> None:
+    `move` puts the spheres' centres `(m, 3)` m into the world, before time goes on.
+    """
+
+    def __init__(self, scene: Scene, truth: Truth, dt: float, move: Callable[[Array], None], robot: int = 0) -> None:
         self.scene = scene
-        self._truth, self._dt, self._move = truth, dt, move
+        self._truth, self._dt, self._move, self._robot = truth, dt, move, robot
+        self._goal = scene.goal if robot == 0 or scene.robots is None else scene.robots[robot - 1, 3:]
         self._spheres = scene.spheres[:, :2].copy()
 
     @property
@@ -88,13 +98,18 @@ class Stage:
 
     def look(self, state: State) -> Percept:
         """What is seen, in the odometry frame of `state`: right relative to the robot, wherever it believes to be."""
-        base, yaw = self._truth.position[0, :2].copy(), float(self._truth.yaw[0])
+        base, yaw = self._truth.position[self._robot, :2].copy(), float(self._truth.yaw[self._robot])
         obstacles = self.obstacles
         obstacles[:, :2] = _seen(obstacles[:, :2], base, yaw, state)
-        goal = None if self.scene.goal is None else _seen(self.scene.goal[None], base, yaw, state)[0]
+        goal = None if self._goal is None else _seen(self._goal[None], base, yaw, state)[0]
+        robots = None
+        if self.scene.robots is not None:
+            others = np.arange(len(self.scene.robots) + 1) != self._robot
+            places = _seen(self._truth.position[others, :2], base, yaw, state)
+            robots = np.column_stack([places, self._truth.yaw[others] + float(state.yaw) - yaw])
         if len(self._spheres):
             self._pursue(base)
-        return Percept(source="scene", age=0.0, goal=goal, obstacles=obstacles)
+        return Percept(source="scene", age=0.0, goal=goal, obstacles=obstacles, robots=robots)
 
     def _pursue(self, base: Array) -> None:
         """Let the spheres roll toward the robot for a tick."""

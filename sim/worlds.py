@@ -16,6 +16,7 @@ from hw.config import ConfigError
 from hw.hal import Array, Command, Mode, Observation
 from hw.legs import Legs
 from hw.robot import Robot
+from sim.crowd import Crowd
 from sim.model import TIMESTEP, build
 from sim.randomise import COMMAND_DELAY, LATENCY, Body, draw
 from sim.scene import robot_bodies
@@ -30,11 +31,19 @@ _KP, _VMAX = 4, 7  # indices in a dcmotor's gainprm
 class Worlds:
     """`n` bodies. Commands and observations are `(n, ...)`.
 
-    `threads` 0 takes all cores; `randomise` is the share of episodes on a randomised robot.
+    `threads` 0 takes all cores; `randomise` is the share of episodes on a randomised robot. `together` puts all bodies
+    into one world, whose `model` must hold them; its floor has the friction that was drawn with the last of them.
     """
 
     def __init__(
-        self, robot: Robot, n: int, *, threads: int = 0, randomise: float = 0.0, model: mujoco.MjModel | None = None
+        self,
+        robot: Robot,
+        n: int,
+        *,
+        threads: int = 0,
+        randomise: float = 0.0,
+        model: mujoco.MjModel | None = None,
+        together: bool = False,
     ) -> None:
         self.robot, self.n, self.randomise = robot, n, randomise
         self.model = build(robot) if model is None else model
@@ -42,7 +51,7 @@ class Worlds:
         if abs(self.substeps * TIMESTEP - robot.dt) > 1e-9:
             whole = round(1 / TIMESTEP)
             raise ConfigError(f"{robot.name}: rate: {robot.rate} does not divide the physics' {whole} steps a second")
-        self.batch = Batch(self.model, n, threads)
+        self.batch: Batch | Crowd = Crowd(self.model, n) if together else Batch(self.model, n, threads)
         self._legs = Legs(robot)
         self._bodies = robot_bodies(self.model)
         joints = [self.model.joint(name) for name in robot.names]
@@ -83,19 +92,24 @@ class Worlds:
         self._noise, self._noise_block = np.zeros((n, _NOISE_ROWS, 6 + nj)), np.full(n, -1)
         self._commands = np.zeros((n, self._delayed, nj))  # oldest first
         self._play = np.zeros((n, nj))
-        self._record = {
-            "qpos": np.zeros((n, span, self.model.nq)),
-            "qvel": np.zeros((n, span, self.model.nv)),
-            "sensordata": np.zeros((n, span, self.model.nsensordata)),
-            "actuator_force": np.zeros((n, span, self.model.nu)),
-        }
+        recorded = ("qpos", "qvel", "sensordata", "actuator_force")
+        self._record = {key: np.zeros((n, span, b.bind(key).shape[1])) for key in recorded}
         self._fresh = {key: value[:, -self.substeps :].copy() for key, value in self._record.items()}
         self.ticks = np.zeros(n, int)  # since each world's reset
         self.tick = 0
         self.truth = Truth(self.model, robot, self._state_qpos, self._state_qvel, self._sensors)
 
-    def reset(self, ids: Array, rngs: Sequence[np.random.Generator], joints: Array | None = None) -> None:
-        """Put worlds `ids` on the ground at pose `joints` `(len(ids), n_joints)` (default: home); draws new robots."""
+    def reset(
+        self,
+        ids: Array,
+        rngs: Sequence[np.random.Generator],
+        joints: Array | None = None,
+        places: Array | None = None,
+    ) -> None:
+        """Put worlds `ids` on the ground at pose `joints` `(len(ids), n_joints)` (default: home); draws new robots.
+
+        `places` `(len(ids), 3)`, x, y m and heading rad: where they stand and face, by default the origin and along x.
+        """
         pose = np.broadcast_to(self.robot.home if joints is None else joints, (len(ids), len(self.robot.joints)))
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for i, rng in zip(ids, rngs, strict=True):
@@ -103,6 +117,9 @@ class Worlds:
             self._place(i, draw(rng, self.robot, self._bodies, rng.random() < self.randomise))
         self._state_qpos[ids] = 0.0
         self._state_qpos[ids, 2], self._state_qpos[ids, 3:7] = self._legs.stand(pose - self._zero[ids])
+        if places is not None:
+            self._state_qpos[ids, :2] = places[:, :2]
+            self._state_qpos[ids, 3:7] = _headed(self._state_qpos[ids, 3:7], places[:, 2])
         self._state_qpos[ids[:, None], self._qpos] = pose - self._zero[ids]
         self._state_qvel[ids] = 0.0
         if self.randomise > 0:
@@ -112,7 +129,7 @@ class Worlds:
         self._commands[ids] = pose[:, None]
         self._play[ids] = pose - self._zero[ids]
         for key, value in self._record.items():
-            value[ids] = getattr(self.batch, key)[ids][:, None]
+            value[ids] = self.batch.bind(key)[ids][:, None]
         # The limp body has just been put down; its sensors have read a standing one for long.
         self._record["sensordata"][ids, :, 0:3] = 0.0
         self._record["sensordata"][ids, :, 3:6] = -_GRAVITY * self.truth.gravity[ids][:, None]
@@ -127,21 +144,25 @@ class Worlds:
         self._gyro_bias[i], self._acc_bias[i], self._tilt[i] = body.gyro_bias, body.accelerometer_bias, body.imu_tilt
         self._floor[i, 0] = body.friction
         if self.randomise > 0:
-            own = slice(self._bodies)
-            self._mass[i, own] = self.model.body_mass[own] * body.mass
-            self._inertia[i, own] = self.model.body_inertia[own] * body.mass[:, None]
+            own = slice(1, self._bodies)  # the world itself has no mass
+            self._mass[i, own] = self.model.body_mass[own] * body.mass[own]
+            self._inertia[i, own] = self.model.body_inertia[own] * body.mass[own, None]
 
-    def step(self, command: Command) -> None:
-        """Advance by one tick under `command`, whose arrays are `(n, n_joints)` or broadcast to it."""
+    def step(self, command: Command, modes: Array | None = None) -> None:
+        """Advance by one tick under `command`, whose arrays are `(n, n_joints)` or broadcast to it.
+
+        `modes` `(n,)` are of `Mode`, where the bodies have other ones than the command.
+        """
         self._commands[:, :-1] = self._commands[:, 1:]
         self._commands[:, -1] = command.position
-        gain = command.gain if command.mode is Mode.ACTIVE else 0.0
+        mode = np.broadcast_to(command.mode if modes is None else modes, self.n)[:, None]
+        gain = np.where(mode == Mode.ACTIVE, command.gain, 0.0)
         scale = (self._supply[:, None] / self._nominal_voltage) * (
             self._stiffness[:, None] * self._nominal_stiffness / self._nominal_stiffness[0]
         )
         self._gain[:, :, _KP] = scale * gain
         self._gain[:, :, _VMAX] = self._supply[:, None]
-        limit = 0.0 if command.mode is Mode.OFF else self._braking
+        limit = np.where(mode == Mode.OFF, 0.0, self._braking)
         self._force[:, :, 0], self._force[:, :, 1] = -limit, limit
 
         # The command in force at a substep is the newest that was written at least `delay` before it.
@@ -217,3 +238,9 @@ def _tilt(vector: Array, angles: Array) -> Array:
     """Turn `(n, 3)` by small angles `(n, 2)` about x and y."""
     x, y = angles[:, 0], angles[:, 1]
     return vector + np.stack([y * vector[:, 2], -x * vector[:, 2], x * vector[:, 1] - y * vector[:, 0]], -1)
+
+
+def _headed(orientation: Array, heading: Array) -> Array:
+    """Quaternions `(n, 4)` w x y z turned about the vertical by `(n,)` rad."""
+    (w, x, y, z), c, s = orientation.T, np.cos(heading / 2), np.sin(heading / 2)
+    return np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], -1)

@@ -15,16 +15,17 @@ from hw.robot import Robot
 @dataclass(frozen=True)
 class Kind:
     """A kind of body. A simulated one takes a seed and has a clock that a run drives as fast as it can; another one is
-    reached by a port. `options` are for its constructor."""
+    reached by a port. `several` says whether a scene may hold other robots. `options` are for its constructor."""
 
     module: str
     attribute: str
     simulated: bool
+    several: bool = False
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
 BACKENDS = {
-    "sim": Kind("sim.backend", "SimBackend", simulated=True),
+    "sim": Kind("sim.backend", "SimBackend", simulated=True, several=True),
     "virtual": Kind("sim.rig.backend", "VirtualBackend", simulated=True),
     "dynamixel": Kind("hw.dynamixel.backend", "DynamixelBackend", simulated=False, options={"exact": True}),
 }
@@ -40,11 +41,14 @@ def backend_kind(name: str) -> Kind:
 def make_backend(
     name: str, robot: Robot, *, seed: int, randomise: bool, port: str | None, scene: Scene | None = None
 ) -> Backend:
-    """A body, not yet connected, with a scene around a simulated one.
+    """A body, not yet connected, with a scene around a simulated one: who runs a real robot puts up what it asks for.
 
     Raises ConfigError for an unknown name or a setting that it does not take.
     """
     kind = backend_kind(name)
+    if scene is not None and scene.robots is not None and not kind.several:
+        able = ", ".join(f"--backend {other}" for other, its in BACKENDS.items() if its.several)
+        raise ConfigError(f"backend '{name}' has one robot, and the task asks for {len(scene.robots) + 1}: give {able}")
     if kind.simulated and port is not None:
         raise ConfigError(f"backend '{name}' has no port: drop --port, or choose --backend dynamixel")
     if not kind.simulated and port is None:

@@ -22,6 +22,7 @@ from stack.event import Event
 from stack.interrupt import Interrupt, Stops
 from stack.loop import Listener, Loop, TickRecord
 from stack.odometry import load_odometry
+from stack.others import Others, OtherTask
 from stack.policies import make_policy, policy_fingerprint
 from stack.safety import Guard, Phase
 from stack.steady import steady
@@ -119,10 +120,13 @@ def run(
         seed=settings.seed,
         randomise=settings.randomise,
         port=settings.port,
-        scene=scene if simulated else None,  # who runs a real robot puts up what the task says
+        scene=scene,
     )
     if scene is not None and simulated and getattr(body, "stage", None) is None:
         raise ConfigError(f"task '{task.name}' has a scene: make the backend with it (stack.session.prepare does)")
+    tasks: tuple[OtherTask, ...] = getattr(task, "others", ())
+    if tasks and policy is not None:
+        raise ConfigError(f"task '{task.name}' has {len(tasks) + 1} robots, each with its own policy: name one instead")
     with ExitStack() as stack:
         if hasattr(task, "close"):
             stack.callback(task.close)
@@ -153,6 +157,21 @@ def run(
         director = Director(robot, guard, estimator, task, pilot, push, look)
         tally = _Tally()
         listeners: list[Listener] = [tally]
+        others = None
+        if tasks:
+            # Their planners never run beside the loop: the log, which is the first robot's, has to repeat them.
+            others = Others(
+                robot,
+                body,
+                tasks,
+                lambda its: make_policy(settings.policy, robot, its, realtime=False),
+                guard,
+                interrupt,
+                settings.seed,
+                gain,
+            )
+            stack.callback(others.close)
+            listeners.append(others)
         recorder = None
         if settings.record is not None:
             from stack.provenance import header
@@ -181,6 +200,8 @@ def run(
         )
         try:
             loop.run()
+            if others is not None:
+                others.finish()
         except BaseException as error:
             if recorder is not None:
                 recorder.events(guard.events())

@@ -30,8 +30,13 @@ def goal(log: FlightLog) -> Array | None:
 
 def obstacles(log: FlightLog) -> Array | None:
     """What was seen in the way at each tick of the task, `(ticks, n, 3)` m: x, y, radius, odometry frame."""
-    seen = [message["obstacles"] for message in log.messages["/instruction"] if "obstacles" in message]
-    return np.array([unpack(value) for value in seen]) if seen and len(seen) == len(task_ticks(log)) else None
+    return _seen(log, "obstacles")
+
+
+def robots(log: FlightLog) -> Array | None:
+    """Where the other robots were seen at each tick of the task, `(ticks, n, 3)`: x, y m, heading rad, odometry
+    frame."""
+    return _seen(log, "robots")
 
 
 def plans(log: FlightLog) -> list[DrawnPlan]:
@@ -48,3 +53,9 @@ def plans(log: FlightLog) -> list[DrawnPlan]:
         turn = np.array([[c, -s], [s, c]])
         found.append(DrawnPlan(int(message["tick"]), displacement[row, :2] + unpack(message["path"]) @ turn.T))
     return found
+
+
+def _seen(log: FlightLog, what: str) -> Array | None:
+    """What of a kind was perceived at each tick of the task; None where it was not at each."""
+    seen = [message[what] for message in log.messages["/instruction"] if what in message]
+    return np.array([unpack(value) for value in seen]) if seen and len(seen) == len(task_ticks(log)) else None

@@ -100,6 +100,10 @@ def _path(axes: Axes, log: FlightLog) -> None:
         axes.plot(*plan.path.T, color=PLAN, lw=0.8, alpha=0.6, label="plans" if number == 0 else None)
     axes.plot(place[:, 0], place[:, 1], color=ROBOT, lw=1.6, label="robot")
     axes.plot(*place[0, :2], "o", color=ROBOT, ms=5)
+    robots = flightpath.robots(log)
+    for number, path in enumerate(robots.swapaxes(0, 1) if robots is not None else ()):
+        axes.plot(*path[:, :2].T, color=OBSTACLE, lw=1.2, label="others, as seen" if number == 0 else None)
+        axes.plot(*path[0, :2], "o", color=OBSTACLE, ms=5)
     obstacles = flightpath.obstacles(log)
     for x, y, size in obstacles[-1] if obstacles is not None else ():
         turn = np.linspace(0.0, 2.0 * np.pi, 40)

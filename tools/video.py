@@ -32,7 +32,7 @@ def make_video(log: FlightLog, path: Path, width: int = 640, height: int = 480) 
     ticks, first = log.ticks("/state"), flightpath.task_ticks(log)
     place, orientation = log.column("/state", "displacement"), log.column("/state", "orientation")
     joints, goal, plans = log.column("/state", "position"), flightpath.goal(log), flightpath.plans(log)
-    obstacles = flightpath.obstacles(log)
+    obstacles, robots = flightpath.obstacles(log), flightpath.robots(log)
     rolling = len((log.header.get("scene") or {"spheres": ()})["spheres"])  # the last ones of the obstacles
     pillars = 0 if obstacles is None else obstacles.shape[1] - rolling
     step = max(1, round(robot.rate / FPS))
@@ -42,9 +42,11 @@ def make_video(log: FlightLog, path: Path, width: int = 640, height: int = 480) 
         running = [plan for plan in plans if plan.adopted <= ticks[row]]
         shown = running[-1].path if running and ticks[row] <= first[-1] else None
         frame = Frame(place[row], orientation[row], joints[row], goal, shown)
-        if obstacles is not None and len(first):
-            around = obstacles[np.clip(np.searchsorted(first, ticks[row]), 0, len(first) - 1)]
-            frame = replace(frame, pillars=around[:pillars], spheres=around[pillars:])
+        now = int(np.clip(np.searchsorted(first, ticks[row]), 0, len(first) - 1)) if len(first) else 0
+        if obstacles is not None:
+            frame = replace(frame, pillars=obstacles[now][:pillars], spheres=obstacles[now][pillars:])
+        if robots is not None:
+            frame = replace(frame, robots=robots[now])
         frames.append(frame)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:

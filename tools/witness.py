@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 
 class Witness:
-    """An `on_tick` listener: one row for each tick of the task. `stage` is the scene in play, where there is one."""
+    """An `on_tick` listener: one row for each tick of the task. `stage` is the scene in play, where there is one.
+
+    In a world of several robots it follows the first; that any of them fell or touched another counts.
+    """
 
     def __init__(self, truth: Truth, dt: float, stage: Stage | None = None) -> None:
         self._truth, self._dt, self._stage = truth, dt, stage
@@ -23,6 +26,7 @@ class Witness:
         self._joints: list[Array] = []
         self._up: list[Array] = []
         self._obstacles: list[Array] = []
+        self._robots: list[Array] = []
         self._fallen = self._touched = False
         self.upright = 0  # ticks of the task before the robot had fallen
 
@@ -30,13 +34,14 @@ class Witness:
         instruction, truth = record.proposal.instruction, self._truth
         if instruction is None:
             return
-        self._fallen |= bool(truth.fallen[0])
+        self._fallen |= bool(truth.fallen.any())
         self.upright += not self._fallen
         self._joints.append(truth.joints[0].copy())
         self._up.append(-truth.gravity[0])
         if self._stage is not None:
-            self._touched |= bool(truth.touching[0])
+            self._touched |= bool(truth.touching.any())
             self._obstacles.append(self._stage.obstacles)
+            self._robots.append(np.column_stack([truth.position[1:, :2], truth.yaw[1:]]))
         rate = -float(truth.gravity[0] @ truth.angular_velocity[0])
         self._rows.append(
             (truth.position[0].copy(), float(truth.yaw[0]), truth.velocity[0], rate, instruction.velocity)
@@ -60,8 +65,12 @@ class Witness:
             fallen=self._fallen,
             joints=np.array(self._joints),
             obstacles=_turned(np.array(self._obstacles) - origin, yaw[0]) if self._obstacles else None,
+            robots=_turned(np.array(self._robots) - [*origin[:2], yaw[0]], yaw[0]) if self._others() else None,
             touched=self._touched if self._obstacles else None,
         )
+
+    def _others(self) -> bool:
+        return bool(self._robots) and len(self._robots[0]) > 0
 
     def poses(self) -> Poses:
         """All poses before the robot had fallen."""

@@ -7,6 +7,7 @@ from hw.hal import Task
 from hw.overrides import override
 from hw.robot import Robot
 from stack.tasks.base import BaseTask, Settings
+from stack.tasks.cross import Cross
 from stack.tasks.forest import Forest
 from stack.tasks.goal import Goal
 from stack.tasks.inbetween import Inbetween
@@ -20,7 +21,7 @@ from stack.tasks.velocity import Velocity
 from stack.tasks.walk import Walk
 
 _CLASSES: tuple[type[BaseTask], ...] = (
-    Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Inbetween, Survive, Text, Steer,
+    Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Cross, Inbetween, Survive, Text, Steer,
 )  # fmt: skip
 _TASKS: dict[str, tuple[type[BaseTask], str]] = {
     **{task.name: (task, task.description) for task in _CLASSES},

@@ -383,7 +383,7 @@ def test_text_takes_a_sentence_and_refuses_an_empty_or_foreign_one() -> None:
             load_task("text", {"sentence": sentence})
 
 
-@pytest.mark.parametrize("name", ["forest", "obstacle", "path", "velocity", "text", "survive"])
+@pytest.mark.parametrize("name", ["forest", "obstacle", "cross", "path", "velocity", "text", "survive"])
 def test_costs_can_be_sent_to_the_planner_with_gradients(name: str) -> None:
     """A planner in a process of its own is given the cost; it has a gradient on every trajectory."""
     task = load_task(name, {}, DT)

@@ -52,6 +52,7 @@ def measure(robot_name: str, worlds: int, ticks: int) -> dict[str, float]:
     spent = {"training": 0.0, "raw": 0.0}
     for tick in range(10 + ticks):
         action = 0.2 * rng.standard_normal((worlds, len(robot.joints)))
+        assert isinstance(source.batch, Batch)
         raw.state[:] = source.batch.state
         begun = time.perf_counter()
         env.step(action)

@@ -25,7 +25,7 @@ def draw_paths(records: Sequence[Mapping[str, Any]], title: str, out: Path) -> N
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    alone = any(record["pillars"] or record["spheres"] for record in records)
+    alone = any(record["pillars"] or record["spheres"] or record.get("others") for record in records)
     groups = [[record] for record in records[:PANELS]] if alone else [list(records)]
     columns = min(len(groups), 4)
     lines = math.ceil(len(groups) / columns)
@@ -59,6 +59,8 @@ def _episode(axes: Axes, record: Mapping[str, Any], bare: bool) -> None:
         x, y = zip(*sphere["path"], strict=True)
         axes.plot(x, y, color=OBSTACLE, linewidth=0.8, linestyle=":")
         axes.add_patch(Circle((x[-1], y[-1]), sphere["radius"], color=OBSTACLE, alpha=0.5))
+    for path in record.get("others", ()):  # an episode that was kept before there were any has none
+        axes.plot(*zip(*path, strict=True), color=OBSTACLE, linewidth=0.8)
     if record["path"]:
         x, y = zip(*record["path"], strict=True)
         colour = ROBOT if record["success"] else FAILED

@@ -68,6 +68,7 @@ def record(settings: Settings) -> dict[str, Any]:
         "goal": None if goal is None else np.round(goal, 3),
         "pillars": _still(trace),
         "spheres": _rolling(trace),
+        "others": _walking(trace),
     }
 
 
@@ -93,6 +94,11 @@ def _rolling(trace: Trace) -> list[dict[str, Any]]:
     return [
         {"radius": float(moving[0, i, 2]), "path": _points(moving[:, i, :2], trace.dt)} for i in range(moving.shape[1])
     ]
+
+
+def _walking(trace: Trace) -> list[Array]:
+    """Paths of the other robots."""
+    return [] if trace.robots is None else [_points(path[:, :2], trace.dt) for path in trace.robots.swapaxes(0, 1)]
 
 
 def _moved(obstacles: Array) -> Array:

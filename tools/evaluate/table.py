@@ -94,6 +94,10 @@ _BESIDE: tuple[Row, ...] = (
         "cloc/inbetween-mrpe", CLOC, "In-betweening: base", _INBETWEEN,
         Metric("metrics.mrpe_m", "m", lower=True), 0.322, figure=0.089,
     ),
+    Row(
+        "cloc/cross", CLOC, "Three robots cross: success", Run("cross", episodes=50), SUCCESS, quick=False,
+        note="the paper shows characters that avoid each other, and gives no figure",
+    ),
 )  # fmt: skip
 
 _SAMPLING: tuple[Row, ...] = (
