@@ -106,7 +106,10 @@ class Health:
         """An adapter that gathers bytes for longer than the bus waits: some ticks have their samples, by luck."""
         if not int(np.bitwise_or.reduce(observation.fault)) & LATE:
             return []
-        text = "answers come too late: set the adapter's latency timer to 1 ms (`servoid doctor` tells how)"
+        text = (
+            "answers come too late or not at all: set the adapter's latency timer to 1 ms (`servoid doctor` tells how), "
+            "and check its cable"
+        )
         return [Finding("lowered", "late", text)]
 
     def _heat(self, observation: Observation) -> list[Finding]:
@@ -116,6 +119,8 @@ class Health:
         for i in np.flatnonzero(temperature > limits.temperature).tolist():
             text = f"{self._names[i]} is at {temperature[i]:.0f} C: let it cool"
             found.append(Finding("lowered", "temperature", text, self._names[i]))
+        if found:
+            return found  # a leg that goes soft in mid-step would let the robot fall that is being lowered
         if limits.derate_temperature is not None:
             span = limits.temperature - limits.derate_temperature
             for i in self._weaken(_ramp((temperature - limits.derate_temperature) / span)):

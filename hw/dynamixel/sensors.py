@@ -19,7 +19,9 @@ from hw.imu.mounting import Mounting
 from hw.imu.serial_imu import SerialImu
 from hw.robot import Robot
 
-LATE_TICKS, LATE_SPAN = 4, 8  # of so many ticks, answers came late in so many: that is no accident
+# Of the last ticks, answers came late in so many, or something was still missing after the second request in so many:
+# that is no accident. An adapter that batches may let every sample through just before it counts as old.
+LATE_SPAN, LATE_TICKS, SHORT_TICKS = 8, 4, 6
 _PRESENT = np.dtype([("current", "<i2"), ("velocity", "<i4"), ("position", "<i4")])
 
 
@@ -41,6 +43,7 @@ class DynamixelSensors:
         self._board = GroupRead([(robot.bus.board_id, self._block.address, self._block.length)])
         self._stop = sum({BUTTONS[name] for name in robot.bus.stop_buttons})
         self._late: deque[bool] = deque(maxlen=LATE_SPAN)
+        self._short: deque[bool] = deque(maxlen=LATE_SPAN)
 
     def read(self) -> Observation:
         """All joints, the IMU, and a few servos' slow registers. A value that did not come at this tick is NaN."""
@@ -55,7 +58,8 @@ class DynamixelSensors:
         self._watch.press(self._block.buttons & self._stop != 0)
         self._watch.look(group.alert, hurry=not all(group.fresh))
         self._late.append(bus.counters.lost > lost and bus.counters.stray > stray)
-        late = LATE if sum(self._late) >= LATE_TICKS else 0
+        self._short.append(not (fresh and all(group.fresh)))
+        late = LATE if sum(self._late) >= LATE_TICKS or sum(self._short) >= SHORT_TICKS else 0
         now = bus.clock.now_ns()
         return Observation(
             time_ns=now,

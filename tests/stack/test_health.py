@@ -166,6 +166,15 @@ def test_a_blocked_joint_is_let_go_soft_before_its_servo_shuts_down_and_the_robo
     assert rig.guard.phase is Phase.LOWERING
 
 
+def test_a_robot_that_is_lowered_for_heat_keeps_its_strength() -> None:
+    rig = Rig().running()
+    rig.temperature[KNEE] = 75.0
+    rig.ticks_until("temperature")
+    rig.step(20)
+    assert rig.guard.phase is Phase.LOWERING
+    np.testing.assert_array_equal(rig.gain, 1.0)
+
+
 @pytest.mark.parametrize("case", ["sagging", "moving", "for a moment", "soft gains", "hot"])
 def test_work_is_not_taken_for_a_block(case: str) -> None:
     rig = Rig(gain=0.4 if case == "soft gains" else 1.0).running()
