@@ -47,7 +47,7 @@ class Settings:
     far_actions: float = 0.2
     min_snr: float = 0.0
     action_rate: float = 0.0
-    monotone: float = 0.0
+    monotone: float = 0.25
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
