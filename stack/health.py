@@ -107,7 +107,7 @@ class Health:
         if not int(np.bitwise_or.reduce(observation.fault)) & LATE:
             return []
         text = (
-            "answers come too late or not at all: set the adapter's latency timer to 1 ms (`servoid doctor` tells how), "
+            "answers come too late or not at all: set the adapter's latency timer to 1 ms (`servoid doctor` tells how) "
             "and check its cable"
         )
         return [Finding("lowered", "late", text)]

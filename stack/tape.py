@@ -18,9 +18,7 @@ class Tape:
         self._joints = joints
         self._rows: Array = np.full((min(ticks, _LONGEST) + 1, sum(_COLUMNS.values()) + joints), np.nan)
         self._length = 0
-        self._goals: list[Array | None] = []
-        self._obstacles: list[Array | None] = []
-        self._robots: list[Array | None] = []
+        self._seen: dict[str, list[Array]] = {"goal": [], "obstacles": [], "robots": []}  # where there was something
 
     def __len__(self) -> int:
         return self._length
@@ -41,9 +39,9 @@ class Tape:
             ]
         )
         self._length += 1
-        self._goals.append(percept.goal)
-        self._obstacles.append(percept.obstacles)
-        self._robots.append(percept.robots)
+        for name, rows in self._seen.items():
+            if (what := getattr(percept, name)) is not None:
+                rows.append(what)
 
     def trace(self, dt: float, fallen: bool) -> Trace:
         """All of it, with ticks of `dt` s."""
@@ -59,13 +57,12 @@ class Tape:
             command=part["command"],
             fallen=fallen,
             joints=joints,
-            goal=_stacked(self._goals),
-            obstacles=_stacked(self._obstacles),
-            robots=_stacked(self._robots),
+            goal=self._stacked("goal"),
+            obstacles=self._stacked("obstacles"),
+            robots=self._stacked("robots"),
         )
 
-
-def _stacked(rows: list[Array | None]) -> Array | None:
-    """Rows `(ticks, ...)` of what was perceived; None where there was nothing to perceive."""
-    present = [row for row in rows if row is not None]
-    return np.array(present) if present and len(present) == len(rows) else None
+    def _stacked(self, name: str) -> Array | None:
+        """Rows `(ticks, ...)` of what was perceived; None where at some tick nothing was."""
+        rows = self._seen[name]
+        return np.array(rows) if rows and len(rows) == self._length else None

@@ -7,6 +7,7 @@ the same backend. Wanted are no stop, no fall, and no memory that grows.
 from __future__ import annotations
 
 import argparse
+from array import array
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ class Watch:
         self._share, self._warm = args.share, round(args.warm_up * rate)
         self._truth = rig.truth()
         self.ticks = self.missed = 0
-        self.late: list[float] = []  # ms
+        self.late = array("d")  # ms
         self.fell = False
         self.start_mb = self.end_mb = self.rig_start_mb = self.rig_end_mb = 0.0
 
