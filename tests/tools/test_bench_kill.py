@@ -28,7 +28,8 @@ stopped by the guard after 1.0 s
 
 # A run that ends by the Ctrl-C, and its guardian, which does its work after that.
 RUN = """#!{python}
-import pathlib, subprocess, sys, time
+import pathlib, signal, subprocess, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # who starts tests in the background has it ignored
 work = "import sys, time; time.sleep(1.0); print('servoid guardian: torque is off', file=sys.stderr)"
 subprocess.Popen([sys.executable, "-c", work, "guardian.py"], start_new_session=True)
 print({said!r}, file=sys.stderr, flush=True)
