@@ -110,7 +110,7 @@ class Health:
             "answers come too late or not at all: set the adapter's latency timer to 1 ms (`servoid doctor` tells how) "
             "and check its cable"
         )
-        return [Finding("lowered", "late", text)]
+        return [Finding("now", "late", text)]
 
     def _heat(self, observation: Observation) -> list[Finding]:
         limits = self._limits

@@ -15,6 +15,8 @@ from sim.rig.backend import on_the_board
 from sim.rig.faults import Fault, Scenario
 from sim.rig.rig import Rig
 
+_TOGETHER_NS = 80_000_000  # after which ticks of 20 ms and batches of 16 ms begin together again
+
 
 class LocalLine:
     """The rig's line as a Port, and its time as a Clock, which sleeping lets pass.
@@ -74,6 +76,8 @@ class LocalBackend:
 
     def __init__(self, rig: Rig, *, seed: int = 0, randomise: bool = False) -> None:
         self.rig = rig
+        # Ticks and an adapter's batches fall together as in every run before: what happens does not depend on those.
+        rig.advance(-(-rig.now_ns // _TOGETHER_NS) * _TOGETHER_NS)
         rig.scenario = Scenario(seed=seed)
         rig.reset(seed, randomise=randomise)
         rig.take_accepted()

@@ -213,13 +213,22 @@ def test_gl_that_does_not_work_is_explained(tmp_path):
     assert "MUJOCO_GL=egl" in out
 
 
+def draws() -> bool:
+    """Whether MuJoCo can draw here at all, without a line of this project's."""
+    code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).render()"
+    drawn = [sys.executable, "-c", code]
+    kinds = [os.environ | {"MUJOCO_GL": name} for name in ("egl", "osmesa")]
+    return any(subprocess.run(drawn, env=kind, capture_output=True).returncode == 0 for kind in kinds)
+
+
 def test_a_goal_run_is_filmed_and_plotted(tmp_path):
     av = pytest.importorskip("av")
     process = start("run", "goal", "--policy", "gait", "--seconds", "2", "--video", "a.mp4")
     out, err = process.communicate(timeout=120)
     assert process.returncode == 1, err  # two seconds do not reach it
-    if "no video" in out:
-        pytest.skip(out)
+    if not draws():
+        pytest.skip("MuJoCo itself cannot draw on this machine")
+    assert "no video" not in out
     with av.open(str(tmp_path / "a.mp4")) as container:
         pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert len(pictures) >= 50

@@ -205,7 +205,7 @@ def _judge(verdict: Verdict, robot: Robot, body: Witnessed, watch: _Watch, outco
         verdict.problems.append(f"still driven at the end: {', '.join(body.later)}")
     if verdict.ended == "damped" and named_ns is not None:
         verdict.off_seconds = _off_seconds(body.accepted, named_ns)
-        latest = OFF_SECONDS + (LOWER_SECONDS if Phase.LOWERING in watch.phases else 0.0)  # maybe broken off
+        latest = OFF_SECONDS + (LOWER_SECONDS if in_order else 0.0)
         if verdict.off_seconds is not None and verdict.off_seconds > latest:
             verdict.problems.append(f"torque off {verdict.off_seconds:.2f} s after it was named")
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from hw.config import ConfigError
 from hw.hal import Array
-from tools.train.timed import Survival, TimedTrainer, same_network
+from tools.train.timed import Survival, TimedTrainer, add_run_arguments, same_network
 
 if TYPE_CHECKING:
     import torch
@@ -53,11 +53,7 @@ class Settings:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid train diffusion`."""
     d = Settings()
-    parser.add_argument("--data", type=Path, required=True, help="dataset folder, as `servoid collect` writes it")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the run: checkpoints, logs, learning curve")
-    parser.add_argument("--robot", default="op3", help="robot name or file (default op3)")
-    parser.add_argument("--minutes", type=float, default=d.minutes, help="training time; evaluations come on top")
-    parser.add_argument("--resume", action=argparse.BooleanOptionalAction, default=True, help="continue in --out")
+    add_run_arguments(parser, d.minutes, d.evaluate_every, "validation loss")
     parser.add_argument("--init", type=Path, help="checkpoint to begin from; its normalisation is kept")
     parser.add_argument(
         "--latent", type=Path, help="plan latents of this file (`servoid train latent`), not joint targets"
@@ -83,12 +79,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--monotone", type=float, default=d.monotone, help="share of windows with rising noise levels, 0 to 0.5"
     )
     parser.add_argument("--precision", choices=("bf16", "fp32"), default=d.precision)
-    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch threads (default: all cores)")
-    parser.add_argument("--evaluate-every", type=float, default=d.evaluate_every, help="minutes; 0: only at the end")
-    parser.add_argument("--survival-seconds", type=float, default=10.0)
-    parser.add_argument("--survival-worlds", type=int, default=32, help="0: keep the best by validation loss instead")
-    parser.add_argument("--licence", default="Apache-2.0", help="licence of the data, kept in the checkpoint")
-    parser.add_argument("--seed", type=int, default=d.seed)
 
 
 def main(args: argparse.Namespace) -> int:

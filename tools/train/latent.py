@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hw.config import ConfigError
-from tools.train.timed import Survival, TimedTrainer, same_network
+from tools.train.timed import Survival, TimedTrainer, add_run_arguments, same_network
 
 if TYPE_CHECKING:
     from hw.robot import Robot
@@ -50,11 +50,7 @@ class Settings:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid train latent`."""
     d = Settings()
-    parser.add_argument("--data", type=Path, required=True, help="dataset folder, as `servoid collect` writes it")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the run: checkpoints, logs, learning curve")
-    parser.add_argument("--robot", default="op3", help="robot name or file (default op3)")
-    parser.add_argument("--minutes", type=float, default=d.minutes, help="training time; evaluations come on top")
-    parser.add_argument("--resume", action=argparse.BooleanOptionalAction, default=True, help="continue in --out")
+    add_run_arguments(parser, d.minutes, d.evaluate_every, "reconstruction")
     parser.add_argument("--size", type=int, default=16, help="numbers of a latent")
     parser.add_argument("--width", type=int, default=256, help="of hidden layers")
     parser.add_argument("--layers", type=int, default=2, help="hidden ones")
@@ -64,12 +60,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--beta", type=float, nargs=2, default=d.beta, metavar=("FIRST", "LAST"), help="weight of the KL divergence"
     )
     parser.add_argument("--change", type=float, default=d.change, help="weight of the change of latents over a tick")
-    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch threads (default: all cores)")
-    parser.add_argument("--evaluate-every", type=float, default=d.evaluate_every, help="minutes; 0: only at the end")
-    parser.add_argument("--survival-seconds", type=float, default=10.0)
-    parser.add_argument("--survival-worlds", type=int, default=32, help="0: keep the best by reconstruction instead")
-    parser.add_argument("--licence", default="Apache-2.0", help="licence of the data, kept in the checkpoint")
-    parser.add_argument("--seed", type=int, default=d.seed)
 
 
 def main(args: argparse.Namespace) -> int:

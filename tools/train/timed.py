@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -13,6 +15,21 @@ from hw.config import ConfigError
 
 # From a checkpoint's path to what was measured; "survival" in it is the share of worlds that stayed up, 0 to 1.
 Survival = Callable[[Path], Mapping[str, float]]
+
+
+def add_run_arguments(parser: argparse.ArgumentParser, minutes: float, evaluate_every: float, otherwise: str) -> None:
+    """Add the options that all timed trainers share. `otherwise` chooses the best where survival is not measured."""
+    parser.add_argument("--data", type=Path, required=True, help="dataset folder, as `servoid collect` writes it")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the run: checkpoints, logs, learning curve")
+    parser.add_argument("--robot", default="op3", help="robot name or file (default op3)")
+    parser.add_argument("--minutes", type=float, default=minutes, help="training time; evaluations come on top")
+    parser.add_argument("--resume", action=argparse.BooleanOptionalAction, default=True, help="continue in --out")
+    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch threads (default: all cores)")
+    parser.add_argument("--evaluate-every", type=float, default=evaluate_every, help="minutes; 0: only at the end")
+    parser.add_argument("--survival-seconds", type=float, default=10.0)
+    parser.add_argument("--survival-worlds", type=int, default=32, help=f"0: keep the best by {otherwise} instead")
+    parser.add_argument("--licence", default="Apache-2.0", help="licence of the data, kept in the checkpoint")
+    parser.add_argument("--seed", type=int, default=0)
 
 
 class TimedTrainer:
