@@ -52,7 +52,7 @@ def figures(words: list[str], capfd: pytest.CaptureFixture[str]) -> dict[str, An
 def test_a_controller_that_is_killed_leaves_no_torque_and_a_log(capfd: pytest.CaptureFixture[str]) -> None:
     """By the rig's own record: the guardian after it braked for 30 ms, and with it killed too, the watchdog. How soon
     the guardian's process has its turn is up to the machine, and a busy one takes its time: it is given a second here,
-    as in the bench itself, which measures less than 0.1 s on an idle one. One that does not work at all takes for ever."""
+    as in the bench itself, which measures less than 0.1 s on an idle one. One that does nothing takes for ever."""
     values = figures(["bench", "kill", "--kills", "2", "--unguarded", "1"], capfd)
     assert values["runs"] == values["all_damped"] == values["all_off"] == 2
     assert values["unguarded_runs"] == values["unguarded_all_stopped"] == 1
