@@ -10,7 +10,9 @@ from hw.robot import Robot
 
 AHEAD = np.array([0, 3, 8])  # ticks ahead that the tracker sees of its reference
 RESIDUAL = 0.3  # rad of joint target for an action of one
-_HISTORY = 2  # past ticks of joints and gyro
+_HISTORY = 4  # past ticks of joints and gyro
+# Past commands before the last one: a command takes up to 40 ms to the motor, and what it does up to 12 ms back.
+_COMMANDS = 3
 
 
 class TrackerObservation:
@@ -20,12 +22,12 @@ class TrackerObservation:
         self._home = robot.home
         n, feet = len(robot.joints), len(robot.feet)
         self._past = np.zeros((*shape, _HISTORY, n + 3))
-        self._before = np.zeros((*shape, n))
+        self._before = np.zeros((*shape, _COMMANDS, n))  # newest first
         self._fresh = np.ones(shape, bool)
-        self.size = 3 + 3 + 2 + 1 + feet + 4 * n + _HISTORY * (n + 3) + len(AHEAD) * (n + 4 + feet)
+        self.size = 3 + 3 + 2 + 1 + feet + (3 + _COMMANDS) * n + _HISTORY * (n + 3) + len(AHEAD) * (n + 4 + feet)
         joints, swapped, look = Mirror.joints(robot), Mirror.feet(robot), len(AHEAD)
         self.mirror = Mirror.join(
-            Mirror.VECTOR, Mirror.ROTATION, Mirror.PLANAR, Mirror.SCALAR, swapped, *[joints] * 4,
+            Mirror.VECTOR, Mirror.ROTATION, Mirror.PLANAR, Mirror.SCALAR, swapped, *[joints] * (3 + _COMMANDS),
             *[joints, Mirror.ROTATION] * _HISTORY,
             *[joints] * look, *[Mirror.PLANAR] * look, *[Mirror.FLIPPED] * look, *[Mirror.SCALAR] * look,
             *[swapped] * look,
@@ -41,7 +43,7 @@ class TrackerObservation:
         row = np.concatenate([joints, 0.25 * state.angular_velocity], -1)
         if self._fresh.any():
             self._past = np.where(self._fresh[..., None, None], row[..., None, :], self._past)
-            self._before = np.where(self._fresh[..., None], applied, self._before)
+            self._before = np.where(self._fresh[..., None, None], applied[..., None, :], self._before)
             self._fresh = np.zeros_like(self._fresh)
         lead = state.yaw.shape
         observation = np.concatenate(
@@ -54,7 +56,7 @@ class TrackerObservation:
                 joints,
                 0.1 * state.joint_velocity,
                 applied - state.position,
-                self._before - self._home,
+                (self._before - self._home).reshape(*lead, -1),
                 self._past.reshape(*lead, -1),
                 (frames.position - self._home).reshape(*lead, -1),
                 2.0 * frames.velocity.reshape(*lead, -1),
@@ -65,5 +67,5 @@ class TrackerObservation:
             -1,
         ).astype(np.float32)
         self._past = np.concatenate([row[..., None, :], self._past[..., :-1, :]], -2)
-        self._before = applied
+        self._before = np.concatenate([applied[..., None, :], self._before[..., :-1, :]], -2)
         return observation

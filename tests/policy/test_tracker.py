@@ -102,7 +102,7 @@ def test_a_mirrored_robot_is_observed_as_the_mirror_image() -> None:
 
 
 def test_history_is_that_of_the_world_and_of_the_ticks_before() -> None:
-    """An observation depends on the last two ticks, not on older ones, and a reset forgets one world's."""
+    """An observation depends on the last four ticks, not on older ones, and a reset forgets one world's."""
     frames, applied = gait((2,)).frames(AHEAD), np.tile(ROBOT.home, (2, 1))
 
     def last(offsets: list[float], reset_after: int | None = None) -> np.ndarray:
@@ -113,13 +113,34 @@ def test_history_is_that_of_the_world_and_of_the_ticks_before() -> None:
             seen = observe(state(ROBOT.home + offset, (2,)), applied + offset, frames)
         return seen
 
-    plain = last([0.0, 0.1, 0.2, 0.3])
-    assert not np.array_equal(last([0.0, 0.1, 0.25, 0.3]), plain)
-    assert not np.array_equal(last([0.0, 0.15, 0.2, 0.3]), plain)
-    np.testing.assert_array_equal(last([0.9, 0.1, 0.2, 0.3]), plain)
-    forgot = last([0.0, 0.1, 0.2, 0.3], reset_after=3)
-    np.testing.assert_array_equal(forgot[0], last([0.3])[0])
+    walked = [0.0, 0.1, 0.2, 0.3, 0.4, 0.5]
+    plain = last(walked)
+    for tick in range(1, 5):
+        other = walked.copy()
+        other[tick] += 0.05
+        assert not np.array_equal(last(other), plain), tick
+    np.testing.assert_array_equal(last([0.9, *walked[1:]]), plain)
+    forgot = last(walked, reset_after=5)
+    np.testing.assert_array_equal(forgot[0], last([0.5])[0])
     np.testing.assert_array_equal(forgot[1], plain[1])
+
+
+def test_commands_on_their_way_are_seen() -> None:
+    """A command may take 40 ms to the motor: without those of the ticks before, what a joint does cannot be told."""
+    frames = gait().frames(AHEAD)
+
+    def last(commands: list[float]) -> np.ndarray:
+        observe = TrackerObservation(ROBOT)
+        for offset in commands:
+            seen = observe(state(ROBOT.home), ROBOT.home + offset, frames)
+        return seen
+
+    plain = last([0.0] * 5)
+    for tick in range(1, 5):
+        commands = [0.0] * 5
+        commands[tick] = 0.1
+        assert not np.array_equal(last(commands), plain), tick
+    np.testing.assert_array_equal(last([0.1, 0.0, 0.0, 0.0, 0.0]), plain)
 
 
 def step(**changes: Any) -> Step:

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from hw.robot import load_robot
+from policy.checkpoint import CheckpointError
 from policy.mlp import Mlp
 from policy.tracker.observation import TrackerObservation
 from tools.train.expert import Trainer, _observations, forget_after, plot
 from tools.train.fleet import Fleet
 from tools.train.settings import load_settings
-from tools.train.tracking import Tracking
+from tools.train.tracking import Tracking, _draw
 
 ROBOT = load_robot()
 SETTINGS = replace(load_settings(), hidden=(32, 16), horizon=6, mini_batches=2, episode_seconds=1.0)
@@ -79,6 +80,54 @@ def test_the_export_acts_as_the_trained_actor(trained: tuple[Path, Trainer]) -> 
     assert np.abs(expected).max() > 0.01
     assert head["results"] == {"samples": 96}
     assert head["config"]["rewards"] == SETTINGS.rewards
+
+
+def test_a_tracker_is_trained_further(trained: tuple[Path, Trainer], tmp_path: Path) -> None:
+    """With --init the run begins with what the checkpoint does, less noise, and a critic that learns alone at first."""
+    import torch
+
+    out, _ = trained
+    source = out / "expert.safetensors"
+    env = Tracking(ROBOT, 8, None, SETTINGS)
+    (tmp_path / "further").mkdir()
+    further = Trainer(env, tmp_path / "further", 1e6, False, str(source))
+    network, _ = Mlp.load(source, "tracker", ROBOT, TrackerObservation(ROBOT).size)
+    further.ppo.actor.eval()
+    with torch.inference_mode():
+        acted = further.ppo.actor(_observations(env)).numpy()
+    np.testing.assert_allclose(acted, network(env.actor), atol=1e-3)
+    further.ppo.train_mode()
+    row = further._iteration()
+    assert row["std"] == pytest.approx(np.mean(SETTINGS.noise), rel=1e-3)
+    dense = [m for m in further.ppo.actor.mlp if hasattr(m, "weight")]
+    for layer, (weight, _) in zip(dense, network.layers, strict=True):
+        np.testing.assert_array_equal(layer.weight.detach().numpy().T, weight)
+    further._save()
+    _, head = Mlp.load(tmp_path / "further" / "expert.safetensors", "tracker", ROBOT, TrackerObservation(ROBOT).size)
+    assert head["results"]["begun_with"]["results"] == {"samples": 96}
+    again = Trainer(env, tmp_path / "further", 1e6, False)
+    assert again.begun_with == further.begun_with
+
+
+def test_a_tracker_with_other_layers_is_not_trained_further(trained: tuple[Path, Trainer], tmp_path: Path) -> None:
+    env = Tracking(ROBOT, 2, None, replace(SETTINGS, hidden=(16, 16)))
+    with pytest.raises(CheckpointError, match=r"hidden layers are \[32, 16\]"):
+        Trainer(env, tmp_path, 1e6, False, str(trained[0] / "expert.safetensors"))
+
+
+def test_commands_of_training_are_spread_over_what_is_asked() -> None:
+    """Backward while turning is where the tracker fell most, and top speed what it lacked: both must be seen often."""
+    rng = np.random.default_rng(0)
+    commands = np.array([_draw(rng, SETTINGS) for _ in range(4000)])
+    assert (commands[:, 0] >= SETTINGS.vx[0]).all()
+    assert (commands[:, 0] <= SETTINGS.vx[1]).all()
+    still = (commands == 0).all(1)
+    mixed_back = (commands[:, 0] < 0) & (commands[:, 1:] != 0).all(1)
+    fast = commands[:, 0] > 0.35
+    assert still.mean() == pytest.approx(SETTINGS.stand, abs=0.02)
+    assert mixed_back.mean() > SETTINGS.backward
+    assert fast.mean() > 0.08
+    assert (commands[fast, 1:] == 0).all()  # no fast walking while turning or side-stepping
 
 
 def test_a_fresh_start_leaves_no_curve_of_the_old_run(tmp_path: Path) -> None:

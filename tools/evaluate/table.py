@@ -54,7 +54,9 @@ _VELOCITY = Run("velocity", quick_seconds=61.0)
 _ALONE = dict.fromkeys(("cost.velocity", "cost.yaw_rate", "cost.displacement", "cost.yaw", "cost.stand"), "0") | {
     "cost.goal": "1", "cost.facing": "0.5",
 }  # fmt: skip
-_UNTOLD = {"text_weight": "0"}
+# Its gradient goes through the network, as in the papers: taken on the predicted states it moves the places alone, which
+# the next call takes for noise, and the robot stands.
+_UNTOLD = {"text_weight": "0", "guidance.gradient": "network", "guidance.weight": "3000"}
 
 _FOREST = Run("forest")
 _INBETWEEN = Run("inbetween", clips=6)
@@ -228,9 +230,22 @@ _MOTION: tuple[Row, ...] = tuple(
 
 
 def _elsewhere(row: Row, where: str, run: Run) -> Row:
-    """The same row on another body, where no figure was set."""
+    """The same row on another body or without the planner's delay, where no figure was set."""
     return replace(row, name=f"{row.name}@{where}", title=f"{row.title} ({where})", run=run, figure=None, quick=False)
 
+
+# What fewer or more network calls a plan come to, by what the robot does. One more call finishes the actions (`lead`).
+_CALLS: tuple[Row, ...] = tuple(
+    Row(
+        f"calls/{name}-{steps + 1}", OURS, f"{title}, {steps + 1} network calls a plan",
+        replace(run, plan={"steps": str(steps)}), metric, quick=False,
+    )
+    for name, title, run, metric in (
+        ("goal-far", "Goal, far: success", _FAR, SUCCESS),
+        ("perturb", "Walk + perturb: falls", Run("perturb"), FALLS),
+    )
+    for steps in (1, 2, 3, 5, 10)
+)  # fmt: skip
 
 ON_VIRTUAL = ("uniphys/length", "uniphys/goal-near", "cloc/perturb", "cloc/forest")
 
@@ -241,6 +256,8 @@ ROWS: tuple[Row, ...] = (
     *_TRAINED,
     *_TEXTS,
     *_MOTION,
+    *_CALLS,
+    *(_elsewhere(row, "no-delay", replace(row.run, plan={**row.run.plan, "delay": "0"})) for row in _MAIN),
     *(_elsewhere(row, "randomised", replace(row.run, randomise=True)) for row in _MAIN),
     *(_elsewhere(row, "virtual", replace(row.run, backend="virtual")) for row in _MAIN if row.name in ON_VIRTUAL),
 )

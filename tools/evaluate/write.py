@@ -18,7 +18,7 @@ def cells(line: Mapping[str, Any]) -> list[str]:
     """A row of the table for a person, under HEAD."""
     bound = "at most " if line["lower_is_better"] else "at least "
     figure = "" if line["figure"] is None else bound + quantity(line["figure"], line["unit"])
-    low_high = "" if line["ci95"] is None else " to ".join(f"{x:.3g}" for x in line["ci95"])
+    low_high = "" if line["ci95"] is None else " to ".join(number(x, 3) for x in line["ci95"])
     reached = {True: "yes", False: "no", None: ""}[line["reached"]]
     return [
         line["paper"],
@@ -35,7 +35,12 @@ def cells(line: Mapping[str, Any]) -> list[str]:
 
 def quantity(value: float | None, unit: str) -> str:
     """A number to three or four digits with its unit; nothing for None."""
-    return "" if value is None else f"{value:.4g} {unit}".strip()
+    return "" if value is None else f"{number(value, 4)} {unit}".strip()
+
+
+def number(value: float, digits: int) -> str:
+    """A number to so many digits, and all of those before the point: 3000 and not 3e+03."""
+    return f"{value:.0f}" if 10**digits <= abs(value) + 0.5 < 1e9 else f"{value:.{digits}g}"
 
 
 def markdown(title: str, facts: Iterable[str], lines: Sequence[Mapping[str, Any]], below: Iterable[str]) -> str:

@@ -12,6 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from policy import checkpoint
+from policy.checkpoint import CheckpointError, resolve
+from policy.mlp import Mlp
+from stack.provenance import sha256
+
+_CRITIC_ALONE = 600_000  # samples
+_ADOPTED_COUNT = 5_000_000  # samples that adopted input statistics weigh as much as
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
@@ -21,6 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worlds", type=int, default=512)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--fresh", action="store_true", help="start anew even if --out holds a run")
+    parser.add_argument(
+        "--init", metavar="CHECKPOINT", help="begin with this tracker (expert: the shipped one), with half of the noise"
+    )
     parser.add_argument("--plain-odometry", action="store_true", help="no learned correction in the estimator")
 
 
@@ -39,25 +50,28 @@ def main(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(args.seed)
     env = Tracking(robot, args.worlds, odometry, settings, args.seed)
-    Trainer(env, args.out, args.samples, args.fresh).learn(args.minutes)
+    Trainer(env, args.out, args.samples, args.fresh, args.init).learn(args.minutes)
     return 0
 
 
 class Trainer:
     """PPO's outer loop: collect, update, log, save. The algorithm itself is rsl-rl's."""
 
-    def __init__(self, env: Any, out: Path, samples: float, fresh: bool) -> None:
+    def __init__(self, env: Any, out: Path, samples: float, fresh: bool, init: str | None = None) -> None:
         import torch
         from torch.utils.tensorboard import SummaryWriter
 
         self.env, self.out, self.budget = env, out, samples
         self.ppo = _ppo(env)
         self.samples, self.state_file = 0, out / "state.pt"
+        self.begun_with: dict[str, Any] = {}  # the tracker that training began with, if any
         if self.state_file.exists() and not fresh:
             saved = torch.load(self.state_file, weights_only=True)
-            self.samples = int(saved.pop("samples"))
+            self.samples, self.begun_with = int(saved.pop("samples")), saved.pop("begun_with")
             self.ppo.load(saved, None, True)
         else:
+            if init is not None:
+                self.begun_with = adopt(self.ppo.actor, resolve(init), env)
             self._warm_up()
         forget_after(out / "progress.csv", self.samples)
         self.writer = SummaryWriter(str(out), purge_step=self.samples)
@@ -101,6 +115,10 @@ class Trainer:
 
         env, s = self.env, self.env.settings
         progress = min(self.samples / self.budget, 1.0)
+        if self.begun_with:
+            progress = 0.5 + 0.5 * progress
+            # An adopted actor must not learn from a critic that knows nothing yet.
+            self.ppo.actor.mlp.requires_grad_(self.samples >= _CRITIC_ALONE)
         env.push_scale = min(1.0, 0.25 + 0.75 * progress / 0.2)
         self.ppo.actor.distribution.log_std_param.fill_(np.log(np.interp(progress, [0.0, 1.0], s.noise)))
         self.ppo.learning_rate = s.learning_rate * (1.0 - 0.85 * progress)
@@ -151,9 +169,10 @@ class Trainer:
         import torch
 
         part = self.state_file.with_suffix(".part")
-        torch.save({**self.ppo.save(), "samples": self.samples}, part)
+        torch.save({**self.ppo.save(), "samples": self.samples, "begun_with": self.begun_with}, part)
         part.replace(self.state_file)
-        export(self.ppo.actor, self.env.robot, self.env.settings, self.out / "expert.safetensors", self.samples)
+        results = {"samples": self.samples, **({"begun_with": self.begun_with} if self.begun_with else {})}
+        export(self.ppo.actor, self.env.robot, self.env.settings, self.out / "expert.safetensors", results)
         plot(self.out / "progress.csv", self.out / "progress.png")
 
 
@@ -233,11 +252,31 @@ def _ppo(env: Any) -> Any:
     return PPO.construct_algorithm(_observations(env), Shape, config, "cpu")
 
 
-def export(actor: Any, robot: Any, settings: Any, path: Path, samples: int) -> None:
-    """Write the actor as the tracker checkpoint that runs without torch."""
-    from policy import checkpoint
-    from policy.mlp import Mlp
+def adopt(actor: Any, path: Path, env: Any) -> dict[str, Any]:
+    """Give the actor the weights and the input statistics of a tracker's checkpoint.
 
+    Returns what the header of the new one says of it. Raises CheckpointError where it does not fit.
+    """
+    import torch
+
+    network, head = Mlp.load(path, "tracker", env.robot, env.actor.shape[1])
+    dense, norm = [m for m in actor.mlp if hasattr(m, "weight")], actor.obs_normalizer
+    hidden = list(network.sizes[1:-1])
+    if hidden != list(env.settings.hidden):
+        raise CheckpointError(f"{path}: its hidden layers are {hidden}; say so in configs/policies/expert.yaml")
+    with torch.no_grad():
+        for layer, (weight, bias) in zip(dense, network.layers, strict=True):
+            layer.weight.copy_(torch.from_numpy(weight.T.copy()))
+            layer.bias.copy_(torch.from_numpy(bias))
+        norm._mean.copy_(torch.from_numpy(network.mean))
+        norm._std.copy_(torch.from_numpy(network.std - norm.eps))
+        norm._var.copy_(norm._std**2)
+        norm.count.fill_(_ADOPTED_COUNT)
+    return {"sha256": sha256(path), "git_commit": head["git_commit"], "results": head["results"]}
+
+
+def export(actor: Any, robot: Any, settings: Any, path: Path, results: dict[str, Any]) -> None:
+    """Write the actor as the tracker checkpoint that runs without torch."""
     dense = [m for m in actor.mlp if hasattr(m, "weight")]
     layers = [(m.weight.detach().numpy().T, m.bias.detach().numpy()) for m in dense]
     norm = actor.obs_normalizer
@@ -248,7 +287,7 @@ def export(actor: Any, robot: Any, settings: Any, path: Path, samples: int) -> N
         config={"hidden": list(settings.hidden), "rewards": settings.rewards},
         data="closed-loop experience on the analytic gait in randomised worlds, generated by this project",
         licence="Apache-2.0",
-        results={"samples": samples},
+        results=results,
     )
     network.save(path, head)
 

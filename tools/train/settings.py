@@ -31,6 +31,7 @@ class ExpertSettings:
     stand: float
     forward: float
     single: float
+    backward: float
     rewards: dict[str, float]
 
 

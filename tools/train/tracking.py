@@ -152,16 +152,20 @@ class Tracking:
 
 
 def _draw(rng: np.random.Generator, s: ExpertSettings) -> Array:
-    """A command `(3,)`: standing, straight ahead, along one other axis, or any mixture."""
+    """A command `(3,)`: standing, straight ahead, along one other axis, backward, or any mixture."""
     command = rng.uniform([s.vx[0], s.vy[0], s.yaw_rate[0]], [s.vx[1], s.vy[1], s.yaw_rate[1]])
     kind = rng.random()
-    if kind < s.stand:
+    shares = np.cumsum([s.stand, s.forward, s.single, s.backward])
+    if kind < shares[0]:
         return np.zeros(3)
-    if kind < s.stand + s.forward:
-        return command * [1.0, 0.0, 0.0]
-    if kind < s.stand + s.forward + s.single:
+    if kind < shares[1]:
+        fast = rng.uniform(s.vx[1] - (s.vx[1] - s.vx[0]) / 3, s.vx[1])
+        return np.array([fast if rng.random() < 0.5 else command[0], 0.0, 0.0])
+    if kind < shares[2]:
         command[0] = rng.uniform(s.vx[0], 0.0)
         return np.where(np.arange(3) == rng.integers(3), command, 0.0)
-    if command[0] > _MIXED_SPEED:  # no fast walking while turning or side-stepping
+    if kind < shares[3]:
+        command[0] = rng.uniform(s.vx[0], 0.0)
+    elif command[0] > _MIXED_SPEED:  # no fast walking while turning or side-stepping
         command[0] -= _MIXED_SPEED
     return command

@@ -11,7 +11,7 @@ from hw.config import ConfigError
 from tools.evaluate.rows import Beside, Metric, Row, Run, select
 from tools.evaluate.summary import Measured, table
 from tools.evaluate.table import ROWS
-from tools.evaluate.write import as_csv, cells, markdown
+from tools.evaluate.write import as_csv, cells, markdown, number
 from tools.intervals import bootstrap
 from tools.parser import Parser
 
@@ -105,6 +105,12 @@ def test_markdown_and_csv_hold_what_the_table_does() -> None:
     head, row = as_csv([line]).splitlines()
     assert head.startswith("paper,row,name,published")
     assert row.startswith("A,Share,a/share,0.95,")
+
+
+def test_numbers_keep_all_digits_before_the_point() -> None:
+    """3000 ticks are not 3e+03."""
+    assert [number(x, 3) for x in (2999.6, 1000.0, 999.4, 0.12345, -3000.0)] == ["3000", "1000", "999", "0.123", "-3000"]
+    assert number(float("inf"), 3) == "inf"
 
 
 def test_rows_are_chosen_by_pattern_and_bring_what_they_are_held_against() -> None:
