@@ -143,9 +143,9 @@ def test_standing_it_neither_moves_nor_sinks() -> None:
 
 
 # The correction was learned on the expert's walk, and most of what runs walks like it. The bare gait slips otherwise.
-@pytest.mark.parametrize(("policy", "share"), [("expert", 0.04), ("diffusion", 0.04), ("gait", 0.08)])
-def test_drift_of_twenty_walks_is_a_small_share_of_the_path(policy: str, share: float) -> None:
+@pytest.mark.parametrize("policy", ["expert", "diffusion", "gait"])
+def test_drift_of_twenty_walks_is_a_small_share_of_the_path(policy: str) -> None:
     result = drift(ROBOT, driver(ROBOT, policy), load_odometry(ROBOT), walks=20, seconds=30.0, seed=11)
     assert result.walks >= 15  # that stayed up and covered more than a metre
-    assert result.p90 <= share
+    assert result.p90 <= 0.04
     assert result.yaw_p90 <= 0.1

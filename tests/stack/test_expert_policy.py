@@ -11,6 +11,7 @@ from hw.hal import Instruction, State
 from hw.robot import load_robot
 from stack.expert_policy import ExpertPolicy
 from stack.gait_policy import GaitPolicy
+from stack.odometry import load_odometry
 from tools.train.fleet import Fleet
 from tools.train.walker import Walker, load_tracker
 
@@ -41,3 +42,21 @@ def test_one_robot_acts_as_a_world_of_the_fleet(kind: type) -> None:
             np.testing.assert_allclose(target, targets[0], atol=1e-5)
             fleet.step(targets)
         assert np.abs(targets[0] - ROBOT.home).max() > 0.1
+
+
+def test_the_shipped_expert_stays_up_on_robots_it_does_not_know() -> None:
+    """Pushed each second, half of the robots while going backward in a turn, where an older expert fell most."""
+    n = 64
+    fleet, everything = Fleet(ROBOT, n, load_odometry(ROBOT), randomise=1.0, seed=0), np.ones(n, bool)
+    walker = Walker(fleet, load_tracker(ROBOT))
+    fleet.reset(everything)
+    walker.reset(everything)
+    command, fallen = np.tile([[-0.1, 0.05, 0.4], [0.2, -0.05, -0.5]], (n // 2, 1)), ~everything
+    for tick in range(8 * ROBOT.rate):
+        if tick and tick % ROBOT.rate == 0:
+            bearing = np.array([rng.uniform(-np.pi, np.pi) for rng in fleet.rngs])
+            fleet.worlds.push(0.3 * np.stack([np.cos(bearing), np.sin(bearing)], -1))
+        fleet.observe()
+        fleet.step(walker.act(command))
+        fallen |= fleet.truth.fallen
+    assert fallen.mean() <= 0.12

@@ -54,8 +54,8 @@ _VELOCITY = Run("velocity", quick_seconds=61.0)
 _ALONE = dict.fromkeys(("cost.velocity", "cost.yaw_rate", "cost.displacement", "cost.yaw", "cost.stand"), "0") | {
     "cost.goal": "1", "cost.facing": "0.5",
 }  # fmt: skip
-# Its gradient goes through the network, as in the papers: taken on the predicted states it moves the places alone, which
-# the next call takes for noise, and the robot stands.
+# The gradient goes through the network, as in the papers: taken on the predicted states it moves the places alone,
+# which the next call takes for noise, and the robot stands.
 _UNTOLD = {"text_weight": "0", "guidance.gradient": "network", "guidance.weight": "3000"}
 
 _FOREST = Run("forest")
