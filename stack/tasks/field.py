@@ -17,8 +17,8 @@ _NEIGHBOURS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 @dataclass(frozen=True)
 class FieldSettings:
     body: float = 0.17  # m from the middle of the robot to its side
-    strength: float = 3.0  # times dearer is a cell beside an obstacle than one far off
-    fade: float = 0.07  # m over which that falls to 1/e
+    strength: float = 4.0  # times dearer is a cell beside an obstacle than one far off
+    fade: float = 0.08  # m over which that falls to 1/e
     step: float = 0.2  # m that the robot looks down the field
 
     def __post_init__(self) -> None:

@@ -32,7 +32,7 @@ class ForestSettings(Settings):
     x: Annotated[float | None, "m ahead of the start: fixes the goal (else drawn behind the forest)"] = None
     y: Annotated[float | None, "m to the left of the start: fixes the goal"] = None
     radius: Annotated[float, "m from the goal that count as reached"] = 0.14
-    approach: Annotated[Approach, "speed profile"] = field(default_factory=lambda: Approach(speed=0.36))
+    approach: Annotated[Approach, "speed profile"] = field(default_factory=Approach)
     field: Annotated[FieldSettings, "potential field, for the asked velocity"] = field(default_factory=FieldSettings)
 
     def __post_init__(self) -> None:
