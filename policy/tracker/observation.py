@@ -1,4 +1,7 @@
-"""What the tracker sees: the estimate, a short history and the reference's next frames. Never the command."""
+"""What the tracker sees: the estimate, a short history of joints and commands, and the reference's next frames.
+
+Never the velocity that is asked.
+"""
 
 from __future__ import annotations
 

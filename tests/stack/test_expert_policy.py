@@ -1,4 +1,4 @@
-"""The policies of one robot do what trained and collected: the same as their batched twins."""
+"""The policies of one robot do what their batched twins do that trained and collected; the shipped expert stays up."""
 
 from __future__ import annotations
 

@@ -236,7 +236,7 @@ def test_obstacle_rolls_toward_the_robot_and_is_told_with_its_velocity() -> None
 # --- velocity
 
 
-def test_velocities_go_up_to_the_robots_top_speed() -> None:
+def test_velocities_go_up_to_what_the_model_has_seen() -> None:
     assert load_settings("velocity").speed == (0.0, 0.4)  # as measured; configs/tasks/velocity.yaml says how
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hw.config import ConfigError
 from hw.robot import load_robot
 from policy.checkpoint import CheckpointError
 from policy.mlp import Mlp
@@ -97,22 +98,38 @@ def test_a_tracker_is_trained_further(trained: tuple[Path, Trainer], tmp_path: P
         acted = further.ppo.actor(_observations(env)).numpy()
     np.testing.assert_allclose(acted, network(env.actor), atol=1e-3)
     further.ppo.train_mode()
+    critic = further.ppo.critic.mlp[0].weight.detach().clone()
     row = further._iteration()
     assert row["std"] == pytest.approx(np.mean(SETTINGS.noise), rel=1e-3)
+    assert not torch.equal(further.ppo.critic.mlp[0].weight, critic)
     dense = [m for m in further.ppo.actor.mlp if hasattr(m, "weight")]
     for layer, (weight, _) in zip(dense, network.layers, strict=True):
         np.testing.assert_array_equal(layer.weight.detach().numpy().T, weight)
     further._save()
     _, head = Mlp.load(tmp_path / "further" / "expert.safetensors", "tracker", ROBOT, TrackerObservation(ROBOT).size)
     assert head["results"]["begun_with"]["results"] == {"samples": 96}
-    again = Trainer(env, tmp_path / "further", 1e6, False)
+    again = Trainer(env, tmp_path / "further", 1e6, False, str(source))  # the same command goes on
     assert again.begun_with == further.begun_with
+    again.samples = 600_000
+    again._iteration()
+    assert not torch.equal(
+        again.ppo.actor.mlp[0].weight, further.ppo.actor.mlp[0].weight
+    )  # and now the actor learns too
 
 
 def test_a_tracker_with_other_layers_is_not_trained_further(trained: tuple[Path, Trainer], tmp_path: Path) -> None:
     env = Tracking(ROBOT, 2, None, replace(SETTINGS, hidden=(16, 16)))
     with pytest.raises(CheckpointError, match=r"hidden layers are \[32, 16\]"):
         Trainer(env, tmp_path, 1e6, False, str(trained[0] / "expert.safetensors"))
+
+
+def test_a_folder_of_another_run_is_not_gone_on_with(trained: tuple[Path, Trainer], tmp_path: Path) -> None:
+    """Neither for --init, which would be ignored, nor when the saved network has another shape."""
+    out, _ = trained
+    with pytest.raises(ConfigError, match=r"did not begin with .*--fresh"):
+        Trainer(Tracking(ROBOT, 2, None, SETTINGS), out, 1e6, False, str(out / "expert.safetensors"))
+    with pytest.raises(ConfigError, match=r"state\.pt: .*other inputs or layers.*--fresh"):
+        Trainer(Tracking(ROBOT, 2, None, replace(SETTINGS, hidden=(16, 16))), out, 1e6, False)
 
 
 def test_commands_of_training_are_spread_over_what_is_asked() -> None:

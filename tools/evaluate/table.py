@@ -56,7 +56,7 @@ _ALONE = dict.fromkeys(("cost.velocity", "cost.yaw_rate", "cost.displacement", "
 }  # fmt: skip
 # The gradient goes through the network, as in the papers: taken on the predicted states it moves the places alone,
 # which the next call takes for noise, and the robot stands.
-_UNTOLD = {"text_weight": "0", "guidance.gradient": "network", "guidance.weight": "3000"}
+_UNTOLD = {"engine": "torch", "text_weight": "0", "guidance.gradient": "network", "guidance.weight": "3000"}
 
 _FOREST = Run("forest")
 _INBETWEEN = Run("inbetween", clips=6)
@@ -238,7 +238,7 @@ def _elsewhere(row: Row, where: str, run: Run) -> Row:
 _CALLS: tuple[Row, ...] = tuple(
     Row(
         f"calls/{name}-{steps + 1}", OURS, f"{title}, {steps + 1} network calls a plan",
-        replace(run, plan={"steps": str(steps)}), metric, quick=False,
+        replace(run, plan={"schedule": "full_sequence", "lead": "1", "steps": str(steps)}), metric, quick=False,
     )
     for name, title, run, metric in (
         ("goal-far", "Goal, far: success", _FAR, SUCCESS),

@@ -40,7 +40,7 @@ def quantity(value: float | None, unit: str) -> str:
 
 def number(value: float, digits: int) -> str:
     """A number to so many digits, and all of those before the point: 3000 and not 3e+03."""
-    return f"{value:.0f}" if 10**digits <= abs(value) + 0.5 < 1e9 else f"{value:.{digits}g}"
+    return f"{value:.0f}" if abs(value) + 0.5 >= 10**digits else f"{value:.{digits}g}"
 
 
 def markdown(title: str, facts: Iterable[str], lines: Sequence[Mapping[str, Any]], below: Iterable[str]) -> str:

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from hw.config import ConfigError
 from policy import checkpoint
-from policy.checkpoint import CheckpointError, resolve
 from policy.mlp import Mlp
 from stack.provenance import sha256
 
+_BEGUN_AT = 0.5  # of the schedules: as much noise and as large steps as a tracker stands that walks already
 _CRITIC_ALONE = 600_000  # samples
 _ADOPTED_COUNT = 5_000_000  # samples that adopted input statistics weigh as much as
 
@@ -25,12 +26,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("runs/expert"), help="folder of the run; an old one goes on")
     parser.add_argument("--minutes", type=float, default=90.0, help="of training, this call (default: %(default)s)")
-    parser.add_argument("--samples", type=float, default=20e6, help="the learning-rate and push schedules end here")
+    parser.add_argument(
+        "--samples", type=float, default=20e6, help="the schedules of learning rate, noise and pushes end here"
+    )
     parser.add_argument("--worlds", type=int, default=512)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--fresh", action="store_true", help="start anew even if --out holds a run")
     parser.add_argument(
-        "--init", metavar="CHECKPOINT", help="begin with this tracker (expert: the shipped one), with half of the noise"
+        "--init",
+        metavar="CHECKPOINT",
+        help="begin with this tracker (expert: the shipped one), halfway in the schedules",
     )
     parser.add_argument("--plain-odometry", action="store_true", help="no learned correction in the estimator")
 
@@ -67,11 +72,18 @@ class Trainer:
         self.begun_with: dict[str, Any] = {}  # the tracker that training began with, if any
         if self.state_file.exists() and not fresh:
             saved = torch.load(self.state_file, weights_only=True)
-            self.samples, self.begun_with = int(saved.pop("samples")), saved.pop("begun_with")
-            self.ppo.load(saved, None, True)
+            self.samples, self.begun_with = int(saved.pop("samples")), saved.pop("begun_with", {})
+            if init is not None and self.begun_with.get("sha256") != sha256(checkpoint.resolve(init)):
+                raise ConfigError(f"{out}: holds a run that did not begin with {init}: give --fresh, or another --out")
+            try:
+                self.ppo.load(saved, None, True)
+            except RuntimeError:  # torch's word for weights of other shapes
+                raise ConfigError(
+                    f"{self.state_file}: of a tracker with other inputs or layers: give --fresh, or another --out"
+                ) from None
         else:
             if init is not None:
-                self.begun_with = adopt(self.ppo.actor, resolve(init), env)
+                self.begun_with = adopt(self.ppo.actor, checkpoint.resolve(init), env)
             self._warm_up()
         forget_after(out / "progress.csv", self.samples)
         self.writer = SummaryWriter(str(out), purge_step=self.samples)
@@ -116,7 +128,7 @@ class Trainer:
         env, s = self.env, self.env.settings
         progress = min(self.samples / self.budget, 1.0)
         if self.begun_with:
-            progress = 0.5 + 0.5 * progress
+            progress = _BEGUN_AT + (1.0 - _BEGUN_AT) * progress
             # An adopted actor must not learn from a critic that knows nothing yet.
             self.ppo.actor.mlp.requires_grad_(self.samples >= _CRITIC_ALONE)
         env.push_scale = min(1.0, 0.25 + 0.75 * progress / 0.2)
@@ -263,7 +275,9 @@ def adopt(actor: Any, path: Path, env: Any) -> dict[str, Any]:
     dense, norm = [m for m in actor.mlp if hasattr(m, "weight")], actor.obs_normalizer
     hidden = list(network.sizes[1:-1])
     if hidden != list(env.settings.hidden):
-        raise CheckpointError(f"{path}: its hidden layers are {hidden}; say so in configs/policies/expert.yaml")
+        raise checkpoint.CheckpointError(
+            f"{path}: its hidden layers are {hidden}; say so in configs/policies/expert.yaml"
+        )
     with torch.no_grad():
         for layer, (weight, bias) in zip(dense, network.layers, strict=True):
             layer.weight.copy_(torch.from_numpy(weight.T.copy()))
@@ -272,6 +286,8 @@ def adopt(actor: Any, path: Path, env: Any) -> dict[str, Any]:
         norm._std.copy_(torch.from_numpy(network.std - norm.eps))
         norm._var.copy_(norm._std**2)
         norm.count.fill_(_ADOPTED_COUNT)
+    # The warm-up that comes next acts with the noise that training begins with.
+    actor.distribution.log_std_param.data.fill_(np.log(np.interp(_BEGUN_AT, [0.0, 1.0], env.settings.noise)))
     return {"sha256": sha256(path), "git_commit": head["git_commit"], "results": head["results"]}
 
 

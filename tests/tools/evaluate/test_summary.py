@@ -139,6 +139,10 @@ def test_the_main_rows_are_repeated_on_the_randomised_robot_and_four_on_the_virt
     assert sum(row.run.backend == "virtual" for row in ROWS) == 4
     quick = select(ROWS, [], quick=True)
     assert not any(row.run.randomise or row.run.backend != "sim" or row.run.network for row in quick)
+    undelayed = [row for row in ROWS if row.name.endswith("@no-delay")]
+    assert len(undelayed) == 8
+    assert all(row.run.plan["delay"] == "0" for row in undelayed)
+    assert not any(row.name.startswith("calls/") or row in undelayed for row in quick)
 
 
 def test_networks_are_named_apart() -> None:
