@@ -51,11 +51,13 @@ class Metric:
     unit: str = ""
     share: bool = False  # true or false, instead of a number
     lower: bool = False  # whether less is better
+    resolution: float = 0.0  # of the unit: what is finer is rounding of the simulation, and nothing to compare
 
     def values(self, records: Sequence[Mapping[str, Any]]) -> list[float]:
         """The figure of each episode that has it."""
         values = [_pick(record, self.of) for record in records]
-        return [float(value) for value in values if value is not None and math.isfinite(value)]
+        finite = [float(value) for value in values if value is not None and math.isfinite(value)]
+        return [round(value / self.resolution) * self.resolution for value in finite] if self.resolution else finite
 
 
 @dataclass(frozen=True)

@@ -206,7 +206,7 @@ _TEXTS: tuple[Row, ...] = (
 
 def _motion(name: str, title: str, run: Run, metric: Metric, published: float | None, unit: str | None) -> list[Row]:
     """How a run's motion was made, and beside it how the expert's was."""
-    expert, quick = replace(run, policy="expert"), run is _TEXT
+    expert, quick, metric = replace(run, policy="expert"), run is _TEXT, replace(metric, lower=True)
     reach, note = Beside(f"motion/{name}-expert", 1.2), "beside the policy"
     return [
         Row(f"motion/{name}", UNIPHYS, title, run, metric, published, unit, reach, quick),
@@ -216,15 +216,15 @@ def _motion(name: str, title: str, run: Run, metric: Metric, published: float | 
 
 _MOTION: tuple[Row, ...] = tuple(
     row
-    for name, title, of, unit, published, theirs in (
-        ("floating", "Floating", "motion.floating_mm", "mm", 16.6, "mm of a human"),
-        ("jerk", "Jerk", "motion.jerk_mps3", "m/s3", 1.2, "mm/s3, as printed"),
-        ("foot-slip", "Foot slip", "motion.foot_slip_mmps", "mm/s", None, None),
+    for name, title, metric, published, theirs in (
+        ("floating", "Floating", Metric("motion.floating_mm", "mm", resolution=0.001), 16.6, "mm of a human"),
+        ("jerk", "Jerk", Metric("motion.jerk_mps3", "m/s3"), 1.2, "mm/s3, as printed"),
+        ("foot-slip", "Foot slip", Metric("motion.foot_slip_mmps", "mm/s"), None, None),
     )
     for row in (
-        *_motion(name, f"{title}, told in words", _TEXT, Metric(of, unit, lower=True), published, theirs),
-        *_motion(f"{name}-goal-far", f"{title}, far goal", _FAR, Metric(of, unit, lower=True), None, None),
-        *_motion(f"{name}-velocity", f"{title}, velocity control", _VELOCITY, Metric(of, unit, lower=True), None, None),
+        *_motion(name, f"{title}, told in words", _TEXT, metric, published, theirs),
+        *_motion(f"{name}-goal-far", f"{title}, far goal", _FAR, metric, None, None),
+        *_motion(f"{name}-velocity", f"{title}, velocity control", _VELOCITY, metric, None, None),
     )
 )
 

@@ -114,6 +114,12 @@ def test_numbers_keep_all_digits_before_the_point() -> None:
     assert number(float("inf"), 3) == "inf"
 
 
+def test_what_is_finer_than_the_resolution_is_not_compared() -> None:
+    """A robot that always has a foot on the ground floats by nothing: 2e-7 mm against 0 is no shortfall."""
+    metric = Metric("x", "mm", lower=True, resolution=0.001)
+    assert metric.values([{"x": 2.4e-7}, {"x": 0.0}, {"x": 0.0312}]) == pytest.approx([0.0, 0.0, 0.031])
+
+
 def test_rows_are_chosen_by_pattern_and_bring_what_they_are_held_against() -> None:
     rows = [SHARE, FALLS, TWICE, EXPERT]
     assert [row.name for row in select(rows, ["a/tw*"], quick=False)] == ["a/twice", "a/expert"]
