@@ -13,6 +13,7 @@ import torch
 
 from hw.config import ConfigError
 from hw.hal import Array, Percept, State, Trace
+from policy.text.captions import caption
 from stack.tasks import load_settings, load_task, measures, names, task_class
 from stack.tasks.approach import Approach
 from stack.tasks.guidance import Weights, integrate_twist, twist_cost
@@ -349,10 +350,15 @@ def test_cost_weighs_each_part_and_keeps_batches_apart() -> None:
     np.testing.assert_allclose(each.detach(), [0.0, 0.0, 0.0], atol=1e-12)
 
 
-def test_survival_tells_a_planner_nothing() -> None:
+def test_survival_sets_a_robot_in_motion_and_then_tells_a_planner_nothing() -> None:
+    """Left alone at rest, a model that has seen standing stands for 3000 ticks: no survival of anything."""
     task = load_task("survive", {}, DT)
     task.reset(np.random.default_rng(0))
-    asked = task.instruct(0, state(), NOTHING)
+    begun = task.instruct(0, state(), NOTHING)
+    assert begun.text == caption(begun.velocity)
+    assert begun.text != caption(np.zeros(3))
+    assert task.instruct(149, state(), NOTHING).text == begun.text
+    asked = task.instruct(150, state(), NOTHING)
     assert asked.text == ""
     assert np.abs(asked.velocity).max() > 0.0, "what policies walk by that do not plan"
     assert not any(getattr(task.settings.cost, name) for name in ("velocity", "displacement", "yaw", "stand", "goal"))
