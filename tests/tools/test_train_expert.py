@@ -112,9 +112,7 @@ def test_a_tracker_is_trained_further(trained: tuple[Path, Trainer], tmp_path: P
     assert again.begun_with == further.begun_with
     again.samples = 600_000
     again._iteration()
-    assert not torch.equal(
-        again.ppo.actor.mlp[0].weight, further.ppo.actor.mlp[0].weight
-    )  # and now the actor learns too
+    assert not torch.equal(again.ppo.actor.mlp[0].weight, further.ppo.actor.mlp[0].weight)  # the actor learns too
 
 
 def test_a_tracker_with_other_layers_is_not_trained_further(trained: tuple[Path, Trainer], tmp_path: Path) -> None:
