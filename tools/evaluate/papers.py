@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one a core)")
     parser.add_argument("--episodes", type=int, help="a row, instead of its own number")
     parser.add_argument("--seconds", type=float, help="at most so long an episode: for a try")
-    parser.add_argument("--minutes", type=float, help="stop then; the same command goes on")
+    parser.add_argument("--minutes", type=float, help="stop then; the same command goes on. 0: tell what was done")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode's stream (default: %(default)s)")
     parser.add_argument("--fresh", action="store_true", help="do again what was done")
     add_json_argument(parser)
@@ -64,7 +64,7 @@ def main(args: argparse.Namespace) -> int:
             episodes=args.episodes or (QUICK_EPISODES if args.quick else None),
             seconds=args.seconds,
             workers=args.workers,
-            minutes=args.minutes or (QUICK_MINUTES if args.quick else None),
+            minutes=QUICK_MINUTES if args.quick and args.minutes is None else args.minutes,
             quick=args.quick,
             fresh=args.fresh,
         )
@@ -103,10 +103,12 @@ def encoder_accuracy() -> dict[str, Any]:
 
 
 def _check(args: argparse.Namespace) -> None:
-    for name in ("episodes", "seconds", "minutes"):
+    for name in ("episodes", "seconds"):
         value = getattr(args, name)
         if value is not None and value <= 0:
             raise ConfigError(f"--{name}: must be positive, not {value:g}")
+    if args.minutes is not None and args.minutes < 0:
+        raise ConfigError(f"--minutes: must not be negative, not {args.minutes:g}")
     if args.workers < 0:
         raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
 
@@ -151,6 +153,7 @@ def _write(
     for name, text in (("papers.md", markdown("Papers", facts, lines, below)), ("papers.csv", as_csv(lines))):
         path = options.out / name
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
         except OSError as error:
             raise ConfigError(f"{path}: cannot be written ({error.strerror}): choose another --out") from None

@@ -32,7 +32,7 @@ class Options:
     episodes: int | None = None
     seconds: float | None = None  # at most so long an episode: for a try, since figures mean little then
     workers: int = 0
-    minutes: float | None = None  # then stop, and go on another time
+    minutes: float | None = None  # then stop, and go on another time; 0: do nothing, and tell what was done
     quick: bool = False  # cut the longest episodes
     fresh: bool = False  # do again what was done
 
@@ -91,7 +91,8 @@ def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[st
     cached = sum(len(work.records()) for work in runs)
     say(f"{len(rows)} rows, {len(runs)} runs: {cached} episodes are there, {len(jobs)} are to be done")
     deadline = None if options.minutes is None else begun + 60.0 * options.minutes
-    workers = max(min(options.workers or os.cpu_count() or 1, len(jobs)), 1)
+    # With no time at all there is nothing to start processes for.
+    workers = 1 if options.minutes == 0 else max(min(options.workers or os.cpu_count() or 1, len(jobs)), 1)
     for done in _progress(each(do, _jobs(runs, options.seed), workers, deadline), len(jobs)):
         work = runs[done.job.run]
         if done.refused is not None:

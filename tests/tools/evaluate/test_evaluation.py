@@ -227,6 +227,19 @@ def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path
     assert str(path.resolve()) in Path(done[0].settings.policy).read_text()
 
 
+def test_no_time_at_all_tells_what_was_done(tmp_path: Path, done: list[Job]) -> None:
+    evaluate([NEAR], options(tmp_path, episodes=1), quiet)
+    measured = evaluate([NEAR, FAR], options(tmp_path, minutes=0), quiet)
+    assert [len(measured[row.name].records) for row in (NEAR, FAR)] == [1, 0]
+    assert len(done) == 1
+
+
+def test_where_nothing_could_be_run_the_table_is_written_all_the_same(tmp_path: Path) -> None:
+    out = tmp_path / "new"
+    assert main(["evaluate", "papers", "--rows", "cloc/attention-full", "--out", str(out)]) == 0
+    assert "needs training" in (out / "papers.md").read_text()
+
+
 def test_variants_of_the_planner_are_files_that_the_policy_is_made_from(tmp_path: Path) -> None:
     from policy.diffusion.settings import load_settings
 
