@@ -24,10 +24,10 @@ class DisturbanceSettings:
     hip: float = 0.07
     knee: float = 0.09
     ankle: float = 0.11
-    scale: tuple[float, float] = (0.3, 0.8)  # of an episode's noise
+    scale: tuple[float, float] = (0.2, 0.6)  # of an episode's noise
     slow_seconds: float = 0.25  # correlation time of the noise that lasts
     slow_size: float = 0.5  # of it, beside the white noise
-    push_speed: tuple[float, float] = (0.0, 0.3)
+    push_speed: tuple[float, float] = (0.0, 0.45)
     push_seconds: tuple[float, float] = (1.0, 3.0)  # between pushes
 
 

@@ -41,12 +41,12 @@ class Skill:
 # to a goal asks for. Creeping covers the slow end, where a robot arrives.
 SKILLS: tuple[Skill, ...] = (
     Skill("stand", "stand still", (Box(),), 2.5, (1.0, 3.0)),
-    Skill("forward", "walk forward", (Box(forward=(0.05, 0.4)),), 2.0),
+    Skill("forward", "walk forward", (Box(forward=(0.05, 0.5)),), 2.5),
     Skill("slow", "walk forward slowly", (Box(forward=(0.03, 0.12)),)),
     Skill("backward", "walk backward", (Box(forward=(-0.12, -0.03)),)),
     Skill("side", "step sideways", (Box(left=(0.04, 0.12)), Box(left=(-0.12, -0.04)))),
     Skill("turn", "turn on the spot", (Box(turn=(0.2, 1.0)), Box(turn=(-1.0, -0.2))), 1.5),
-    Skill("arc", "walk along an arc", (Box(forward=(0.05, 0.3), turn=(-0.8, 0.8)),), 1.5),
+    Skill("arc", "walk along an arc", (Box(forward=(0.05, 0.4), turn=(-0.8, 0.8)),), 2.0),
     Skill("diagonal", "walk diagonally", (Box((0.05, 0.15), (0.04, 0.1)), Box((0.05, 0.15), (-0.1, -0.04))), 0.8),
     Skill("reverse", "walk backward along an arc", (Box((-0.12, -0.04), turn=(-0.6, 0.6)),), 0.6),
     Skill("any", "walk and turn in any direction", (Box((-0.12, 0.3), (-0.1, 0.1), (-0.8, 0.8)),), 2.0),

@@ -20,12 +20,13 @@ if TYPE_CHECKING:
 _CHANGE = 125  # ticks between commands
 _PUSH_EVERY = 50  # ticks
 _PUSH = 0.3  # m/s, in a random direction
+_RANDOMISED = 0.5  # share of worlds with a robot drawn at random
 
 
 def closed_loop_survival(
     checkpoint: Path, seconds: float, worlds: int, seed: int, robot_name: str = "op3"
 ) -> dict[str, float]:
-    """Run a diffusion checkpoint in `worlds` nominal worlds, all planned as one batch: see `survival_of`.
+    """Run a diffusion checkpoint in `worlds` worlds, all planned as one batch: see `survival_of`.
 
     Uses the settings of configs/policies/diffusion.yaml, with shorter delay and chunks where the network has too few
     actions for them, or was trained for less delay.
@@ -49,9 +50,10 @@ def closed_loop_survival(
 def survival_of(
     drive: Callable[[Fleet], Driver], robot: Robot, seconds: float, worlds: int, seed: int
 ) -> dict[str, float]:
-    """Walk in `worlds` nominal worlds under changing velocity commands and pushes, the same ones for the same `seed`.
+    """Walk in `worlds` worlds under changing velocity commands and pushes, the same ones for the same `seed`.
 
-    Without pushes every network that walks at all survives, and none is better than another.
+    Pushes, and a robot drawn at random in half of the worlds, tell networks apart: without them every network that
+    walks at all survives.
 
     Returns `survival`, the share of worlds that never fell, and `velocity_error`, the mean planar error [m/s] of
     those, smoothed over a cycle, from 2 s after each command.
@@ -59,7 +61,7 @@ def survival_of(
     from stack.odometry import load_odometry
     from tools.train.fleet import Fleet
 
-    fleet = Fleet(robot, worlds, load_odometry(robot), seed=seed)
+    fleet = Fleet(robot, worlds, load_odometry(robot), randomise=_RANDOMISED, seed=seed)
     walker, everything = drive(fleet), np.ones(worlds, bool)
     fleet.reset(everything)
     walker.reset(everything)
