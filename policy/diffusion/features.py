@@ -235,6 +235,7 @@ class Trajectory:
     velocity: AnyArray  # (batch, horizon, 2) m/s, heading frame of its own tick
     yaw_rate: AnyArray  # (batch, horizon) rad/s
     height: AnyArray  # (batch, horizon) m
+    joints: AnyArray  # (batch, horizon, n_joints) rad
     dt: float  # s between ticks; the first is one tick from now
 
     @classmethod
@@ -248,5 +249,6 @@ class Trajectory:
             velocity=token["velocity"][..., :2],
             yaw_rate=token["angular_velocity"][..., 2],
             height=token["height"][..., 0],
+            joints=token["position"],
             dt=dt,
         )

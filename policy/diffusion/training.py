@@ -12,6 +12,7 @@ from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.denoiser import Denoiser
 
 UNTOLD = 0.1  # share of windows without an instruction
+_TOGETHER = 2 / 3  # of the windows that are not for Diffusion Forcing, the share whose tokens go down together
 
 
 @dataclass(frozen=True)
@@ -23,40 +24,48 @@ class Objective:
     min_snr: float = 0.0  # clip of the signal-to-noise ratio that weights tokens; 0: all levels weigh the same
     action_rate: float = 0.0  # weight of the error of the change from one action to the next
     monotone: float = 0.0  # share of windows whose levels rise along the window, as in gradual and rolling schedules
+    forcing: float = 0.25  # share of windows with independent levels everywhere, the past too: Diffusion Forcing
 
     def __post_init__(self) -> None:
         if self.near_actions < 1:
             raise ConfigError(f"near_actions must be at least 1 tick, not {self.near_actions}")
         if min(self.far_actions, self.min_snr, self.action_rate) < 0:
             raise ConfigError("the weights of far actions and of the action rate, and min-SNR, must not be negative")
-        if not 0.0 <= self.monotone <= 0.5:
-            raise ConfigError(f"the share of windows with monotone levels must be 0 to 0.5, not {self.monotone}")
+        if not 0.0 <= self.forcing <= 1.0:
+            raise ConfigError(f"the share of windows for Diffusion Forcing must be 0 to 1, not {self.forcing:g}")
+        if not 0.0 <= self.monotone <= (most := _TOGETHER * (1.0 - self.forcing)) + 1e-9:
+            raise ConfigError(
+                f"the share of windows with monotone levels must be 0 to {most:g} where {self.forcing:g} are for"
+                f" Diffusion Forcing, not {self.monotone:g}"
+            )
 
 
 PLAIN = Objective()
 
 
 def draw_levels(
-    config: DenoiserConfig, batch: int, committed: int, generator: torch.Generator, monotone: float = 0.0
+    config: DenoiserConfig, batch: int, committed: int, generator: torch.Generator, objective: Objective = PLAIN
 ) -> tuple[Tensor, Tensor]:
     """Noise levels `(batch, state tokens)` and `(batch, action tokens)`.
 
-    Half of the windows have independent levels, clean included; the others share one, as they do when a plan is
-    sampled; of these, a share `monotone` of all windows has levels that rise along the window instead. There the first
-    0 to `committed` actions to come are clean: they run while a plan is being made. The past is clean but in half of
-    the windows with independent levels, which learn to mend one (UniPhys, section 3.2).
+    A share `forcing` of the windows has independent levels, clean included, and a noisy past, which they learn to mend
+    (UniPhys, section 4.2). Of the others, which know their past, a third has independent levels of what is to come, and
+    two thirds share one level, as they do when a plan is sampled; of these, a share `monotone` of all windows has
+    levels that rise along the window instead. In those two thirds the first 0 to `committed` actions to come are clean:
+    they run while a plan is being made.
     """
-    half = batch // 2
+    forced = round(objective.forcing * batch)
+    together = round(_TOGETHER * (batch - forced))
     n_states, n_actions, k = len(config.state_ticks), len(config.action_ticks), config.levels
     levels = torch.randint(k + 1, (batch, n_states + n_actions), generator=generator)
-    levels[:half] = torch.randint(1, k + 1, (half, 1), generator=generator)
-    if rising := round(monotone * batch):
+    levels[:together] = torch.randint(1, k + 1, (together, 1), generator=generator)
+    if rising := min(round(objective.monotone * batch), together):
         levels[:rising] = torch.cat(rising_levels(config, rising, generator), 1)
     states, actions = levels[:, :n_states], levels[:, n_states:]
     state_ticks, action_ticks = torch.from_numpy(config.state_ticks), torch.from_numpy(config.action_ticks)
     clean = torch.zeros(batch, 1, dtype=torch.long)
-    clean[:half] = torch.randint(committed + 1, (half, 1), generator=generator)
-    known = torch.arange(batch)[:, None] < half + (batch - half) // 2
+    clean[:together] = torch.randint(committed + 1, (together, 1), generator=generator)
+    known = torch.arange(batch)[:, None] < batch - forced
     states = torch.where((state_ticks <= 0) & known, 0, states)
     actions = torch.where((action_ticks < clean) & known, 0, actions)
     return states, actions
@@ -136,7 +145,7 @@ def losses(
     One window in ten is shown without its instruction `text` `(batch, text_size)`, for classifier-free guidance.
     """
     config = denoiser.config
-    state_levels, action_levels = draw_levels(config, len(states), committed, generator, objective.monotone)
+    state_levels, action_levels = draw_levels(config, len(states), committed, generator, objective)
     noisy_states = add_noise(states, state_levels, signal, generator)
     noisy_actions = add_noise(actions, action_levels, signal, generator)
     told = torch.rand(len(states), generator=generator) >= UNTOLD

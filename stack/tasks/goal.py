@@ -14,6 +14,7 @@ from stack.tasks import measures
 from stack.tasks.approach import Approach, approach
 from stack.tasks.base import BaseTask, Range, Settings, require_positive, require_ranges
 from stack.tasks.frames import to_heading
+from stack.tasks.sentences import require_words, understood
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,9 @@ class GoalSettings(Settings):
     seen: Annotated[bool, "whether the robot sees the goal, as by a camera, or goes by its odometry alone"] = False
     arrive: Annotated[float, "m from the goal at which to stop"] = 0.05
     leave: Annotated[float, "m from the goal at which to start again"] = 0.1
+    text: Annotated[str | None, "a sentence on how to go there, beside the cost (else one that names the velocity)"] = (
+        None
+    )
     approach: Annotated[Approach, "speed profile"] = field(default_factory=Approach)
 
     def __post_init__(self) -> None:
@@ -45,6 +49,18 @@ class Goal(BaseTask):
     name = "goal"
     description = "walk to a point, drawn anywhere around the robot, and stand there"
     settings_type = GoalSettings
+
+    def __init__(self, settings: GoalSettings, dt: float) -> None:
+        """Raises ConfigError for a text that names no motion."""
+        super().__init__(settings, dt)
+        if settings.text is not None:
+            understood("text", settings.text)
+
+    @staticmethod
+    def complete(settings: dict[str, str]) -> dict[str, str]:
+        """Raises ConfigError for a text without a word."""
+        require_words(settings, "text")
+        return settings
 
     def reset(self, rng: np.random.Generator) -> None:
         """Draw the goal, fixed in the odometry frame."""
@@ -68,7 +84,8 @@ class Goal(BaseTask):
         distance = float(np.linalg.norm(ahead))
         self._stopped = distance <= (self.settings.leave if self._stopped else self.settings.arrive)
         velocity = np.zeros(3) if self._stopped else approach(ahead, self.settings.approach)
-        return Instruction(velocity=velocity, goal=ahead)
+        text = None if self._stopped else self.settings.text  # whoever has arrived is told to stand
+        return Instruction(velocity=velocity, goal=ahead, text=text)
 
     def done(self, state: State) -> bool:
         """Arrived, and standing for 1 s where that is asked."""

@@ -13,6 +13,7 @@ import numpy as np
 from hw.hal import Array, Instruction
 
 _STANDING = 1e-3  # m/s and rad/s: an instructed twist below it means to stand
+_SLOW = 0.05  # m/s below which the direction of a motion says little
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,12 @@ class Weights:
     displacement: float = 1.0  # per m^2
     yaw: float = 0.1  # per rad^2
     stand: float = 10.0  # per (m/s)^2 of each tick's velocity, where nothing but standing is asked
+    speed: float = 0.0  # per (m/s)^2 of the speed over the ground, whatever its direction
+    steering: float = 0.0  # of 1 - cos of the angle between the velocity over the ground and the one asked
+    heading: float = 0.0  # of 1 - cos of the angle between where each tick's robot faces and the velocity asked
     goal: float = 0.0  # per m of each tick's distance from the goal
     facing: float = 0.0  # of 1 - cos of each tick's bearing of the goal
+    waypoint: float = 0.0  # per m^2 of each tick's distance from the goal
     path: float = 10.0  # per m^2 of each tick's distance from where the path wants it
     repulsion: float = 0.1  # of exp(-sharpness * distance) from each obstacle, at each tick
     sharpness: float = 15.0  # per m
@@ -48,6 +53,8 @@ class Trajectory(Protocol):
     yaw: Any  # (batch, horizon) rad from now
     velocity: Any  # (batch, horizon, 2) m/s, each frame's own heading frame, like `State.velocity`
     yaw_rate: Any  # (batch, horizon) rad/s
+    height: Any  # (batch, horizon) m of the base above the ground
+    joints: Any  # (batch, horizon, n_joints) rad
     dt: float  # s between frames
 
 
@@ -57,7 +64,9 @@ def total_cost(trajectory: Trajectory, instruction: Instruction, weights: Weight
     The terms for goal, path and obstacles are means over the horizon, so that weights do not depend on its length.
     """
     cost = twist_cost(trajectory, instruction.velocity, weights)
-    if instruction.goal is not None and (weights.goal > 0.0 or weights.facing > 0.0):
+    if instruction.ground is not None and (weights.speed > 0.0 or weights.steering > 0.0 or weights.heading > 0.0):
+        cost = cost + ground_cost(trajectory, instruction.ground, weights)
+    if instruction.goal is not None and (weights.goal > 0.0 or weights.facing > 0.0 or weights.waypoint > 0.0):
         cost = cost + goal_cost(trajectory, instruction.goal, weights)
     if instruction.path is not None:
         cost = cost + path_cost(trajectory, instruction.path, weights)
@@ -67,11 +76,33 @@ def total_cost(trajectory: Trajectory, instruction: Instruction, weights: Weight
 
 
 def goal_cost(trajectory: Trajectory, goal: Array, weights: Weights) -> Any:
-    """`w1 |p - g| + w2 (1 - cos(heading, g - p))` of each tick, for a goal `(2,)` m (UniPhys, eq. 5): `(batch,)`."""
+    """Of each tick, for a goal `(2,)` m: `(batch,)`.
+
+    `w1 |p - g| + w2 (1 - cos(heading, g - p))` (UniPhys, eq. 5), and `w3 |p - g|^2` (Diffuse-CLoC's G_wp, section 4.1).
+    """
     way = trajectory.displacement.new_tensor(np.asarray(goal, dtype=float)) - trajectory.displacement
     distance = _norm(way)
     ahead = (way[..., 0] * trajectory.yaw.cos() + way[..., 1] * trajectory.yaw.sin()) / distance
-    return (weights.goal * distance + weights.facing * (1.0 - ahead)).mean(-1)
+    return (weights.goal * distance + weights.facing * (1.0 - ahead) + weights.waypoint * distance**2).mean(-1)
+
+
+def ground_cost(trajectory: Trajectory, asked: Array, weights: Weights) -> Any:
+    """`w1 (|v| - |g|)^2 + w2 (1 - cos(v, g)) + w3 (1 - cos(heading, g))`, for a velocity `(2,)` m/s: `(batch,)`.
+
+    UniPhys, eq. 6, but for v, the mean over the horizon: tick by tick, the sway of every walk would be an error. A slow
+    motion has hardly a direction, and where standing is asked there is none.
+    """
+    as_tensor = trajectory.velocity.new_tensor
+    cos, sin = trajectory.yaw.cos(), trajectory.yaw.sin()
+    forward, left = trajectory.velocity[..., 0], trajectory.velocity[..., 1]
+    along, across = (cos * forward - sin * left).mean(-1), (sin * forward + cos * left).mean(-1)
+    squared, wanted = along**2 + across**2, float(np.linalg.norm(asked))
+    cost = weights.speed * ((squared + 1e-9).sqrt() - wanted) ** 2
+    if wanted < _STANDING:
+        return cost
+    way = as_tensor(np.asarray(asked, dtype=float) / wanted)
+    cost = cost + weights.steering * (1.0 - (along * way[0] + across * way[1]) / (squared + _SLOW**2).sqrt())
+    return cost + weights.heading * (1.0 - (cos * way[0] + sin * way[1])).mean(-1)
 
 
 def path_cost(trajectory: Trajectory, path: Array, weights: Weights) -> Any:

@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from hw.config import ConfigError
 from hw.hal import Instruction, Percept, State, Trace
 from policy.text.captions import MOTIONS, followed, twist_of
 from stack.tasks import measures
 from stack.tasks.base import BaseTask, Settings, require_positive
+from stack.tasks.sentences import require_words, understood
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,12 @@ class Text(BaseTask):
     def __init__(self, settings: TextSettings, dt: float) -> None:
         """Raises ConfigError for a sentence that names no motion."""
         super().__init__(settings, dt)
-        self._asked: int | None = None if settings.sentence is None else _understood(settings.sentence)
+        self._asked: int | None = None if settings.sentence is None else understood("sentence", settings.sentence)
 
     @staticmethod
     def complete(settings: dict[str, str]) -> dict[str, str]:
-        """Raises ConfigError for a sentence without a word, which would otherwise count as none given."""
-        if not settings.get("sentence", "some").strip():
-            raise ConfigError("--set sentence=: is empty; write one such as 'walk forward'")
+        """Raises ConfigError for a sentence without a word."""
+        require_words(settings, "sentence")
         return settings
 
     def reset(self, rng: np.random.Generator) -> None:
@@ -90,14 +89,3 @@ class Text(BaseTask):
             elif trace.fallen:
                 verdicts.append(False)
         return float(np.mean(verdicts)) if verdicts else float("nan")
-
-
-def _understood(sentence: str) -> int:
-    """Number of the motion that a sentence asks for. Raises ConfigError where it is empty or in no known words."""
-    from policy.text.encoder import load_encoder
-    from policy.text.understanding import Phrasebook
-
-    try:
-        return Phrasebook(load_encoder()).understand(sentence)
-    except ConfigError as error:
-        raise ConfigError(f"--set sentence={sentence}: {error}") from None

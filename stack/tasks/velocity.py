@@ -59,7 +59,7 @@ class Velocity(BaseTask):
         if not self._velocity[number].any() and abs(off) < 0.05:
             turn = 0.0  # asked to stand, and facing the right way: no stepping on the spot
         # Until it faces the way, it walks by the part of the velocity that lies ahead: sideways it can hardly go.
-        return Instruction(velocity=np.array([max(float(ahead[0]), 0.0), 0.0, turn]))
+        return Instruction(velocity=np.array([max(float(ahead[0]), 0.0), 0.0, turn]), ground=ahead)
 
     def success(self, trace: Trace) -> bool:
         return not trace.fallen and self._error(trace) <= self.settings.tolerance

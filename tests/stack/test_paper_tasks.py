@@ -18,7 +18,7 @@ from policy.text.captions import MOTIONS
 from stack.tasks import load_settings, load_task
 from stack.tasks.field import Field, FieldSettings
 from stack.tasks.frames import to_heading
-from stack.tasks.guidance import Weights, goal_cost, obstacle_cost, path_cost, total_cost
+from stack.tasks.guidance import Weights, goal_cost, ground_cost, obstacle_cost, path_cost, total_cost
 
 DT = 0.02
 NOTHING = Percept(source="task", age=0.0)
@@ -52,14 +52,13 @@ def drive(task: Any, seconds: float, seed: int = 0, see: bool = True) -> Trace:
     )
 
 
-def moves(places: Array, yaw: float = 0.0) -> SimpleNamespace:
-    """A predicted trajectory through `places` `(horizon, 2)`."""
+def moves(places: Array, yaw: float = 0.0, velocity: tuple[float, float] = (0.0, 0.0)) -> SimpleNamespace:
+    """A predicted trajectory through `places` `(horizon, 2)`; `velocity` m/s is as a trajectory has it."""
     displacement = torch.tensor(np.asarray(places, dtype=float))[None].requires_grad_()
     horizon = displacement.shape[1]
     zeros = torch.zeros(1, horizon, dtype=torch.float64)
-    return SimpleNamespace(
-        displacement=displacement, yaw=zeros + yaw, velocity=torch.zeros_like(displacement), yaw_rate=zeros, dt=DT
-    )
+    moving = torch.zeros(1, horizon, 2, dtype=torch.float64) + torch.tensor(velocity, dtype=torch.float64)
+    return SimpleNamespace(displacement=displacement, yaw=zeros + yaw, velocity=moving, yaw_rate=zeros, dt=DT)
 
 
 def value(cost: torch.Tensor) -> float:
@@ -104,6 +103,35 @@ def test_goal_cost_wants_to_be_near_and_to_face_the_goal() -> None:
     assert value(away) == pytest.approx(2.0 + 3.0 * 2.0, rel=1e-5)
 
 
+def test_a_waypoint_costs_the_square_of_its_distance() -> None:
+    cost = goal_cost(moves(np.zeros((3, 2))), np.array([0.0, 2.0]), Weights(waypoint=0.5))
+    assert value(cost) == pytest.approx(2.0, rel=1e-5)
+
+
+def test_ground_cost_has_a_term_each_for_speed_direction_and_facing() -> None:
+    """It is told over the ground: who faces left and walks ahead goes left."""
+    left, still = np.array([0.0, 0.3]), np.zeros((5, 2))
+    right_way = moves(still, yaw=np.pi / 2, velocity=(0.3, 0.0))
+    assert value(ground_cost(right_way, left, Weights(speed=1.0, steering=1.0, heading=1.0))) < 0.02
+    slow = moves(still, yaw=np.pi / 2, velocity=(0.1, 0.0))
+    assert value(ground_cost(slow, left, Weights(speed=2.0))) == pytest.approx(2.0 * 0.2**2, rel=1e-3)
+    aside = moves(still, velocity=(0.0, 0.3))
+    assert value(ground_cost(aside, left, Weights(speed=1.0, steering=1.0))) < 0.02
+    assert value(ground_cost(aside, left, Weights(heading=2.0))) == pytest.approx(2.0, rel=1e-5)
+    ahead = moves(still, velocity=(0.3, 0.0))
+    assert value(ground_cost(ahead, left, Weights(steering=2.0))) == pytest.approx(2.0, rel=1e-5)
+    standing = np.zeros(2)
+    assert value(ground_cost(ahead, standing, Weights(speed=1.0, steering=1.0, heading=1.0))) == pytest.approx(0.09)
+
+
+def test_at_rest_the_ground_cost_pulls_toward_what_is_asked() -> None:
+    rest = moves(np.zeros((5, 2)))
+    rest.velocity.requires_grad_()
+    cost = ground_cost(rest, np.array([0.2, 0.0]), Weights(speed=1.0, steering=0.05, heading=0.1))
+    (gradient,) = torch.autograd.grad(cost.sum(), rest.velocity)
+    assert (gradient[..., 0] < 0).all()
+
+
 def test_path_cost_compares_tick_by_tick_as_far_as_both_go() -> None:
     path = np.stack([0.1 * np.arange(1, 4), np.zeros(3)], axis=-1)
     on_it = moves(np.stack([0.1 * np.arange(1, 7), np.zeros(6)], axis=-1))
@@ -115,11 +143,18 @@ def test_path_cost_compares_tick_by_tick_as_far_as_both_go() -> None:
 def test_weights_choose_the_terms_and_zero_leaves_the_planner_to_itself() -> None:
     trajectory = moves(0.1 * np.ones((5, 2)))
     instruction = Instruction(
-        velocity=np.array([0.2, 0.0, 0.0]), goal=np.ones(2), path=np.ones((5, 2)), obstacles=np.ones((2, 5))
+        velocity=np.array([0.2, 0.0, 0.0]),
+        ground=np.array([0.2, 0.2]),
+        goal=np.ones(2),
+        path=np.ones((5, 2)),
+        obstacles=np.ones((2, 5)),
     )
     nothing = Weights(velocity=0, yaw_rate=0, displacement=0, yaw=0, stand=0, path=0, repulsion=0)
     assert value(total_cost(trajectory, instruction, nothing)) == 0.0
-    for name in ("velocity", "displacement", "goal", "path", "repulsion", "avoidance"):
+    for name in (
+        "velocity", "displacement", "speed", "steering", "heading", "goal", "waypoint", "path", "repulsion",
+        "avoidance",
+    ):  # fmt: skip
         assert value(total_cost(trajectory, instruction, replace(nothing, **{name: 1.0}))) > 1e-6, name
     assert (
         load_settings("survive").cost
@@ -381,6 +416,16 @@ def test_text_takes_a_sentence_and_refuses_an_empty_or_foreign_one() -> None:
     for sentence in ("", "gehe bitte geradeaus nach vorne"):
         with pytest.raises(ConfigError, match="--set sentence="):
             load_task("text", {"sentence": sentence})
+        with pytest.raises(ConfigError, match="--set text="):
+            load_task("goal", {"text": sentence})
+
+
+def test_a_goal_can_be_gone_to_in_a_manner_that_a_sentence_names() -> None:
+    pytest.importorskip("wordllama")
+    task = load_task("goal", {"x": "1", "text": "walk forward slowly"}, DT)
+    task.reset(np.random.default_rng(0))
+    assert task.instruct(0, state(), NOTHING).text == "walk forward slowly"
+    assert task.instruct(1, state(0.99), NOTHING).text is None  # there, it is told to stand
 
 
 @pytest.mark.parametrize("name", ["forest", "obstacle", "cross", "path", "velocity", "text", "survive"])

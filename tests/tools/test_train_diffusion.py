@@ -217,6 +217,13 @@ def test_the_past_is_clean_in_three_quarters_of_the_windows_and_half_share_one_l
     assert set(clean.tolist()) == {0, 1, 2}
 
 
+def test_with_diffusion_forcing_alone_every_token_has_a_level_of_its_own() -> None:
+    states, actions = draw_levels(CONFIG, 400, 2, torch.Generator().manual_seed(0), Objective(forcing=1.0))
+    levels = torch.cat([states, actions], 1).float()
+    assert levels.mean(0).sub(10).abs().max() < 1.5  # past and future alike
+    assert abs(torch.corrcoef(levels.T)[0, 1:]).max() < 0.25
+
+
 def test_far_actions_count_less_and_past_ones_not_at_all() -> None:
     weight = action_weight(CONFIG)
     assert weight[:3].tolist() == [0, 0, 0]
@@ -239,7 +246,7 @@ def test_some_windows_have_levels_that_rise_as_gradual_and_rolling_schedules_do(
     assert 0.3 < together < 0.9  # the others are ahead or behind
     # In a batch they take the place of windows that share one level; the rest is as it was.
     plain = draw_levels(CONFIG, 400, 2, torch.Generator().manual_seed(0))
-    mixed = draw_levels(CONFIG, 400, 2, torch.Generator().manual_seed(0), monotone=0.25)
+    mixed = draw_levels(CONFIG, 400, 2, torch.Generator().manual_seed(0), Objective(monotone=0.25))
     assert (mixed[0][:100, 4:].diff(dim=1) > 0).any(1).float().mean() > 0.5
     assert not mixed[0][:300, :4].any()
     assert torch.equal(plain[0][100:], mixed[0][100:])
@@ -285,8 +292,12 @@ def test_objectives_change_the_loss_and_nothing_else() -> None:
 
 
 def test_objectives_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"0 to 0\.5, not 0\.8"):
+    with pytest.raises(ConfigError, match=r"0 to 0\.5 where 0\.25 .* not 0\.8"):
         Objective(monotone=0.8)
+    with pytest.raises(ConfigError, match=r"0 to 0 where 1 .* not 0\.25"):
+        Objective(monotone=0.25, forcing=1.0)
+    with pytest.raises(ConfigError, match="Diffusion Forcing must be 0 to 1"):
+        Objective(forcing=1.5)
     with pytest.raises(ConfigError, match="at least 1 tick"):
         Objective(near_actions=0)
     with pytest.raises(ConfigError, match="must not be negative"):

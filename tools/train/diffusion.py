@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from policy.diffusion.dataset import Windows
 
 MEANS = ("loss", "state_loss", "action_loss", "learning_rate", "tokens_per_s")
-OBJECTIVE = ("near_actions", "far_actions", "min_snr", "action_rate", "monotone")
+OBJECTIVE = ("near_actions", "far_actions", "min_snr", "action_rate", "monotone", "forcing")
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,7 @@ class Settings:
     min_snr: float = 0.0
     action_rate: float = 0.0
     monotone: float = 0.25
+    forcing: float = 0.25
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,7 +77,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--min-snr", type=float, default=d.min_snr, help="clip of SNR loss weights, 5 for one; 0: none")
     parser.add_argument("--action-rate", type=float, default=d.action_rate, help="weight of the error of changes")
     parser.add_argument(
-        "--monotone", type=float, default=d.monotone, help="share of windows with rising noise levels, 0 to 0.5"
+        "--monotone",
+        type=float,
+        default=d.monotone,
+        help="share of windows with rising noise levels, at most two thirds of what --forcing leaves",
+    )
+    parser.add_argument(
+        "--forcing",
+        type=float,
+        default=d.forcing,
+        help="share of windows with independent noise levels, past included (Diffusion Forcing); 1: as UniPhys",
     )
     parser.add_argument("--precision", choices=("bf16", "fp32"), default=d.precision)
 
