@@ -111,6 +111,8 @@ def test_the_canonical_frame_and_the_mirror_commute() -> None:
     torch.testing.assert_close(seen.velocity, plain.velocity * flip)
     torch.testing.assert_close(seen.yaw, -plain.yaw)
     torch.testing.assert_close(seen.yaw_rate, -plain.yaw_rate)
+    torch.testing.assert_close(plain.joints[0].numpy(), RAW.split(raw)["position"])
+    torch.testing.assert_close(plain.height[0].numpy(), RAW.split(raw)["displacement"][:, 2])
 
 
 def test_a_state_becomes_the_raw_row_that_its_layout_says() -> None:
