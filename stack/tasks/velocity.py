@@ -18,7 +18,7 @@ from stack.tasks.frames import turned
 @dataclass(frozen=True)
 class VelocitySettings(Settings):
     seconds: Annotated[float, "s, length of the episode"] = 183.0
-    speed: Annotated[Range, "m/s, one value or low:high"] = (0.0, 0.4)
+    speed: Annotated[Range, "m/s, one value or low:high"] = (0.0, 0.44)
     turn: Annotated[Range, "rad by which the direction changes each time, one value or low:high"] = (-1.0, 1.0)
     every: Annotated[float, "s between changes"] = 8.7
     settle: Annotated[float, "s after each change that do not count"] = 2.1
