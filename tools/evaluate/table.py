@@ -55,7 +55,7 @@ _VELOCITY = Run("velocity", quick_seconds=61.0)
 # Guided by a paper's cost alone: by no velocity that a script works out, and by no sentence.
 _UNSCRIPTED = dict.fromkeys(("cost.velocity", "cost.yaw_rate", "cost.displacement", "cost.yaw", "cost.stand"), "0")
 _ALONE = {**_UNSCRIPTED, "cost.goal": "1", "cost.facing": "0.5"}  # UniPhys, eq. 5
-# Pillars and goal balance 0.35 m from a pillar. Nearer the robot's arms touch them; further off it finds no way between.
+# Pillars and goal balance 0.35 m from a pillar: nearer, its arms touch them, and further off it finds no way between.
 _AMONG_PILLARS = {**_UNSCRIPTED, "cost.goal": "1", "cost.repulsion": "2", "cost.sharpness": "8"}
 # The gradient goes through the network, as in the papers: taken on the predicted states it moves the places alone,
 # which the next call takes for noise, and the robot stands.
