@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -43,6 +46,26 @@ def test_fitting_takes_a_systematic_slip_out(recorded: dict[str, np.ndarray], ca
     slip = data["errors"][:, ticks]
     assert np.square(slip - network(windows)).mean() < 0.25 * np.square(slip).mean()
     assert "corrected: rms" in capsys.readouterr().out
+
+
+def test_the_odometry_that_is_there_is_measured_and_nothing_is_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    given = []
+
+    def drift(robot: object, drive: object, network: object, **options: object) -> odometry.Drift:
+        given.append(network)
+        return odometry.Drift(0.01, 0.02, 0.03, 64)
+
+    monkeypatch.setattr(odometry, "drift", drift)
+    parser = argparse.ArgumentParser()
+    odometry.add_arguments(parser)
+    out = tmp_path / "o.safetensors"
+    assert odometry.main(parser.parse_args(["--policy", "--measure", "--out", str(out)])) == 0
+    assert given[0] is None
+    assert given[1] is not None
+    assert "gait, corrected: displacement error 1.0 % of the path (median), 2.0 %" in capsys.readouterr().out
+    assert not out.exists()
 
 
 def test_walks_that_cover_no_metre_do_not_count() -> None:

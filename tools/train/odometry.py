@@ -34,16 +34,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="of walking a world (default: %(default)s)")
     parser.add_argument("--steps", type=int, default=3000, help="of the optimiser (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--measure",
+        action="store_true",
+        help="train nothing: how far is the odometry that is there off on these walks",
+    )
 
 
 def main(args: argparse.Namespace) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # the worlds use the cores
     from hw.robot import load_robot
     from policy import checkpoint
+    from stack.odometry import load_odometry
 
     robot = load_robot(args.robot)
     names = ["gait", *(name for name in args.policy if name != "gait")]
     drivers = {name: driver(robot, name) for name in names}
+    if args.measure:
+        _measure(robot, drivers, load_odometry(robot), args.seed)
+        return 0
     known = _shipped(robot)
     data: dict[str, Array] | None = None
     for i, name in enumerate(names):  # every way of walking slips in its own way
@@ -51,17 +60,7 @@ def main(args: argparse.Namespace) -> int:
         data = part if data is None else mixed(data, part, args.seed)
     assert data is not None
     network = fit(data, args.steps, args.seed)
-    results = {}
-    for name in names:
-        for title, odometry in (("legs alone", None), ("corrected", network)):
-            result = drift(robot, drivers[name], odometry, walks=64, seconds=30.0, seed=args.seed + 1)
-            key = f"drift_p90_{name}" + ("_legs_alone" if odometry is None else "")
-            results[key] = round(result.p90, 4)
-            print(
-                f"{name}, {title}: displacement error {100 * result.median:.1f} % of the path (median), "
-                f"{100 * result.p90:.1f} % (90th percentile), yaw drift {result.yaw_p90:.3f} rad a minute "
-                f"(90th percentile), {result.walks} walks"
-            )
+    results = _measure(robot, drivers, network, args.seed)
     head = checkpoint.header(
         "odometry",
         robot,
@@ -74,6 +73,22 @@ def main(args: argparse.Namespace) -> int:
     network.save(args.out, head)
     print(f"wrote {args.out}")
     return 0
+
+
+def _measure(robot: Any, drivers: dict[str, MakeDriver], network: Any, seed: int) -> dict[str, float]:
+    """Print the drift of each way of walking, by legs alone and corrected; returns what the checkpoint says of it."""
+    results = {}
+    for name, drive in drivers.items():
+        for title, odometry in (("legs alone", None), ("corrected", network)):
+            result = drift(robot, drive, odometry, walks=64, seconds=30.0, seed=seed + 1)
+            key = f"drift_p90_{name}" + ("_legs_alone" if odometry is None else "")
+            results[key] = round(result.p90, 4)
+            print(
+                f"{name}, {title}: displacement error {100 * result.median:.1f} % of the path (median), "
+                f"{100 * result.p90:.1f} % (90th percentile), yaw drift {result.yaw_p90:.3f} rad a minute "
+                f"(90th percentile), {result.walks} walks"
+            )
+    return results
 
 
 def _shipped(robot: Any) -> Any:
