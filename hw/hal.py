@@ -260,12 +260,12 @@ class Instruction:
     """What a task asks of a policy at a tick."""
 
     velocity: Array  # (..., 3) m/s forward, m/s left, rad/s: base, heading frame
-    ground: Array | None = None  # (2,) m/s over the ground in the heading frame, where the task asks for one
     goal: Array | None = None  # (..., 2) m in the heading frame, from the base
     text: str | None = None  # a sentence that says what to do; None: go by the velocity; empty: by neither
     path: Array | None = None  # (n, 2) m in the heading frame: where to be at the next n ticks
     obstacles: Array | None = None  # (n, 5) in the heading frame: x, y, radius m, velocity m/s; to be kept clear of
     keyframes: Keyframes | None = None
+    ground: Array | None = None  # (2,) m/s over the ground in the heading frame, where the task asks for one
 
 
 class Policy(Protocol):

@@ -80,6 +80,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
                 "velocity": "m/s, m/s, rad/s",
                 "goal": "m, heading frame",
                 "path": "m, heading frame",
+                "ground": "m/s over the ground, heading frame",
                 "place": "m, goal in the odometry frame",
                 "obstacles": "x, y, radius m, odometry frame",
                 "robots": "x, y m and heading rad, odometry frame",
@@ -144,7 +145,7 @@ def messages(record: TickRecord) -> list[tuple[str, dict[str, Any]]]:
         instruction: dict[str, Any] = tick | {"velocity": pack(proposal.instruction.velocity, COMPACT)}
         if proposal.instruction.text is not None:
             instruction["text"] = proposal.instruction.text
-        arrays = {"goal": proposal.instruction.goal, "path": proposal.instruction.path}
+        arrays = {name: getattr(proposal.instruction, name) for name in ("goal", "path", "ground")}
         if (percept := proposal.percept) is not None:
             instruction["source"] = percept.source
             arrays |= {"place": percept.goal, "obstacles": percept.obstacles, "robots": percept.robots}

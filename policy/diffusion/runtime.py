@@ -152,7 +152,7 @@ class Runtime:
         states = np.zeros((1, config.history, raw_layout(self._joints).size))
         actions = np.zeros((1, config.history - 1 + self.settings.delay, config.action_size))
         with suppress(Diverged):  # a robot that is nowhere may well be out of bounds; a real plan will say so
-            self.plan_batch(states, actions, Instruction(np.zeros(3), np.zeros(2)), [(0, 0)])
+            self.plan_batch(states, actions, Instruction(np.zeros(3), goal=np.zeros(2)), [(0, 0)])
 
     @property
     def _joints(self) -> int:

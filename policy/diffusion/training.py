@@ -33,10 +33,11 @@ class Objective:
             raise ConfigError("the weights of far actions and of the action rate, and min-SNR, must not be negative")
         if not 0.0 <= self.forcing <= 1.0:
             raise ConfigError(f"the share of windows for Diffusion Forcing must be 0 to 1, not {self.forcing:g}")
-        if not 0.0 <= self.monotone <= (most := _TOGETHER * (1.0 - self.forcing)) + 1e-9:
+        most = _TOGETHER * (1.0 - self.forcing)
+        if not 0.0 <= self.monotone <= most + 1e-9:
             raise ConfigError(
-                f"the share of windows with monotone levels must be 0 to {most:g} where {self.forcing:g} are for"
-                f" Diffusion Forcing, not {self.monotone:g}"
+                f"the share of windows with monotone levels must be 0 to {most:g} with a share of {self.forcing:g} for"
+                f" Diffusion Forcing, not {self.monotone:g}: set --monotone or --forcing"
             )
 
 

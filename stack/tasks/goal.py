@@ -9,7 +9,9 @@ from typing import Annotated
 
 import numpy as np
 
+from hw.config import ConfigError
 from hw.hal import Array, Instruction, Percept, Scene, State, Trace
+from policy.text.captions import twist_of
 from stack.tasks import measures
 from stack.tasks.approach import Approach, approach
 from stack.tasks.base import BaseTask, Range, Settings, require_positive, require_ranges
@@ -51,10 +53,10 @@ class Goal(BaseTask):
     settings_type = GoalSettings
 
     def __init__(self, settings: GoalSettings, dt: float) -> None:
-        """Raises ConfigError for a text that names no motion."""
+        """Raises ConfigError for a text that names no motion, or none that goes anywhere."""
         super().__init__(settings, dt)
-        if settings.text is not None:
-            understood("text", settings.text)
+        if settings.text is not None and not twist_of(understood("text", settings.text)).any():
+            raise ConfigError(f"--set text={settings.text}: a robot that stands reaches no goal; say how to walk")
 
     @staticmethod
     def complete(settings: dict[str, str]) -> dict[str, str]:

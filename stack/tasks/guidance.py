@@ -89,10 +89,9 @@ def goal_cost(trajectory: Trajectory, goal: Array, weights: Weights) -> Any:
 def ground_cost(trajectory: Trajectory, asked: Array, weights: Weights) -> Any:
     """`w1 (|v| - |g|)^2 + w2 (1 - cos(v, g)) + w3 (1 - cos(heading, g))`, for a velocity `(2,)` m/s: `(batch,)`.
 
-    UniPhys, eq. 6, but for v, the mean over the horizon: tick by tick, the sway of every walk would be an error. A slow
+    UniPhys, eq. 6, with v the mean over the horizon: tick by tick, the sway of every walk would be an error. A slow
     motion has hardly a direction, and where standing is asked there is none.
     """
-    as_tensor = trajectory.velocity.new_tensor
     cos, sin = trajectory.yaw.cos(), trajectory.yaw.sin()
     forward, left = trajectory.velocity[..., 0], trajectory.velocity[..., 1]
     along, across = (cos * forward - sin * left).mean(-1), (sin * forward + cos * left).mean(-1)
@@ -100,9 +99,9 @@ def ground_cost(trajectory: Trajectory, asked: Array, weights: Weights) -> Any:
     cost = weights.speed * ((squared + 1e-9).sqrt() - wanted) ** 2
     if wanted < _STANDING:
         return cost
-    way = as_tensor(np.asarray(asked, dtype=float) / wanted)
-    cost = cost + weights.steering * (1.0 - (along * way[0] + across * way[1]) / (squared + _SLOW**2).sqrt())
-    return cost + weights.heading * (1.0 - (cos * way[0] + sin * way[1])).mean(-1)
+    x, y = (float(part) / wanted for part in asked)
+    cost = cost + weights.steering * (1.0 - (along * x + across * y) / (squared + _SLOW**2).sqrt())
+    return cost + weights.heading * (1.0 - (cos * x + sin * y)).mean(-1)
 
 
 def path_cost(trajectory: Trajectory, path: Array, weights: Weights) -> Any:

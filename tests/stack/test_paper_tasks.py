@@ -19,6 +19,7 @@ from stack.tasks import load_settings, load_task
 from stack.tasks.field import Field, FieldSettings
 from stack.tasks.frames import to_heading
 from stack.tasks.guidance import Weights, goal_cost, ground_cost, obstacle_cost, path_cost, total_cost
+from tools.collect.skills import SKILLS
 
 DT = 0.02
 NOTHING = Percept(source="task", age=0.0)
@@ -271,8 +272,9 @@ def test_obstacle_rolls_toward_the_robot_and_is_told_with_its_velocity() -> None
 # --- velocity
 
 
-def test_velocities_go_up_to_what_the_model_has_seen() -> None:
-    assert load_settings("velocity").speed == (0.0, 0.4)  # as measured; configs/tasks/velocity.yaml says how
+def test_demonstrations_are_asked_for_all_velocities_of_the_task() -> None:
+    fastest = max(box.forward[1] for skill in SKILLS for box in skill.boxes)
+    assert load_settings("velocity").speed[1] <= fastest
 
 
 def test_velocity_is_followed_over_the_ground() -> None:
@@ -426,6 +428,14 @@ def test_a_goal_can_be_gone_to_in_a_manner_that_a_sentence_names() -> None:
     task.reset(np.random.default_rng(0))
     assert task.instruct(0, state(), NOTHING).text == "walk forward slowly"
     assert task.instruct(1, state(0.99), NOTHING).text is None  # there, it is told to stand
+    with pytest.raises(ConfigError, match="reaches no goal"):
+        load_task("goal", {"text": "stand still"}, DT)
+
+
+def test_velocity_says_what_is_asked_over_the_ground_wherever_the_robot_faces() -> None:
+    task = load_task("velocity", {"speed": "0.2", "turn": "0"}, DT)
+    task.reset(np.random.default_rng(0))
+    np.testing.assert_allclose(task.instruct(0, state(yaw=np.pi / 2), NOTHING).ground, [0.0, -0.2], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["forest", "obstacle", "cross", "path", "velocity", "text", "survive"])

@@ -40,7 +40,7 @@ def tick_record(tick: int, rng: np.random.Generator) -> TickRecord:
         state=StillEstimator(ROBOT).update(seen, ROBOT.home),
         command=Command(rng.normal(size=N), np.ones(N), Mode.ACTIVE),
         proposal=Proposal(
-            instruction=Instruction(np.array([0.1, 0.0, 0.2]), goal=np.array([1.0, 0.5])),
+            instruction=Instruction(np.array([0.1, 0.0, 0.2]), goal=np.array([1.0, 0.5]), ground=np.array([0.3, -0.1])),
             percept=Percept("task", 0.0, goal=np.array([1.2, 0.5])),
             plan=Adopted(tick, tick + 2, plan) if tick % 4 == 0 else None,
         ),
@@ -79,7 +79,8 @@ def test_everything_reads_back(tmp_path):
     np.testing.assert_allclose(
         log.column("/plan", "path"), np.array([item.proposal.plan.plan.path for item in records[::4]]), rtol=1e-6
     )
-    np.testing.assert_allclose(log.column("/instruction", "place")[0], [1.2, 0.5], rtol=1e-6)
+    for name, sent in (("place", [1.2, 0.5]), ("goal", [1.0, 0.5]), ("ground", [0.3, -0.1])):
+        np.testing.assert_allclose(log.column("/instruction", name)[0], sent, rtol=1e-6)
     assert [event["text"] for event in log.messages["/event"]] == ["running"]
 
 

@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ from policy.diffusion.training import (
     rate_error,
     rising_levels,
 )
-from tools.train import diffusion
+from tools.train import diffusion, fleet
 from tools.train.diffusion import Settings, Trainer
 from tools.train.journal import Journal
 from tools.train.survival import closed_loop_survival
@@ -141,12 +142,23 @@ def test_training_lowers_the_loss_of_held_out_windows(windows: Windows, tmp_path
     assert run._validation_loss() < 0.7 * before
 
 
-def test_survival_is_measured_of_a_network_with_a_single_action(synthetic_dataset: Path, tmp_path: Path) -> None:
+def test_survival_is_measured_of_a_network_with_a_single_action(
+    synthetic_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     short = replace(CONFIG, actions=1)
     windows = Windows(read_recording(synthetic_dataset, ROBOT), ROBOT, short)
     run = Trainer(windows, ROBOT, short, QUICK, tmp_path, "made up", "Apache-2.0", None)
     run._ship(tmp_path / "one.safetensors", {})
+    shares: list[float] = []
+    made = fleet.Fleet.__init__
+
+    def noted(self: fleet.Fleet, *args: Any, **options: Any) -> None:
+        shares.append(options["randomise"])
+        made(self, *args, **options)
+
+    monkeypatch.setattr(fleet.Fleet, "__init__", noted)
     assert 0.0 <= closed_loop_survival(tmp_path / "one.safetensors", 0.5, 2, 0)["survival"] <= 1.0
+    assert shares == [0.5]  # robots drawn at random
 
 
 def test_survival_that_cannot_be_measured_stops_the_run_before_it_trains(
@@ -221,6 +233,11 @@ def test_with_diffusion_forcing_alone_every_token_has_a_level_of_its_own() -> No
     states, actions = draw_levels(CONFIG, 400, 2, torch.Generator().manual_seed(0), Objective(forcing=1.0))
     levels = torch.cat([states, actions], 1).float()
     assert levels.mean(0).sub(10).abs().max() < 1.5  # past and future alike
+    assert (states[:, :4] > 0).any(0).all()
+    assert (actions[:, :3] > 0).any(0).all()
+    half = draw_levels(CONFIG, 400, 2, torch.Generator().manual_seed(0), Objective(forcing=0.5))
+    assert not half[0][:200, :4].any()
+    assert (half[0][200:, :4] > 0).any(1).all()
     assert abs(torch.corrcoef(levels.T)[0, 1:]).max() < 0.25
 
 
@@ -292,9 +309,9 @@ def test_objectives_change_the_loss_and_nothing_else() -> None:
 
 
 def test_objectives_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"0 to 0\.5 where 0\.25 .* not 0\.8"):
+    with pytest.raises(ConfigError, match=r"0 to 0\.5 with a share of 0\.25 .* not 0\.8"):
         Objective(monotone=0.8)
-    with pytest.raises(ConfigError, match=r"0 to 0 where 1 .* not 0\.25"):
+    with pytest.raises(ConfigError, match=r"0 to 0 with a share of 1 .* not 0\.25: set --monotone"):
         Objective(monotone=0.25, forcing=1.0)
     with pytest.raises(ConfigError, match="Diffusion Forcing must be 0 to 1"):
         Objective(forcing=1.5)
@@ -305,7 +322,7 @@ def test_objectives_that_make_no_sense_are_refused() -> None:
 
 
 def test_a_checkpoint_says_what_it_was_trained_for(windows: Windows, tmp_path: Path) -> None:
-    options = {"min_snr": 5.0, "action_rate": 0.1, "monotone": 0.25, "far_actions": 0.0}
+    options = {"min_snr": 5.0, "action_rate": 0.1, "monotone": 0.25, "forcing": 0.5, "far_actions": 0.0}
     settings = Settings(minutes=0.002, batch=16, warmup_steps=5, **options)  # type: ignore[arg-type]
     trainer(windows, tmp_path, Measured(1.0), settings).run()
     training = read_header(tmp_path / "best.safetensors")["training"]

@@ -246,7 +246,7 @@ def _request(robot: Robot, model: Model, delay: int) -> PlanRequest:
     row[layout.slice("position")] = robot.home
     history, action = model.config.history, model.space.encode(row, robot.home)
     states, actions = np.tile(row, (history, 1)), np.tile(action, (history - 1 + delay, 1))
-    return PlanRequest(0, states, actions, Instruction(np.array([0.2, 0.0, 0.0]), np.array([1.0, 0.0])))
+    return PlanRequest(0, states, actions, Instruction(np.array([0.2, 0.0, 0.0]), goal=np.array([1.0, 0.0])))
 
 
 def _plan_times(planner: Runtime, request: PlanRequest, plans: int) -> tuple[list[float], list[float]]:

@@ -38,7 +38,8 @@ class Skill:
 
 
 # Their numbers are the dataset's task indices. Turning and walking mixed weigh more: they are most of what steering
-# to a goal asks for. Creeping covers the slow end, where a robot arrives.
+# to a goal asks for, and so does straight ahead, up to more than the expert can. Creeping covers the slow end, where a
+# robot arrives.
 SKILLS: tuple[Skill, ...] = (
     Skill("stand", "stand still", (Box(),), 2.5, (1.0, 3.0)),
     Skill("forward", "walk forward", (Box(forward=(0.05, 0.5)),), 2.5),

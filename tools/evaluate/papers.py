@@ -109,6 +109,8 @@ def _check(args: argparse.Namespace) -> None:
             raise ConfigError(f"--{name}: must be positive, not {value:g}")
     if args.minutes is not None and args.minutes < 0:
         raise ConfigError(f"--minutes: must not be negative, not {args.minutes:g}")
+    if args.minutes == 0 and args.fresh:
+        raise ConfigError("--fresh forgets what --minutes 0 would tell: leave out one of them")
     if args.workers < 0:
         raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +15,13 @@ import yaml
 from hw.config import ConfigError
 from tools.evaluate.cache import key
 from tools.evaluate.code import code
-from tools.evaluate.rows import Run
+from tools.evaluate.rows import Network, Run
 
 if TYPE_CHECKING:
     from policy.diffusion.settings import DiffusionSettings
 
 EXPERT = "expert"
+_WHATEVER = ("evaluate_every", "seed")  # of training: what does not make another kind of network
 
 
 class Pilots:
@@ -78,7 +82,8 @@ class Pilots:
                 raise ConfigError(f"policy '{self._policy}' has no such settings: this row is for diffusion models")
             return None
         base, path = self._settings, self.network(run)
-        if path is not None:
+        if run.network is not None and path is not None:
+            _check_training(path, run.network)
             base = replace(base, checkpoint=str(path.resolve()))
         return override(base, dict(run.plan), "planner setting")
 
@@ -97,6 +102,23 @@ class Pilots:
             return {**odometry, "checkpoint": known["checkpoint_sha256"], "gait": asdict(load_gait())}
         values = asdict(settings)
         return {**odometry, "settings": values | {"checkpoint": sha256(resolve(values["checkpoint"]))}}
+
+
+@cache
+def _check_training(path: Path, network: Network) -> None:
+    """Raise ConfigError for a network that was trained with other options than its row says."""
+    from policy.checkpoint import read_header
+    from tools.train.diffusion import add_arguments
+
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    asked = vars(parser.parse_args(["--data", "", "--out", "", *shlex.split(network.train)]))
+    header = read_header(path)
+    given = {**header.get("config", {}), **header.get("training", {})}
+    for name, value in given.items():
+        if name in asked and name not in _WHATEVER and asked[name] != value:
+            option = "--" + name.replace("_", "-")
+            raise ConfigError(f"{path}: trained with {option} {value}, and this row is of {asked[name]}: train it anew")
 
 
 def _diffusion_settings(policy: str) -> DiffusionSettings | None:

@@ -89,7 +89,8 @@ def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[st
     runs, commit = list(works.values()), git_commit()
     jobs = list(_jobs(runs, options.seed))
     cached = sum(len(work.records()) for work in runs)
-    say(f"{len(rows)} rows, {len(runs)} runs: {cached} episodes are there, {len(jobs)} are to be done")
+    ahead = "" if options.minutes == 0 else f", {len(jobs)} are to be done"
+    say(f"{len(rows)} rows, {len(runs)} runs: {cached} episodes are there{ahead}")
     deadline = None if options.minutes is None else begun + 60.0 * options.minutes
     # With no time at all there is nothing to start processes for.
     workers = 1 if options.minutes == 0 else max(min(options.workers or os.cpu_count() or 1, len(jobs)), 1)
@@ -119,7 +120,7 @@ def _prepare(run: Run, pilots: Pilots, options: Options) -> _Work:
     chosen, recipe = dict(run.set), None
     if run.clips:
         recipe = key(clips.recipe(options.robot) | {"number": run.clips})
-        recorded = clips.record_clips(options.out / "clips", options.robot, run.clips)
+        recorded = [] if options.minutes == 0 else clips.record_clips(options.out / "clips", options.robot, run.clips)
         chosen["clips"] = ":".join(map(str, recorded))
     own = load_settings(run.task, dict(run.set)).seconds
     limits = [own, options.seconds, run.quick_seconds if options.quick else None]

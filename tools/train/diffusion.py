@@ -86,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--forcing",
         type=float,
         default=d.forcing,
-        help="share of windows with independent noise levels, past included (Diffusion Forcing); 1: as UniPhys",
+        help="share of windows with independent noise levels, past included: Diffusion Forcing (1: with --monotone 0)",
     )
     parser.add_argument("--precision", choices=("bf16", "fp32"), default=d.precision)
 
@@ -101,6 +101,7 @@ def main(args: argparse.Namespace) -> int:
     from policy.diffusion.config import DenoiserConfig
     from policy.diffusion.dataset import Windows, read_recording
     from policy.diffusion.features import token_layout
+    from policy.diffusion.training import Objective
     from policy.latent.actions import load_latents
     from policy.text.encoder import load_encoder
 
@@ -120,6 +121,7 @@ def main(args: argparse.Namespace) -> int:
     )
     names = ("minutes", "batch", "learning_rate", "committed", "evaluate_every", "seed", "precision", *OBJECTIVE)
     settings = Settings(**{name: getattr(args, name) for name in names})
+    Objective(**{name: getattr(settings, name) for name in OBJECTIVE})  # refused before the data is read
     recording = read_recording(args.data, robot)
     windows = Windows(recording, robot, config, emphasis=args.emphasis, seed=args.seed, latents=latents)
     source = f"{args.data.resolve().name}: {len(recording.spans)} episodes, {len(recording.raw)} ticks"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -213,11 +214,11 @@ def test_a_network_of_latents_wants_the_latents_first(tmp_path: Path) -> None:
 
 
 def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path, done: list[Job]) -> None:
-    run = Run("goal-near", episodes=1, network=Network("full", "--mask full"))
+    run = Run("goal-near", episodes=1, network=Network("full", "--width 128 --horizon 24"))
     row = Row("t/full", "T", "Full", run, Metric("success", share=True))
     chosen = Options(tmp_path, policy="diffusion", workers=1)
     measured = evaluate([row], chosen, quiet)["t/full"]
-    command = f"servoid train diffusion --data runs/walks --out {tmp_path}/networks/full --mask full"
+    command = f"servoid train diffusion --data runs/walks --out {tmp_path}/networks/full --width 128 --horizon 24"
     assert measured.training == f"`{command}`"
     assert not measured.records
     path = tmp_path / "networks" / "full" / "best.safetensors"
@@ -225,6 +226,10 @@ def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path
     shutil.copy(resolve("diffusion"), path)
     assert len(evaluate([row], chosen, quiet)["t/full"].records) == 1
     assert str(path.resolve()) in Path(done[0].settings.policy).read_text()
+    other = replace(row, run=replace(run, network=Network("full", "--width 128 --horizon 24 --near-actions 16")))
+    refused = evaluate([other], chosen, quiet)["t/full"].refused
+    assert refused is not None
+    assert "trained with --near-actions 8, and this row is of 16" in refused
 
 
 def test_no_time_at_all_tells_what_was_done(tmp_path: Path, done: list[Job]) -> None:
@@ -232,6 +237,14 @@ def test_no_time_at_all_tells_what_was_done(tmp_path: Path, done: list[Job]) -> 
     measured = evaluate([NEAR, FAR], options(tmp_path, minutes=0), quiet)
     assert [len(measured[row.name].records) for row in (NEAR, FAR)] == [1, 0]
     assert len(done) == 1
+
+
+def test_no_time_at_all_records_no_clips_and_forgets_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    words = ["evaluate", "papers", "--minutes", "0", "--out", str(tmp_path), "--rows", "cloc/inbetween"]
+    assert main(words) == 0
+    assert not (tmp_path / "clips").exists()
+    assert main([*words, "--fresh"]) == 2
+    assert "--fresh" in capsys.readouterr().err
 
 
 def test_where_nothing_could_be_run_the_table_is_written_all_the_same(tmp_path: Path) -> None:
