@@ -30,6 +30,7 @@ from policy.diffusion.schedule import DenoisingMatrix, cosine_signal
 from policy.diffusion.settings import DiffusionSettings
 from policy.text.captions import MOTIONS, caption, motion_of
 from policy.text.encoder import load_encoder
+from policy.text.understanding import Phrasebook
 
 # (trajectory, instruction) -> cost (batch,), as tasks define it
 Cost = Callable[[Trajectory, Instruction], Any]
@@ -77,6 +78,7 @@ class Runtime:
         self._warm: dict[int, DenoisingMatrix] = {}  # rolling, by the number of fresh frames
         self._signal = cosine_signal(config.levels)
         self._encoder = load_encoder(config.text) if config.text and settings.text_weight else None
+        self._phrasebook = Phrasebook(self._encoder) if self._encoder and settings.text_nearest else None
         self._read: dict[str, Tensor] = {}  # instructions that were encoded
         self._used = tuple(torch.from_numpy(mask) for mask in settings.used(config))
         self._state_mask = torch.from_numpy(config.state_ticks <= 0) & self._used[0]
@@ -225,7 +227,8 @@ class Runtime:
     def _text(self, instruction: Instruction, batch: int) -> Tensor | None:
         """The encoded sentence `(batch, text size)`; where the task gives none, one that names the asked motion.
 
-        An empty one tells nothing: motion is then unconditional.
+        An empty one tells nothing: motion is then unconditional. A phrasing that was not trained with would be a code
+        that the network never saw, so the nearest of those that were is shown to it.
         """
         if self._encoder is None or instruction.text == "":
             return None
@@ -236,7 +239,8 @@ class Runtime:
         else:
             sentences = [MOTIONS[i].phrasings[0] for i in motion_of(instruction.velocity)]
         for sentence in set(sentences) - self._read.keys():
-            self._read[sentence] = torch.from_numpy(self._encoder.encode([sentence])[0])
+            phrasing = self._phrasebook.familiar(sentence) if self._phrasebook else sentence
+            self._read[sentence] = torch.from_numpy(self._encoder.encode([phrasing])[0])
         return torch.stack([self._read[sentence] for sentence in sentences])
 
     def _guidance(self, instruction: Instruction) -> Guidance | None:

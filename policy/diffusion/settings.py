@@ -108,6 +108,7 @@ class DiffusionSettings:
     eta: float = 0.0  # 0: DDIM, deterministic; 1: DDPM
     stabilise: int = 0  # noise level that clean tokens are shown with
     text_weight: float = 1.0  # classifier-free guidance by the instruction; 0: unread, 1: as trained
+    text_nearest: bool = True  # a sentence is read as the nearest one of the training; False: by its own code
     engine: str = REFERENCE  # what runs the network: see `policy.diffusion.engines`
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
 

@@ -41,6 +41,10 @@ class Phrasebook:
         """Index in `MOTIONS` of the phrasing nearest to each text, `(n,)`. Raises ConfigError as `encode` does."""
         return self.motions[_distances(self._encoder.encode(texts), self.codes).argmin(1)]
 
+    def familiar(self, text: str) -> str:
+        """The training phrasing nearest to a text. Raises ConfigError as `encode` does."""
+        return self.texts[int(_distances(self._encoder.encode([text]), self.codes)[0].argmin())]
+
     def understand(self, text: str) -> int:
         """Index in `MOTIONS` of what a text asks for.
 

@@ -19,7 +19,9 @@ from policy.diffusion.denoiser import Denoiser
 from policy.diffusion.features import Normaliser, Trajectory, raw_layout
 from policy.diffusion.runtime import Runtime
 from policy.diffusion.settings import DiffusionSettings, GuidanceSettings, load_settings
+from policy.text.captions import MOTIONS, NAMES
 from policy.text.encoder import load_encoder
+from policy.text.understanding import Phrasebook
 
 ROBOT = load_robot()
 SETTINGS = DiffusionSettings(steps=4, delay=2)
@@ -71,6 +73,22 @@ def test_an_empty_sentence_leaves_the_velocity_untold() -> None:
     assert not np.array_equal(first(None, 0.2), first(None, -0.1))
     assert not np.array_equal(first("", 0.2), first(None, 0.2))
     np.testing.assert_array_equal(first("", 0.2), first("", -0.1))
+
+
+def test_a_sentence_is_read_as_the_nearest_that_was_trained_with_unless_told_otherwise() -> None:
+    pytest.importorskip("wordllama")
+    told = "head straight on"  # held out
+    known = Phrasebook(load_encoder("words")).familiar(told)
+    assert known in MOTIONS[NAMES.index("forward")].phrasings
+
+    def first(text: str, nearest: bool) -> Array:
+        settings = replace(SETTINGS, text_nearest=nearest)
+        runtime = Runtime(model(text="words", text_size=load_encoder("words").size), settings, ROBOT.dt)
+        return runtime.plan(replace(request(), instruction=Instruction(np.zeros(3), text=text)), 7).actions
+
+    np.testing.assert_array_equal(first(told, True), first(known, True))
+    np.testing.assert_array_equal(first(known, True), first(known, False))
+    assert not np.array_equal(first(told, False), first(known, False))
 
 
 def test_committed_actions_are_part_of_the_plan() -> None:
