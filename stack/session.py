@@ -76,6 +76,7 @@ class Result:
     events: tuple[Event, ...]
     trace: Trace
     log: Path | None
+    interrupted: bool = False  # whether it was told to end, be it after its task had ended
 
     def summary(self) -> dict[str, Any]:
         """The result as JSON values, without the trace."""
@@ -210,7 +211,7 @@ def run(
             raise
         last = guard.events()
         tally.events += last
-        result = tally.result(director, guard, task, settings)
+        result = replace(tally.result(director, guard, task, settings), interrupted=interrupt.count > 0)
         if recorder is not None:
             recorder.events(last)
             recorder.close(result.summary())

@@ -99,10 +99,7 @@ def run_all(args: argparse.Namespace, values: dict[str, str], report: Any) -> li
 
 
 def _numbered(job: tuple[int, Settings]) -> tuple[int, dict[str, Any]]:
-    row = episode(job[1])
-    if row["outcome"] == "interrupted":  # by a Ctrl-C that the run took: no episode, and none after it
-        raise KeyboardInterrupt
-    return job[0], row
+    return job[0], episode(job[1])
 
 
 def episode_check(job: Settings) -> None:
@@ -125,12 +122,16 @@ class Judged:
 
 
 def episode(job: Settings) -> dict[str, Any]:
-    """One run, judged by the truth. One that the guard broke off is no success, however far it came."""
+    """One run, judged by the truth; see `judge`."""
     return judge(job).row
 
 
 def judge(job: Settings) -> Judged:
-    """One run, with everything that the truth shows of it."""
+    """One run, with everything that the truth shows of it.
+
+    One that the guard broke off is no success, however far it came. Raises KeyboardInterrupt where the run was told to
+    end, by a Ctrl-C that it took for itself: that is no episode, and there shall be none after it.
+    """
     from hw.robot import load_robot
     from stack.session import prepare, run
     from tools.witness import Witness
@@ -138,6 +139,8 @@ def judge(job: Settings) -> Judged:
     task, backend = prepare(job)
     witness = Witness(simulated_truth(backend), load_robot(job.robot).dt, getattr(backend, "stage", None))
     result = run(job, backend=backend, on_tick=witness)
+    if result.interrupted:
+        raise KeyboardInterrupt
     trace = witness.trace()
     row = {
         "seed": job.seed,

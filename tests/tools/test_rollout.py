@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +14,8 @@ from hw.config import ConfigError
 from hw.hal import Trace
 from hw.robot import load_robot
 from sim.backend import SimBackend
+from stack.loop import TickRecord
+from stack.safety import Phase
 from stack.session import Settings, run
 from tools import rollout
 from tools.witness import Witness
@@ -87,13 +90,12 @@ def trace(fallen: bool) -> Trace:
         ("succeeded", True, False, True),
         ("fell", False, False, True),  # the guard was quicker than the fall
         ("stopped", False, False, False),  # the guard broke it off: no success, however far it came
-        ("interrupted", False, False, False),
     ],
 )
 def test_success_is_by_the_truth_and_only_of_whole_runs(
     monkeypatch: pytest.MonkeyPatch, outcome: str, fallen: bool, success: bool, fell: bool
 ) -> None:
-    result = SimpleNamespace(outcome=outcome, seconds=4.0, trace=trace(False))
+    result = SimpleNamespace(outcome=outcome, seconds=4.0, trace=trace(False), interrupted=False)
     monkeypatch.setattr("stack.session.run", lambda *a, **k: result)
     monkeypatch.setattr(Witness, "trace", lambda self: trace(fallen))
     monkeypatch.setattr(Witness, "odometry_error", lambda self, estimate: 0.01)
@@ -101,10 +103,25 @@ def test_success_is_by_the_truth_and_only_of_whole_runs(
     assert (row["success"], row["fell"]) == (success, fell)
 
 
+def test_a_run_that_is_told_to_end_is_no_episode_even_where_its_task_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The signal comes while the robot is being lowered: the run has a result, and nothing else would know of it."""
+    lowering = []
+
+    def told(record: TickRecord) -> None:
+        if record.phase is Phase.LOWERING and not lowering:
+            lowering.append(record.tick)
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(Witness, "__call__", lambda self, record: told(record))
+    with pytest.raises(KeyboardInterrupt):
+        rollout.episode(Settings(task="stand", policy="gait", seconds=0.5))
+    assert lowering
+
+
 def test_a_run_that_never_began_is_counted_and_not_a_crash(monkeypatch: pytest.MonkeyPatch) -> None:
     """A randomised robot may fall while it stands up, before the task's first tick."""
     for task in ("walk", "goal", "stand"):
-        result = SimpleNamespace(outcome="stopped", seconds=0.0, trace=trace(False))
+        result = SimpleNamespace(outcome="stopped", seconds=0.0, trace=trace(False), interrupted=False)
         monkeypatch.setattr("stack.session.run", lambda *a, result=result, **k: result)
         row = rollout.episode(Settings(task=task, policy="gait"))
         assert not row["success"]

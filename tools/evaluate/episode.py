@@ -55,8 +55,6 @@ def record(settings: Settings) -> dict[str, Any]:
     from tools.rollout import judge
 
     judged = judge(settings)
-    if judged.row["outcome"] == "interrupted":  # by a Ctrl-C that the run took: no episode
-        raise KeyboardInterrupt
     trace, task = judged.trace, judged.task
     limit = round(task.seconds / trace.dt)
     goal = getattr(task, "goal", None)

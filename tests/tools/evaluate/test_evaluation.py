@@ -268,10 +268,11 @@ def test_variants_of_the_planner_are_files_that_the_policy_is_made_from(tmp_path
 
 def test_an_episode_that_ctrl_c_ended_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The run takes the signal for itself, and ends in good order: nothing else would tell the evaluation."""
-    from types import SimpleNamespace
 
-    judged = SimpleNamespace(row={"outcome": "interrupted", "success": False})
-    monkeypatch.setattr("tools.rollout.judge", lambda settings: judged)
+    def judge(settings: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tools.rollout.judge", judge)
     with pytest.raises(KeyboardInterrupt):
         evaluate([NEAR], options(tmp_path), quiet)
     assert not any('"episode"' in path.read_text() for path in (tmp_path / "episodes").glob("*.jsonl"))
