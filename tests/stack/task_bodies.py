@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+from types import SimpleNamespace
 
-from hw.hal import State
+import numpy as np
+import torch
+
+from hw.hal import Array, State
+
+DT = 0.02
 
 
 def state(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> State:
@@ -20,3 +25,12 @@ def state(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> State:
         joint_velocity=np.zeros(20),
         contact=np.ones(2),
     )
+
+
+def moves(places: Array, yaw: float = 0.0, velocity: tuple[float, float] = (0.0, 0.0)) -> SimpleNamespace:
+    """A predicted trajectory through `places` `(horizon, 2)`; `velocity` m/s is as a trajectory has it."""
+    displacement = torch.tensor(np.asarray(places, dtype=float))[None].requires_grad_()
+    horizon = displacement.shape[1]
+    zeros = torch.zeros(1, horizon, dtype=torch.float64)
+    moving = torch.zeros(1, horizon, 2, dtype=torch.float64) + torch.tensor(velocity, dtype=torch.float64)
+    return SimpleNamespace(displacement=displacement, yaw=zeros + yaw, velocity=moving, yaw_rate=zeros, dt=DT)

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from task_bodies import state
+from task_bodies import moves, state
 
 from hw.config import ConfigError
-from hw.hal import Array, Instruction, Percept, Trace
+from hw.hal import Percept, Trace
 from policy.text.captions import MOTIONS
 from stack.tasks import load_settings, load_task
 from stack.tasks.field import Field, FieldSettings
-from stack.tasks.frames import to_heading
-from stack.tasks.guidance import Weights, goal_cost, ground_cost, obstacle_cost, path_cost, total_cost
 from tools.collect.skills import SKILLS
 
 DT = 0.02
@@ -51,119 +48,6 @@ def drive(task: Any, seconds: float, seed: int = 0, see: bool = True) -> Trace:
         fallen=False,
         obstacles=np.array(obstacles) if see and obstacles[0] is not None else None,
     )
-
-
-def moves(places: Array, yaw: float = 0.0, velocity: tuple[float, float] = (0.0, 0.0)) -> SimpleNamespace:
-    """A predicted trajectory through `places` `(horizon, 2)`; `velocity` m/s is as a trajectory has it."""
-    displacement = torch.tensor(np.asarray(places, dtype=float))[None].requires_grad_()
-    horizon = displacement.shape[1]
-    zeros = torch.zeros(1, horizon, dtype=torch.float64)
-    moving = torch.zeros(1, horizon, 2, dtype=torch.float64) + torch.tensor(velocity, dtype=torch.float64)
-    return SimpleNamespace(displacement=displacement, yaw=zeros + yaw, velocity=moving, yaw_rate=zeros, dt=DT)
-
-
-def value(cost: torch.Tensor) -> float:
-    return float(cost.detach())
-
-
-# --- frames and costs
-
-
-def test_heading_frame_has_the_robot_at_its_origin_facing_x() -> None:
-    now = state(1.0, 2.0, np.pi / 2)
-    np.testing.assert_allclose(to_heading(np.array([[1.0, 3.0], [0.0, 2.0]]), now), [[1, 0], [0, 1]], atol=1e-12)
-
-
-def test_obstacle_cost_is_the_papers_and_pushes_away() -> None:
-    here = moves(np.zeros((4, 2)))
-    obstacle = np.array([[0.3, 0.0, 0.05, 0.0, 0.0]])
-    cost = obstacle_cost(here, obstacle, Weights(repulsion=2.0, sharpness=10.0))
-    assert value(cost) == pytest.approx(2.0 * np.exp(-10.0 * 0.25), rel=1e-4)
-    (gradient,) = torch.autograd.grad(cost.sum(), here.displacement)
-    assert (gradient[0, :, 0] > 0).all()  # a step down it goes back
-    assert (gradient[0, :, 1] == 0).all()
-    soft = obstacle_cost(here, obstacle, Weights(repulsion=0.0, avoidance=1.0, margin=0.25))
-    assert value(soft) == pytest.approx(np.log(2.0), rel=1e-4)
-
-
-def test_obstacle_cost_meets_a_moving_obstacle_where_it_will_be() -> None:
-    horizon = 25
-    still = moves(np.zeros((horizon, 2)))
-    coming, leaving = np.array([[0.5, 0, 0.1, -0.4, 0]]), np.array([[0.5, 0, 0.1, 0.4, 0]])
-    weights = Weights(repulsion=1.0)
-    assert obstacle_cost(still, coming, weights) > 5 * obstacle_cost(still, leaving, weights)
-    at_end = 0.5 - 0.4 * DT * horizon
-    alone = obstacle_cost(moves(np.zeros((1, 2))), np.array([[at_end + 0.4 * DT, 0, 0.1, -0.4, 0]]), weights)
-    assert value(alone) == pytest.approx(np.exp(-15 * (at_end - 0.1)), rel=1e-4)
-
-
-def test_goal_cost_wants_to_be_near_and_to_face_the_goal() -> None:
-    goal, weights = np.array([1.0, 0.0]), Weights(goal=2.0, facing=3.0)
-    assert value(goal_cost(moves(np.zeros((3, 2))), goal, weights)) == pytest.approx(2.0, rel=1e-5)
-    away = goal_cost(moves(np.zeros((3, 2)), yaw=np.pi), goal, weights)
-    assert value(away) == pytest.approx(2.0 + 3.0 * 2.0, rel=1e-5)
-
-
-def test_a_waypoint_costs_the_square_of_its_distance() -> None:
-    cost = goal_cost(moves(np.zeros((3, 2))), np.array([0.0, 2.0]), Weights(waypoint=0.5))
-    assert value(cost) == pytest.approx(2.0, rel=1e-5)
-
-
-def test_ground_cost_has_a_term_each_for_speed_direction_and_facing() -> None:
-    """It is told over the ground: who faces left and walks ahead goes left."""
-    left, still = np.array([0.0, 0.3]), np.zeros((5, 2))
-    right_way = moves(still, yaw=np.pi / 2, velocity=(0.3, 0.0))
-    assert value(ground_cost(right_way, left, Weights(speed=1.0, steering=1.0, heading=1.0))) < 0.02
-    slow = moves(still, yaw=np.pi / 2, velocity=(0.1, 0.0))
-    assert value(ground_cost(slow, left, Weights(speed=2.0))) == pytest.approx(2.0 * 0.2**2, rel=1e-3)
-    aside = moves(still, velocity=(0.0, 0.3))
-    assert value(ground_cost(aside, left, Weights(speed=1.0, steering=1.0))) < 0.02
-    assert value(ground_cost(aside, left, Weights(heading=2.0))) == pytest.approx(2.0, rel=1e-5)
-    ahead = moves(still, velocity=(0.3, 0.0))
-    assert value(ground_cost(ahead, left, Weights(steering=2.0))) == pytest.approx(2.0, rel=1e-5)
-    standing = np.zeros(2)
-    assert value(ground_cost(ahead, standing, Weights(speed=1.0, steering=1.0, heading=1.0))) == pytest.approx(0.09)
-
-
-def test_at_rest_the_ground_cost_pulls_toward_what_is_asked() -> None:
-    rest = moves(np.zeros((5, 2)))
-    rest.velocity.requires_grad_()
-    cost = ground_cost(rest, np.array([0.2, 0.0]), Weights(speed=1.0, steering=0.05, heading=0.1))
-    (gradient,) = torch.autograd.grad(cost.sum(), rest.velocity)
-    assert (gradient[..., 0] < 0).all()
-
-
-def test_path_cost_compares_tick_by_tick_as_far_as_both_go() -> None:
-    path = np.stack([0.1 * np.arange(1, 4), np.zeros(3)], axis=-1)
-    on_it = moves(np.stack([0.1 * np.arange(1, 7), np.zeros(6)], axis=-1))
-    assert value(path_cost(on_it, path, Weights(path=1.0))) == pytest.approx(0.0, abs=1e-12)
-    late = moves(np.stack([0.1 * np.arange(0, 6), np.zeros(6)], axis=-1))
-    assert value(path_cost(late, path, Weights(path=5.0))) == pytest.approx(5.0 * 0.01)
-
-
-def test_weights_choose_the_terms_and_zero_leaves_the_planner_to_itself() -> None:
-    trajectory = moves(0.1 * np.ones((5, 2)))
-    instruction = Instruction(
-        velocity=np.array([0.2, 0.0, 0.0]),
-        ground=np.array([0.2, 0.2]),
-        goal=np.ones(2),
-        path=np.ones((5, 2)),
-        obstacles=np.ones((2, 5)),
-    )
-    nothing = Weights(velocity=0, yaw_rate=0, displacement=0, yaw=0, stand=0, path=0, repulsion=0)
-    assert value(total_cost(trajectory, instruction, nothing)) == 0.0
-    for name in (
-        "velocity", "displacement", "speed", "steering", "heading", "goal", "waypoint", "path", "repulsion",
-        "avoidance",
-    ):  # fmt: skip
-        assert value(total_cost(trajectory, instruction, replace(nothing, **{name: 1.0}))) > 1e-6, name
-    assert (
-        load_settings("survive").cost
-        == load_settings("text").cost
-        == replace(Weights(), velocity=0, yaw_rate=0, displacement=0, yaw=0, stand=0)
-    )
-    with pytest.raises(ValueError, match="margin: must be positive"):
-        Weights(margin=0.0)
 
 
 # --- forest
