@@ -31,9 +31,10 @@ OBJECTIVE = ("near_actions", "far_actions", "min_snr", "action_rate", "monotone"
 
 @dataclass(frozen=True)
 class Settings:
-    """How to train; times in minutes of training, evaluation not counted."""
+    """How to train; times in minutes of training, evaluations not counted."""
 
     minutes: float = 45.0
+    steps: int = 0  # 0: as many as fit into the minutes
     batch: int = 128
     learning_rate: float = 6e-4
     weight_decay: float = 1e-3
@@ -92,7 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Train; returns 0 when the time budget is used up. Raises ConfigError."""
+    """Train; returns 0 when the budget is used up. Raises ConfigError."""
     # Threads that spin while they wait for each other make a step ten times slower when another program is running.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded
     import torch
@@ -119,8 +120,8 @@ def main(args: argparse.Namespace) -> int:
         text_size=load_encoder(args.text).size if args.text else 0,
         **{name: getattr(args, name) for name in shape},
     )
-    names = ("minutes", "batch", "learning_rate", "committed", "evaluate_every", "seed", "precision", *OBJECTIVE)
-    settings = Settings(**{name: getattr(args, name) for name in names})
+    names = "minutes", "steps", "batch", "learning_rate", "committed", "evaluate_every", "seed", "precision"
+    settings = Settings(**{name: getattr(args, name) for name in (*names, *OBJECTIVE)})
     Objective(**{name: getattr(settings, name) for name in OBJECTIVE})  # refused before the data is read
     recording = read_recording(args.data, robot)
     windows = Windows(recording, robot, config, emphasis=args.emphasis, seed=args.seed, latents=latents)
@@ -171,7 +172,7 @@ class Trainer(TimedTrainer):
 
         if settings.committed > config.horizon:
             raise ConfigError(f"--committed {settings.committed} is longer than the horizon of {config.horizon} ticks")
-        super().__init__(out, settings.minutes, settings.evaluate_every, survival)
+        super().__init__(out, settings.minutes, settings.steps, settings.evaluate_every, survival)
         self.objective = Objective(**{name: getattr(settings, name) for name in OBJECTIVE})
         torch.manual_seed(settings.seed)
         self.windows, self.robot, self.config, self.settings = windows, robot, config, settings
@@ -272,7 +273,7 @@ class Trainer(TimedTrainer):
             self.robot,
             data=self.source,
             licence=self.licence,
-            results={"step": self.step, "minutes": round(self.seconds / 60, 2), **results},
+            results={**self.progress, **results},
             training=asdict(self.settings),
             latents=self.windows.latents,
         )

@@ -33,6 +33,7 @@ class Settings:
     """How to train. Loss: squared error of normalised targets + beta KL + change of the posterior's mean, weighted."""
 
     minutes: float = 5.0
+    steps: int = 0  # 0: as many as fit into the minutes
     batch: int = 512  # pairs of ticks
     learning_rate: float = 1e-3
     beta: tuple[float, float] = (0.01, 0.001)  # at the beginning and at the end, as PULSE's; geometric in between
@@ -43,8 +44,8 @@ class Settings:
     def __post_init__(self) -> None:
         if min(self.beta) <= 0 or self.change < 0:
             raise ConfigError("beta must be positive, and the weight of changes not negative")
-        if self.minutes <= 0 or self.batch < 1 or self.learning_rate <= 0:
-            raise ConfigError("minutes, batch and learning rate must be positive")
+        if self.batch < 1 or self.learning_rate <= 0:
+            raise ConfigError("batch and learning rate must be positive")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Train; returns 0 when the time budget is used up. Raises ConfigError."""
+    """Train; returns 0 when the budget is used up. Raises ConfigError."""
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded; see `tools.train.diffusion`
     import torch
 
@@ -75,7 +76,7 @@ def main(args: argparse.Namespace) -> int:
     torch.set_num_threads(args.threads)
     robot = load_robot(args.robot)
     config = LatentConfig(args.size, args.width, args.layers)
-    names = ("minutes", "batch", "learning_rate", "change", "evaluate_every", "seed")
+    names = ("minutes", "steps", "batch", "learning_rate", "change", "evaluate_every", "seed")
     settings = Settings(beta=(args.beta[0], args.beta[1]), **{name: getattr(args, name) for name in names})
     recording = read_recording(args.data, robot)
     source = f"{args.data.resolve().name}: {len(recording.spans)} episodes, {len(recording.raw)} ticks"
@@ -126,7 +127,7 @@ class LatentTrainer(TimedTrainer):
 
         from policy.latent.network import LatentNetwork
 
-        super().__init__(out, settings.minutes, settings.evaluate_every, survival)
+        super().__init__(out, settings.minutes, settings.steps, settings.evaluate_every, survival)
         torch.manual_seed(settings.seed)
         self.pairs, self.robot, self.config, self.settings = pairs, robot, config, settings
         self.source, self.licence = source, licence
@@ -181,7 +182,7 @@ class LatentTrainer(TimedTrainer):
     def _ship(self, path: Path, results: Mapping[str, float]) -> None:
         from policy.latent.actions import save_latents
 
-        facts = {"step": self.step, "minutes": round(self.seconds / 60, 2), **results}
+        facts = {**self.progress, **results}
         latents, how = self.network.to_numpy(), {**asdict(self.settings), "beta": list(self.settings.beta)}
         save_latents(path, latents, self.robot, data=self.source, licence=self.licence, results=facts, training=how)
 

@@ -1,4 +1,4 @@
-"""A training run of a given time, in a folder where it can be resumed, that keeps the best of its checkpoints."""
+"""A training run of a given time or number of steps, in a folder where it can be resumed, that keeps its best network."""
 
 from __future__ import annotations
 
@@ -18,11 +18,18 @@ Survival = Callable[[Path], Mapping[str, float]]
 
 
 def add_run_arguments(parser: argparse.ArgumentParser, minutes: float, evaluate_every: float, otherwise: str) -> None:
-    """Add the options that all timed trainers share. `otherwise` chooses the best where survival is not measured."""
+    """Add the options that all such trainers share. `otherwise` chooses the best where survival is not measured."""
     parser.add_argument("--data", type=Path, required=True, help="dataset folder, as `servoid collect` writes it")
     parser.add_argument("--out", type=Path, required=True, help="folder of the run: checkpoints, logs, learning curve")
     parser.add_argument("--robot", default="op3", help="robot name or file (default op3)")
     parser.add_argument("--minutes", type=float, default=minutes, help="training time; evaluations come on top")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=0,
+        help="train for so many steps instead, however long they take: the same on any machine. It is evaluated as often"
+        " as it would be in --minutes",
+    )
     parser.add_argument("--resume", action=argparse.BooleanOptionalAction, default=True, help="continue in --out")
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch threads (default: all cores)")
     parser.add_argument("--evaluate-every", type=float, default=evaluate_every, help="minutes; 0: only at the end")
@@ -44,12 +51,20 @@ class TimedTrainer:
     COLUMNS: ClassVar[tuple[str, ...]]  # of the log: "minutes", and all that is measured
     PANELS: ClassVar[Sequence[Sequence[str]]]  # columns that are drawn, by picture
 
-    def __init__(self, out: Path, minutes: float, evaluate_every: float, survival: Survival | None) -> None:
-        """Minutes of training, evaluations not counted; `evaluate_every` 0: only at the end."""
-        self.out, self.minutes, self.evaluate_every, self.survival = out, minutes, evaluate_every, survival
+    def __init__(
+        self, out: Path, minutes: float, steps: int, evaluate_every: float, survival: Survival | None
+    ) -> None:
+        """Minutes of training, evaluations not counted, or steps where they are not 0.
+
+        `evaluate_every` are minutes, of `minutes`; 0: only at the end. Raises ConfigError for less than nothing.
+        """
+        if minutes <= 0 or steps < 0 or evaluate_every < 0:
+            raise ConfigError("--minutes must be positive, --steps and --evaluate-every not negative")
+        self.out, self.minutes, self.steps, self.survival = out, minutes, steps, survival
+        self.every = evaluate_every / minutes or math.inf  # share of the budget from an evaluation to the next
         self.step = 0
         self.seconds = 0.0  # of training, evaluations not counted
-        self.evaluated = 0.0  # training time at the last evaluation
+        self.evaluated = 0.0  # share of the budget that was used at the last evaluation
         self.best: tuple[float, float] | None = None  # survival, minus the held-out loss
         out.mkdir(parents=True, exist_ok=True)
 
@@ -87,47 +102,50 @@ class TimedTrainer:
 
     @property
     def share(self) -> float:
-        """Of the time that is used up, 0 to 1."""
-        return min(1.0, self.seconds / (60 * self.minutes))
+        """Of the time or of the steps that is used up, 0 to 1."""
+        return min(1.0, self.step / self.steps if self.steps else self.seconds / (60 * self.minutes))
+
+    @property
+    def progress(self) -> dict[str, float]:
+        """How far the run has come, for the header of a checkpoint."""
+        return {"step": self.step, "minutes": round(self.seconds / 60, 2), "share": round(self.share, 4)}
 
     def run(self) -> None:
-        """Train until the time is used up. Interrupted, it saves first what `resume` needs."""
+        """Train until the budget is used up. Interrupted, it saves first what `resume` needs."""
         from tqdm import tqdm
 
         from tools.train.journal import Journal
 
-        budget = 60 * self.minutes
-        every = 60 * self.evaluate_every or math.inf
-        print(f"training {self._title()}, {self.minutes:g} minutes, in {self.out}", file=sys.stderr)
+        budget = f"{self.steps:,} steps" if self.steps else f"{self.minutes:g} minutes"
+        print(f"training {self._title()}, {budget}, in {self.out}", file=sys.stderr)
         with (
             Journal(self.out, self.COLUMNS, self.step) as journal,
-            tqdm(total=round(budget), initial=round(self.seconds), unit="s", file=sys.stderr, mininterval=2) as bar,
+            tqdm(total=100, initial=round(100 * self.share), unit="%", file=sys.stderr, mininterval=2) as bar,
         ):
             try:
-                while self.seconds < budget:
-                    due = max(self.evaluated + every - self.seconds, 0.0)
-                    self._train_for(min(budget - self.seconds, due, 10.0), journal, bar)
-                    if self.seconds - self.evaluated >= every and self.seconds < budget:
+                while self.share < 1.0:
+                    self._train_until(self.evaluated + self.every, journal, bar)
+                    if self.evaluated + self.every <= self.share < 1.0:
                         self._evaluate(journal, bar)
-                if self.evaluated < self.seconds:
+                if self.evaluated < self.share:
                     self._evaluate(journal, bar)
             except KeyboardInterrupt:
                 self.save()
                 print(f"interrupted: the same command goes on from step {self.step}", file=sys.stderr)
                 raise
 
-    def _train_for(self, seconds: float, journal: Any, bar: Any) -> None:
-        """Train for about `seconds` and log the means."""
+    def _train_until(self, share: float, journal: Any, bar: Any) -> None:
+        """Train until that share of the budget is used, at most for ten seconds, and log the means."""
         before, start = self.seconds, time.perf_counter()
         losses: list[tuple[float, ...]] = []
-        while self.seconds - before < seconds or not losses:
+        while not losses or (self.share < min(share, 1.0) and self.seconds - before < 10.0):
             losses.append(self._step())
             self.seconds = before + time.perf_counter() - start
         elapsed, steps = self.seconds - before, len(losses)
         means = tuple(sum(column) / steps for column in zip(*losses, strict=True))
         columns, text = self._progress(means, steps / elapsed)
         journal.log(self.step, {"minutes": self.seconds / 60, **columns})
-        bar.update(round(self.seconds) - bar.n)
+        bar.update(round(100 * self.share) - bar.n)
         bar.set_postfix_str(f"step {self.step}, {text}")
 
     def _evaluate(self, journal: Any, bar: Any) -> None:
@@ -142,7 +160,7 @@ class TimedTrainer:
         if better := self.best is None or score > self.best:
             self.best = score
             self._ship(self.out / self.BEST, results)
-        self.evaluated = self.seconds
+        self.evaluated = self.share
         self.save()
         row = {name: value for name, value in results.items() if name in self.COLUMNS}
         journal.log(self.step, {"minutes": self.seconds / 60, **row})
@@ -178,7 +196,8 @@ class TimedTrainer:
         except (RuntimeError, EOFError, OSError, pickle.UnpicklingError) as error:
             raise ConfigError(f"{path}: cannot be resumed ({error}); use --no-resume or another --out") from error
         self._restore(path, saved)
-        self.step, self.seconds, self.evaluated = saved["step"], saved["seconds"], saved["evaluated"]
+        self.step, self.seconds = saved["step"], saved["seconds"]
+        self.evaluated = min(saved["evaluated"], self.share)  # of another budget, perhaps
         self.best = (saved["best"][0], saved["best"][1]) if saved["best"] else None
         print(f"resumed at step {self.step}, {self.seconds / 60:.1f} minutes", file=sys.stderr)
         return True
