@@ -1,4 +1,4 @@
-"""A training run of a given time or number of steps, in a folder where it can be resumed, that keeps its best network."""
+"""A training run of some time or steps, in a folder where it can be resumed, that keeps the best network."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ def add_run_arguments(parser: argparse.ArgumentParser, minutes: float, evaluate_
         "--steps",
         type=int,
         default=0,
-        help="train for so many steps instead, however long they take: the same on any machine. It is evaluated as often"
-        " as it would be in --minutes",
+        help="train for so many steps instead, the same on any machine; evaluated as often as in --minutes",
     )
     parser.add_argument("--resume", action=argparse.BooleanOptionalAction, default=True, help="continue in --out")
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch threads (default: all cores)")
@@ -51,9 +50,7 @@ class TimedTrainer:
     COLUMNS: ClassVar[tuple[str, ...]]  # of the log: "minutes", and all that is measured
     PANELS: ClassVar[Sequence[Sequence[str]]]  # columns that are drawn, by picture
 
-    def __init__(
-        self, out: Path, minutes: float, steps: int, evaluate_every: float, survival: Survival | None
-    ) -> None:
+    def __init__(self, out: Path, minutes: float, steps: int, evaluate_every: float, survival: Survival | None) -> None:
         """Minutes of training, evaluations not counted, or steps where they are not 0.
 
         `evaluate_every` are minutes, of `minutes`; 0: only at the end. Raises ConfigError for less than nothing.
