@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -30,11 +31,12 @@ def test_it_prints_one_row_for_each_network_runtime_and_kind_of_guidance(capfd: 
         for gradient in ("none", "analytic", "network")
     ]
     chunked, rolling = load_settings(), load_settings("diffuse_cloc")
-    assert result["ms_between_plans"] == pytest.approx(1000 * chunked.replan * 0.02)
+    assert result["plan_due_ms"] == pytest.approx(40), "a plan that takes longer than `delay` is never adopted"
     assert len({(row["network"], row["call_median_ms"]) for row in rows}) == 2, "a call is the same in every runtime"
     for row in rows:
         settings = chunked if row["runtime"] == "chunked" else rolling
         assert row["engine"] == "torch"
+        assert row["plan_due_ms"] == pytest.approx(1000 * settings.delay * 0.02)
         assert row["tokens"] == (39 if row["network"] == "random" else 2 + 12 + 1 + 6)
         assert row["calls_per_plan"] == settings.steps + settings.lead
         assert 0 < row["call_median_ms"] <= row["call_p99_ms"]
@@ -45,6 +47,10 @@ def test_it_prints_one_row_for_each_network_runtime_and_kind_of_guidance(capfd: 
         assert row["plan_cpu_ms"] > 0
         assert row["gflops"] > 0
         assert row["peak_gflops"] == rows[0]["peak_gflops"] > 0
+
+
+def test_without_a_delay_a_plan_is_due_before_the_next_one() -> None:
+    assert policy.due_ms(replace(load_settings(), replan=4, delay=0), 0.02) == pytest.approx(80)
 
 
 def test_operations_are_counted_as_the_layers_say() -> None:

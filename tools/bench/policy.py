@@ -111,19 +111,23 @@ def _run(args: argparse.Namespace, report: Report) -> None:
         config = network.model.config
         report.line(f"{network.name}: {network.model.denoiser.parameter_count:,} parameters, {config.tokens} tokens")
     report.table(COLUMNS, [[_cell(row[key]) for key in COLUMNS] for row in rows])
-    between = {name: 1000 * settings.replan * robot.dt for name, settings in runtimes.items()}
-    due = ", ".join(f"{name} every {ms:g} ms" for name, ms in between.items())
+    due = ", ".join(f"{name} after {due_ms(settings, robot.dt):g} ms" for name, settings in runtimes.items())
     report.line(f"one thread, peak {peak:.0f} GFLOP/s; a plan is due: {due}")
     for what, reason in skipped.items():
         report.line(f"skipped {what}: {reason}")
     report.result(
         {
             "checkpoint": networks[0].name,
-            "ms_between_plans": next(iter(between.values())),
+            "plan_due_ms": due_ms(next(iter(runtimes.values())), robot.dt),
             "rows": rows,
             "skipped": skipped,
         }
     )
+
+
+def due_ms(settings: DiffusionSettings, dt: float) -> float:
+    """Milliseconds after its request by which a plan must be there: `delay`, or `replan` where there is no delay."""
+    return 1000 * (settings.delay or settings.replan) * dt
 
 
 def _time(
@@ -170,7 +174,7 @@ def _time(
                 "plan_p99_ms": float(np.percentile(plan_ms, 99)),
                 "plan_cpu_ms": float(np.median(cpu_ms)),
                 "plans_per_s": 1000 / float(np.median(plan_ms)),
-                "ms_between_plans": 1000 * settings.replan * robot.dt,
+                "plan_due_ms": due_ms(settings, robot.dt),
                 "gflops": network.gflop / (float(np.median(call_ms)) / 1000),
             }
         )
