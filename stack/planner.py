@@ -35,7 +35,10 @@ class Planner(Protocol):
     def submit(self, request: PlanRequest) -> None: ...
 
     def collect(self, tick: int, wait: bool) -> Plan | None:
-        """The plan requested at `tick`, once; None while it is not ready, unless `wait`. Raises PlannerError."""
+        """The plan requested at `tick`, once; None where it is not ready, unless `wait`. Raises PlannerError.
+
+        Called when the plan is due: without `wait`, a request that nobody has begun to answer by then is dropped.
+        """
         ...
 
     def close(self) -> None: ...
@@ -70,8 +73,9 @@ class InlinePlanner:
 class ProcessPlanner:
     """Plans in a process of its own, started fresh (spawn), which ends with its parent.
 
-    Neither `submit` nor `collect` without `wait` ever blocks: the process is sent a request only when it is idle, and
-    the newest one waits here meanwhile.
+    Neither `submit` nor `collect` without `wait` ever blocks: the process is sent a request only when it is idle. One
+    that finds it busy waits here for `collect` with `wait`, or is dropped: sent late, its plan would be late as well, and
+    so would all that follow, for none of them would find an idle process any more.
     """
 
     def __init__(self, build: Callable[[], Answer], seed: int = 0, start_timeout: float = 120.0) -> None:
@@ -111,6 +115,8 @@ class ProcessPlanner:
         self._pump(0.0)
 
     def collect(self, tick: int, wait: bool) -> Plan | None:
+        if not wait:
+            self._waiting = None
         self._pump(0.0)
         while wait and (self._busy or self._waiting is not None):
             self._pump(None)

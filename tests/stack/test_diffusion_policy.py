@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -17,8 +20,9 @@ from policy.diffusion.denoiser import Denoiser
 from policy.diffusion.features import Normaliser, raw_layout
 from policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 from policy.text.captions import caption
+from stack import planner as planner_module
 from stack.diffusion_policy import DiffusionPolicy, diffusion_policy
-from stack.planner import InlinePlanner
+from stack.planner import InlinePlanner, ProcessPlanner
 from stack.trim import Trim
 
 ROBOT = load_robot()
@@ -112,6 +116,48 @@ def test_a_late_plan_is_not_adopted_and_the_last_goes_on_by_its_tick() -> None:
     assert policy.adopted == [(4, 5), (12, 13)]
     assert policy.take_events() == ("the plan requested at tick 8 was not ready at 9: that of 4 goes on",)
     assert policy.take_events() == ()
+
+
+class FakePipe:
+    """The loop's end of a pipe to a process that plans by a clock in ticks, `takes` for the plan of each."""
+
+    def __init__(self, takes: Callable[[int], float]) -> None:
+        self.now, self._takes = 0.0, takes
+        self._answers: list[tuple[float, object]] = [(0.0, None)]  # when there, and what; the first: it is ready
+
+    def send(self, message: tuple[int, int, PlanRequest]) -> None:
+        serial, seed, asked = message
+        assert not self._answers, "it is busy"
+        self._answers.append((self.now + self._takes(asked.tick), (serial, marked(asked, seed))))
+
+    def poll(self, timeout: float) -> bool:
+        return bool(self._answers) and self._answers[0][0] <= self.now
+
+    def recv(self) -> object:
+        return self._answers.pop(0)[1]
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("replan", "delay", "slow", "missed"),
+    [(4, 2, 2.6, [20]), (4, 4, 5.2, [20, 24]), (2, 2, 2.5, [20, 22]), (1, 1, 1.3, [20, 21])],
+)
+@pytest.mark.parametrize("usual", [0.3, 0.7, 0.95])
+def test_planning_goes_on_after_a_slow_plan(
+    monkeypatch: pytest.MonkeyPatch, replan: int, delay: int, slow: float, missed: list[int], usual: float
+) -> None:
+    """Beside the slow one, the one is missed that was due to begin meanwhile. None that is sent late makes others late."""
+    pipe = FakePipe(lambda tick: slow if tick == 20 else usual * delay)
+    context = SimpleNamespace(Pipe=lambda: (pipe, MagicMock()), Process=MagicMock())
+    monkeypatch.setattr(planner_module.multiprocessing, "get_context", lambda method: context)
+    policy = DiffusionPolicy(ProcessPlanner(MagicMock()), history=4, replan=replan, delay=delay, wait=False)
+    for tick in range(60):
+        pipe.now = float(tick)
+        policy.act(state(tick), np.full(20, 0.5), INSTRUCTION)
+    requested = [tick for tick in range(3, 60 - delay) if tick % replan == 0]
+    assert policy.adopted == [(tick, tick + delay) for tick in requested if tick not in missed]
 
 
 def test_a_motion_has_the_name_of_what_was_asked_not_of_its_correction() -> None:
