@@ -148,7 +148,7 @@ class FakePipe:
 def test_planning_goes_on_after_a_slow_plan(
     monkeypatch: pytest.MonkeyPatch, replan: int, delay: int, slow: float, missed: list[int], usual: float
 ) -> None:
-    """Beside the slow one, the one is missed that was due to begin meanwhile. None that is sent late makes others late."""
+    """Missed are the slow one, and one that found the planner busy: sent late, it would make all that follow late."""
     pipe = FakePipe(lambda tick: slow if tick == 20 else usual * delay)
     context = SimpleNamespace(Pipe=lambda: (pipe, MagicMock()), Process=MagicMock())
     monkeypatch.setattr(planner_module.multiprocessing, "get_context", lambda method: context)
