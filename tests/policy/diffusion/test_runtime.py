@@ -75,6 +75,20 @@ def test_an_empty_sentence_leaves_the_velocity_untold() -> None:
     np.testing.assert_array_equal(first("", 0.2), first("", -0.1))
 
 
+def test_each_of_a_batch_is_told_the_name_of_its_own_motion_or_of_the_one_that_is_named() -> None:
+    pytest.importorskip("wordllama")
+    runtime = Runtime(model(text="words", text_size=load_encoder("words").size), SETTINGS, ROBOT.dt)
+    asked, told = np.array([[0.1, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.6]])
+
+    def first(velocity: Array, named: Array | None) -> Array:
+        here = request()
+        window = here.states[None], here.actions[None], Instruction(velocity)
+        return runtime.plan_batch(*window, [(7, here.tick)], named=named)[0]
+
+    np.testing.assert_array_equal(first(asked, None), first(told, asked))
+    assert not np.array_equal(first(asked, None), first(asked, told))
+
+
 def test_a_sentence_is_read_as_the_nearest_that_was_trained_with_unless_told_otherwise() -> None:
     pytest.importorskip("wordllama")
     told = "head straight on"  # held out
