@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hw.config import ConfigError
 from hw.hal import Array, Instruction, Plan, PlanRequest
 from hw.robot import Robot
 from policy.checkpoint import resolve
@@ -55,25 +54,13 @@ class Runtime:
         model do not fit, and where the engine cannot be loaded.
         """
         config = model.config
-        settings.check(config)
+        settings.check(config, model.header.get("training"))
         self.model, self.settings, self.dt = model, settings, dt
         self.cost = cost if settings.guidance.weight > 0 else None
         self.engine = engine or load_engine(settings.engine, model.denoiser)
         self.samples = settings.guidance.samples if self.cost else 1
         self.horizon = settings.horizon or config.horizon  # ticks that are planned,
         self.actions = min(self.horizon, config.action_horizon)  # and those with actions
-        trained = model.header.get("training", {})
-        needed = settings.replan + settings.delay
-        if not trained.get("far_actions", 1.0) and needed > trained["near_actions"]:
-            raise ConfigError(
-                f"diffusion policy: a plan must last replan + delay = {needed} ticks, and this checkpoint learned the "
-                f"actions of the next {trained['near_actions']} only; lower replan or delay"
-            )
-        if settings.delay > trained.get("committed", settings.delay):
-            raise ConfigError(
-                f"diffusion policy: delay {settings.delay} is asked for, and this checkpoint was trained for at most "
-                f"{trained['committed']} ticks: lower it, or train with --committed {settings.delay}"
-            )
         self.matrix = settings.matrix(config)
         self._warm: dict[int, DenoisingMatrix] = {}  # rolling, by the number of fresh frames
         self._signal = cosine_signal(config.levels)

@@ -227,12 +227,16 @@ def slow_down(trajectory: Any, instruction: Instruction) -> Any:
 
 @pytest.fixture
 def settings(tmp_path: Path) -> DiffusionSettings:
-    """Settings of a small network with random weights."""
+    return untrained(tmp_path)
+
+
+def untrained(tmp_path: Path, **training: Any) -> DiffusionSettings:
+    """Settings of a small network with random weights, whose header says of its `training` what is given."""
     torch.manual_seed(0)
     config, path = DenoiserConfig(54, 20, width=32, heads=2), tmp_path / "net.safetensors"
     states = Normaliser(torch.zeros(54), torch.ones(54))
     actions = Normaliser(torch.tensor(ROBOT.home, dtype=torch.float32), torch.full((20,), 0.1))
-    facts: dict[str, Any] = {"data": "none", "licence": "none", "results": {}, "training": {}}
+    facts: dict[str, Any] = {"data": "none", "licence": "none", "results": {}, "training": training}
     checkpoint.save(path, Denoiser(config).state_dict(), config, states, actions, ROBOT, **facts)
     return DiffusionSettings(checkpoint=str(path), steps=5, replan=4, delay=2)
 
@@ -290,6 +294,16 @@ def test_a_checkpoint_for_another_rate_is_refused_before_anything_starts(
         diffusion_policy(ROBOT, replace(settings, replan=15, delay=2), process=process)
     with pytest.raises(ConfigError, match="horizon 32 is asked for"):
         diffusion_policy(ROBOT, replace(settings, horizon=32), process=process)
+
+
+@pytest.mark.parametrize("process", [False, True])
+def test_settings_that_the_training_does_not_fit_are_refused_before_anything_starts(
+    tmp_path: Path, process: bool
+) -> None:
+    with pytest.raises(ConfigError, match="trained for at most 1 ticks"):
+        diffusion_policy(ROBOT, untrained(tmp_path, committed=1), process=process)
+    with pytest.raises(ConfigError, match="learned the actions of the next 5 only"):
+        diffusion_policy(ROBOT, untrained(tmp_path, far_actions=0.0, near_actions=5), process=process)
 
 
 def test_rolling_gives_the_same_actions_in_line_and_beside_the_loop(settings: DiffusionSettings) -> None:

@@ -122,7 +122,14 @@ def main(args: argparse.Namespace) -> int:
     )
     names = "minutes", "steps", "batch", "learning_rate", "committed", "evaluate_every", "seed", "precision"
     settings = Settings(**{name: getattr(args, name) for name in (*names, *OBJECTIVE)})
-    Objective(**{name: getattr(settings, name) for name in OBJECTIVE})  # refused before the data is read
+    # What cannot be trained or measured is refused before the data is read.
+    Objective(**{name: getattr(settings, name) for name in OBJECTIVE})
+    if not 0 <= settings.committed <= config.horizon:
+        raise ConfigError(f"--committed {settings.committed}: 0 to the horizon of {config.horizon} ticks is needed")
+    if survival is not None:
+        from tools.train.survival import planning
+
+        planning(config, asdict(settings))
     recording = read_recording(args.data, robot)
     windows = Windows(recording, robot, config, emphasis=args.emphasis, seed=args.seed, latents=latents)
     source = f"{args.data.resolve().name}: {len(recording.spans)} episodes, {len(recording.raw)} ticks"
@@ -170,8 +177,6 @@ class Trainer(TimedTrainer):
         from policy.diffusion.schedule import cosine_signal
         from policy.diffusion.training import Average, Objective
 
-        if settings.committed > config.horizon:
-            raise ConfigError(f"--committed {settings.committed} is longer than the horizon of {config.horizon} ticks")
         super().__init__(out, settings.minutes, settings.steps, settings.evaluate_every, survival)
         self.objective = Objective(**{name: getattr(settings, name) for name in OBJECTIVE})
         torch.manual_seed(settings.seed)
