@@ -16,7 +16,7 @@ import numpy as np
 
 from hw.config import ConfigError
 from hw.hal import Array
-from tools.train.timed import Survival, TimedTrainer, add_run_arguments, same_network
+from tools.train.timed import Survival, TimedTrainer, add_run_arguments, same
 
 if TYPE_CHECKING:
     import torch
@@ -156,6 +156,8 @@ def _survival(args: argparse.Namespace) -> Survival:
 class Trainer(TimedTrainer):
     """Trains a denoiser; checkpoints hold the averaged network."""
 
+    settings: Settings
+
     LOSS = "validation_action_loss"
     COLUMNS = ("minutes", *MEANS, LOSS, "survival", "velocity_error")
     PANELS = (("state_loss", "action_loss", LOSS), ("survival",), ("velocity_error",))
@@ -177,10 +179,10 @@ class Trainer(TimedTrainer):
         from policy.diffusion.schedule import cosine_signal
         from policy.diffusion.training import Average, Objective
 
-        super().__init__(out, settings.minutes, settings.steps, settings.evaluate_every, survival)
+        super().__init__(out, settings, survival)
         self.objective = Objective(**{name: getattr(settings, name) for name in OBJECTIVE})
         torch.manual_seed(settings.seed)
-        self.windows, self.robot, self.config, self.settings = windows, robot, config, settings
+        self.windows, self.robot, self.config = windows, robot, config
         self.source, self.licence = source, licence
         self.network = Denoiser(config)
         self.average = Average(self.network, settings.average)
@@ -301,7 +303,7 @@ class Trainer(TimedTrainer):
     def _restore(self, path: Path, saved: Mapping[str, Any]) -> None:
         from policy.diffusion.features import Normaliser
 
-        same_network(path, asdict(self.config), saved["config"])
+        same(path, "another network", asdict(self.config), saved["config"])
         if saved["source"] != self.source:
             raise ConfigError(
                 f"{path}: trained on {saved['source']}, not on {self.source}; use --no-resume or another --out"
