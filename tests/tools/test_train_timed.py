@@ -11,10 +11,12 @@ import torch
 from test_train_diffusion import CONFIG, QUICK, ROBOT, Measured, trainer
 
 from hw.config import ConfigError
+from policy.checkpoint import read_header
 from policy.diffusion.dataset import Windows, read_recording
 from policy.latent.actions import LatentConfig
 from policy.latent.demonstrations import Demonstrations
 from tools.train import latent
+from tools.train.diffusion import Trainer
 
 
 @pytest.fixture(scope="module")
@@ -60,3 +62,29 @@ def test_latents_go_on_under_the_settings_that_they_began_with(synthetic_dataset
     assert run(minutes=1.0).resume()
     with pytest.raises(ConfigError, match=r"beta was \(0.01, 0.001\), is \(0.1, 0.1\); change was 0.005, is 0.1"):
         run(beta=(0.1, 0.1), change=0.1).resume()
+
+
+def test_a_checkpoint_says_what_it_was_begun_with_also_after_going_on(windows: Windows, tmp_path: Path) -> None:
+    old = tmp_path / "old.safetensors"
+    Trainer(windows, ROBOT, CONFIG, QUICK, tmp_path, "old walks", "CC-BY-4.0", None)._ship(old, {"survival": 0.5})
+
+    def run(source: str = "new walks") -> Trainer:
+        return Trainer(windows, ROBOT, CONFIG, QUICK, tmp_path / "on", source, "Apache-2.0", None)
+
+    def header(of: Trainer) -> dict[str, Any]:
+        of._ship(tmp_path / "new.safetensors", {})
+        return read_header(tmp_path / "new.safetensors")
+
+    first = run()
+    first.begin_from(old)
+    first.save()
+    again = run()
+    assert again.resume()
+    for head in (header(first), header(again)):
+        assert (head["data"], head["licence"]) == ("new walks", "Apache-2.0")
+        begun = head["results"]["begun_with"]
+        assert (begun["checkpoint"], begun["data"], begun["licence"]) == ("old.safetensors", "old walks", "CC-BY-4.0")
+        assert begun["results"]["survival"] == 0.5
+    assert "begun_with" not in header(run())["results"]
+    with pytest.raises(ConfigError, match="trained on new walks, not on other walks"):
+        run("other walks").resume()

@@ -184,6 +184,7 @@ class Trainer(TimedTrainer):
         torch.manual_seed(settings.seed)
         self.windows, self.robot, self.config = windows, robot, config
         self.source, self.licence = source, licence
+        self.begun_with: dict[str, Any] = {}  # the checkpoint that training began with, if any
         self.network = Denoiser(config)
         self.average = Average(self.network, settings.average)
         self.optimiser = torch.optim.AdamW(
@@ -196,6 +197,7 @@ class Trainer(TimedTrainer):
         """Take weights and normalisation of a checkpoint, to go on with other data. Raises ConfigError."""
         from policy.diffusion.checkpoint import load
         from policy.latent.actions import same_latents
+        from stack.provenance import sha256
 
         model = load(path, self.robot)
         if model.config != self.config:
@@ -205,6 +207,8 @@ class Trainer(TimedTrainer):
         self.network.load_state_dict(model.denoiser.state_dict())
         self.average.weights = {name: p.detach().clone() for name, p in self.network.named_parameters()}
         self.windows.states, self.windows.actions = model.states, model.actions
+        known = {name: model.header[name] for name in ("git_commit", "data", "licence", "results")}
+        self.begun_with = {"checkpoint": path.name, "sha256": sha256(path), **known}
 
     def _title(self) -> str:
         size = f"{self.network.parameter_count:,} parameters, {self.config.tokens} tokens"
@@ -280,7 +284,7 @@ class Trainer(TimedTrainer):
             self.robot,
             data=self.source,
             licence=self.licence,
-            results={**self.progress, **results},
+            results={**self.progress, **results, **({"begun_with": self.begun_with} if self.begun_with else {})},
             training=asdict(self.settings),
             latents=self.windows.latents,
         )
@@ -294,6 +298,7 @@ class Trainer(TimedTrainer):
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
             "source": self.source,
+            "begun_with": self.begun_with,
             "latents": _tensors(self.windows.latents.to_tensors() if self.windows.latents else {}),
             # Whole, with the matrix of the emphasis: another seed or --init may have made them.
             "states": _tensors(self.windows.states.to_numpy()),
@@ -315,6 +320,7 @@ class Trainer(TimedTrainer):
         self.windows.states, self.windows.actions = (
             Normaliser.from_numpy(_arrays(saved[name])).to_torch() for name in ("states", "actions")
         )
+        self.begun_with = saved.get("begun_with", {})  # unknown to an older program
         self.network.load_state_dict(saved["network"])
         self.average.weights = saved["average"]
         self.average.updates = saved["updates"]
