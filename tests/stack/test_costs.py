@@ -51,7 +51,25 @@ def test_goal_cost_wants_to_be_near_and_to_face_the_goal() -> None:
     goal, weights = np.array([1.0, 0.0]), Weights(goal=2.0, facing=3.0)
     assert value(goal_cost(moves(np.zeros((3, 2))), goal, weights)) == pytest.approx(2.0, rel=1e-5)
     away = goal_cost(moves(np.zeros((3, 2)), yaw=np.pi), goal, weights)
-    assert value(away) == pytest.approx(2.0 + 3.0 * 2.0, rel=1e-5)
+    assert value(away) == pytest.approx(2.0 + 3.0 * 2.0, rel=0.01)
+
+
+def pull(distance: float, weights: Weights, bearing: float = 1.0) -> tuple[float, float]:
+    """The cost of a goal in sight, and the size of its gradient on the place."""
+    here = moves(np.zeros((1, 2)))
+    cost = goal_cost(here, distance * np.array([np.cos(bearing), np.sin(bearing)]), weights)
+    (gradient,) = torch.autograd.grad(cost.sum(), here.displacement)
+    return value(cost), float(gradient.norm())
+
+
+def test_facing_a_near_goal_does_not_outweigh_being_there() -> None:
+    facing, goal = Weights(facing=1.0), Weights(goal=1.0)
+    for distance in (0.001, 0.02, 0.1):
+        assert pull(distance, facing)[1] < 5.0 * pull(distance, goal)[1]
+    assert pull(0.02, facing)[1] < 3.0 * pull(0.02, goal)[1]
+    # Who faces it is not pushed off, and further away facing is the paper's: 1 - cos, turned by 1 / distance.
+    assert pull(0.02, facing, bearing=0.0)[1] == pytest.approx(0.0, abs=1e-3)
+    assert pull(1.0, facing) == pytest.approx((1.0 - np.cos(1.0), np.sin(1.0)), rel=0.02)
 
 
 def test_a_waypoint_costs_the_square_of_its_distance() -> None:
