@@ -23,6 +23,7 @@ _CHANGE = 125  # ticks between commands
 _PUSH_EVERY = 50  # ticks
 _PUSH = 0.3  # m/s, in a random direction
 _RANDOMISED = 0.5  # share of worlds with a robot drawn at random
+_MEASURED = 2**31  # sets these worlds apart from those that data is collected in, with the same seed
 
 
 def closed_loop_survival(
@@ -68,7 +69,7 @@ def survival_of(
     from stack.odometry import load_odometry
     from tools.train.fleet import Fleet
 
-    fleet = Fleet(robot, worlds, load_odometry(robot), randomise=_RANDOMISED, seed=seed)
+    fleet = Fleet(robot, worlds, load_odometry(robot), randomise=_RANDOMISED, seed=seed, tag=_MEASURED)
     walker, everything = drive(fleet), np.ones(worlds, bool)
     fleet.reset(everything)
     walker.reset(everything)
