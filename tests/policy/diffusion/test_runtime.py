@@ -20,7 +20,7 @@ from policy.diffusion.features import Normaliser, Trajectory, raw_layout
 from policy.diffusion.runtime import Runtime
 from policy.diffusion.settings import DiffusionSettings, GuidanceSettings, load_settings
 from policy.text.captions import MOTIONS, NAMES
-from policy.text.encoder import load_encoder
+from policy.text.encoder import code_size, load_encoder
 from policy.text.understanding import Phrasebook
 
 ROBOT = load_robot()
@@ -203,3 +203,21 @@ def test_a_checkpoint_plans_as_what_was_saved(tmp_path: Path) -> None:
     checkpoint.save(path, weights, made.config, made.states, made.actions, ROBOT, **facts)
     with pytest.raises(CheckpointError, match="do not fit its own header"):
         checkpoint.load(path, ROBOT)
+
+
+def test_a_checkpoint_whose_encoder_gives_other_codes_now_is_refused(tmp_path: Path) -> None:
+    path, size = tmp_path / "net.safetensors", code_size("words")
+    facts: dict[str, Any] = {"data": "made up", "licence": "Apache-2.0", "results": {}, "training": {}}
+
+    def load(text: str, text_size: int) -> checkpoint.Model:
+        made = model(text=text, text_size=text_size)
+        checkpoint.save(path, made.denoiser.state_dict(), made.config, made.states, made.actions, ROBOT, **facts)
+        return checkpoint.load(path, ROBOT)
+
+    assert load("words", size).config.text_size == size
+    with pytest.raises(
+        CheckpointError, match=rf"as {size - 1} numbers, .* gives {size}: .* commit .* or train it again"
+    ):
+        load("words", size - 1)
+    with pytest.raises(CheckpointError, match="unknown text encoder 'word'"):
+        load("word", size)
