@@ -33,7 +33,7 @@ class GuidanceSettings:
     """Loss guidance: see `policy.diffusion.sampler.Guidance`. A weight of 0 turns it off."""
 
     weight: float = 4000.0
-    clip: float = 12.0
+    clip: float = 12.0  # longest step over a window; both are in the network's inputs, projected where it has emphasis
     gradient: str = "analytic"
     samples: int = 1  # windows denoised side by side for one plan
     choose: str = "mean"  # of them. mean: they share the mean gradient, the first is run; best: the cheapest is run
