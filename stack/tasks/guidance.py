@@ -46,6 +46,11 @@ class Weights:
             if getattr(self, key) == 0.0:
                 raise ValueError(f"{key}: must be positive")
 
+    @property
+    def twist(self) -> bool:
+        """Whether any term counts that is about the velocity, which every instruction holds."""
+        return any((self.velocity, self.yaw_rate, self.displacement, self.yaw, self.stand))
+
 
 class Trajectory(Protocol):
     """A batch of predicted motions, torch tensors. Frame `i` lies `(i + 1) * dt` ahead of now."""

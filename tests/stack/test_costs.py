@@ -10,9 +10,13 @@ import torch
 from task_bodies import DT, moves, state
 
 from hw.hal import Instruction
-from stack.tasks import load_settings
+from hw.robot import load_robot
+from stack.policies import make_policy
+from stack.tasks import load_settings, load_task
 from stack.tasks.frames import to_heading
 from stack.tasks.guidance import Weights, goal_cost, ground_cost, obstacle_cost, path_cost, total_cost
+
+TWIST = tuple(f"cost.{name}" for name in ("velocity", "yaw_rate", "displacement", "yaw", "stand"))
 
 
 def value(cost: torch.Tensor) -> float:
@@ -132,3 +136,23 @@ def test_weights_choose_the_terms_and_zero_leaves_the_planner_to_itself() -> Non
     )
     with pytest.raises(ValueError, match="margin: must be positive"):
         Weights(margin=0.0)
+
+
+@pytest.mark.parametrize(
+    ("task", "settings", "guides"),
+    [
+        ("survive", {}, False),
+        ("text", {}, False),
+        ("inbetween", {}, False),
+        ("text", {"cost.yaw": "0.1"}, True),
+        ("walk", {}, True),
+        ("goal", dict.fromkeys(TWIST, "0") | {"cost.goal": "1"}, True),
+    ],
+)
+def test_a_task_whose_cost_is_zero_makes_a_policy_without_guidance(
+    monkeypatch: pytest.MonkeyPatch, task: str, settings: dict[str, str], guides: bool
+) -> None:
+    costs: list[object] = []
+    monkeypatch.setattr("stack.diffusion_policy.diffusion_policy", lambda robot, s, cost, process: costs.append(cost))
+    make_policy("diffusion", load_robot(), load_task(task, settings), realtime=False)
+    assert [cost is not None for cost in costs] == [guides]
