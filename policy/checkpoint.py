@@ -146,7 +146,7 @@ def check(path: Path, head: Mapping[str, Any], kind: str, robot: Robot) -> None:
         raise CheckpointError(f"{path}: holds a {head['kind']} network, and a {kind} network is needed")
     theirs, ours = list(head["joints"]), list(robot.names)
     if theirs != ours:
-        reason = _difference(theirs, ours)
+        reason = difference(theirs, ours)
         raise CheckpointError(f"{path}: made for {head['robot']}, its joints do not fit {robot.name}: {reason}")
     if head["rate"] != robot.rate:
         raise CheckpointError(
@@ -159,10 +159,11 @@ def check_layout(path: Path, name: str, theirs: Sequence[Sequence[Any]], ours: S
     """Refuse a checkpoint whose layout `name` (pairs of field and size) is not `ours`. Raises CheckpointError."""
     a, b = ([f"{field}({size})" for field, size in layout] for layout in (theirs, ours))
     if a != b:
-        raise CheckpointError(f"{path}: its {name} layout is not this program's: {_difference(a, b)}")
+        raise CheckpointError(f"{path}: its {name} layout is not this program's: {difference(a, b)}")
 
 
-def _difference(theirs: list[str], ours: list[str]) -> str:
+def difference(theirs: Sequence[str], ours: Sequence[str]) -> str:
+    """What sets names apart that are not the same, or not in the same order."""
     if len(theirs) != len(ours):
         extra = [x for x in theirs if x not in ours]
         lacking = [x for x in ours if x not in theirs]

@@ -176,23 +176,19 @@ def diffusion_policy(
     settings = settings or load_settings()
     path = resolve(settings.checkpoint)
     settings = replace(settings, checkpoint=str(path))
-    _check(robot, settings)  # here, with a plain error, rather than in the planner's process
+    head = read_header(path)
+    config = check_fit(path, head, robot)
+    settings.check(config, head.get("training"))  # here, with a plain error, rather than in the planner's process
     space = load_action_space(path, robot)
     planner: Planner
     if process:
         planner = ProcessPlanner(partial(_build, robot, settings, cost))
     else:
         planner = InlinePlanner(_build(robot, settings, cost))
-    history = int(read_header(path)["config"]["history"])
     trim = Trim(robot.dt, settings.trim) if settings.trim else None
-    return DiffusionPolicy(planner, history, settings.replan, settings.delay, wait=not process, trim=trim, space=space)
-
-
-def _check(robot: Robot, settings: DiffusionSettings) -> None:
-    """Refuse what the planner would refuse. Raises ConfigError."""
-    path = resolve(settings.checkpoint)
-    config = check_fit(path, read_header(path), robot)
-    settings.check(config)
+    return DiffusionPolicy(
+        planner, config.history, settings.replan, settings.delay, wait=not process, trim=trim, space=space
+    )
 
 
 def _build(robot: Robot, settings: DiffusionSettings, cost: Cost | None) -> Answer:

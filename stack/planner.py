@@ -13,6 +13,8 @@ import signal
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from multiprocessing.util import Finalize
 from typing import Protocol
 
 from hw.hal import Plan, PlanRequest
@@ -35,7 +37,10 @@ class Planner(Protocol):
     def submit(self, request: PlanRequest) -> None: ...
 
     def collect(self, tick: int, wait: bool) -> Plan | None:
-        """The plan requested at `tick`, once; None while it is not ready, unless `wait`. Raises PlannerError."""
+        """The plan requested at `tick`, once; None where it is not ready, unless `wait`. Raises PlannerError.
+
+        Called when the plan is due: without `wait`, a request that nobody has begun to answer by then is dropped.
+        """
         ...
 
     def close(self) -> None: ...
@@ -70,8 +75,9 @@ class InlinePlanner:
 class ProcessPlanner:
     """Plans in a process of its own, started fresh (spawn), which ends with its parent.
 
-    Neither `submit` nor `collect` without `wait` ever blocks: the process is sent a request only when it is idle, and
-    the newest one waits here meanwhile.
+    Neither `submit` nor `collect` without `wait` ever blocks: the process is sent a request only when it is idle. One
+    that finds it busy waits here for a `collect` with `wait`, or else is dropped: sent late, its plan would come late
+    as well, and so would all that follow, none of which would find the process idle any more.
     """
 
     def __init__(self, build: Callable[[], Answer], seed: int = 0, start_timeout: float = 120.0) -> None:
@@ -89,6 +95,8 @@ class ProcessPlanner:
         self._process = context.Process(target=_serve, args=(theirs, build), name="planner", daemon=True)
         self._process.start()
         theirs.close()
+        # At exit multiprocessing waits for its processes: without this, for ever for one that nobody closed.
+        self._end = Finalize(self, _end, (self._pipe, self._process), exitpriority=0)
         try:
             if not self._pipe.poll(start_timeout):
                 raise PlannerError(
@@ -111,6 +119,8 @@ class ProcessPlanner:
         self._pump(0.0)
 
     def collect(self, tick: int, wait: bool) -> Plan | None:
+        if not wait:
+            self._waiting = None
         self._pump(0.0)
         while wait and (self._busy or self._waiting is not None):
             self._pump(None)
@@ -121,11 +131,7 @@ class ProcessPlanner:
 
     def close(self) -> None:
         """End the process. May be called twice."""
-        self._pipe.close()
-        self._process.join(0.2)
-        if self._process.is_alive():  # in the middle of a plan
-            self._process.kill()
-            self._process.join()
+        self._end()
         self._waiting = self._ready = None
 
     def _pump(self, timeout: float | None) -> None:
@@ -161,9 +167,18 @@ class ProcessPlanner:
         return f"the planner process {how}; it cannot plan any more"
 
 
+def _end(pipe: Connection, process: BaseProcess) -> None:
+    pipe.close()
+    process.join(0.2)
+    if process.is_alive():  # in the middle of a plan
+        process.kill()
+        process.join()
+
+
 def _serve(pipe: Connection, build: Callable[[], Answer]) -> None:
     """The planner process: answer requests until the other end of the pipe is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the loop's to handle
+    for number in (signal.SIGINT, signal.SIGTERM):  # to the whole group: the loop still plans while it ends the run
+        signal.signal(number, signal.SIG_IGN)
     os.environ["OMP_NUM_THREADS"] = "1"  # before torch is imported
     try:
         answer = build()

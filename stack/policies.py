@@ -19,7 +19,8 @@ def _diffusion(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
 
     trained = source.endswith(".safetensors")
     settings = replace(load_settings(), checkpoint=source) if trained else load_settings(source)
-    return diffusion_policy(robot, settings, task.cost, process=realtime)
+    cost = task.cost if getattr(task, "guides", True) else None
+    return diffusion_policy(robot, settings, cost, process=realtime)
 
 
 def _expert(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:

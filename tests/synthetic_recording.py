@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 
 from hw.hal import Array
 from hw.robot import Robot
+from policy.diffusion.features import recorded_names
 
 
 def episode(robot: Robot, ticks: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
@@ -66,5 +67,7 @@ def write_dataset(folder: Path, robot: Robot, episodes: int = 12, ticks: int = 1
     half = table.num_rows // 2  # an episode may straddle two files
     pq.write_table(table.slice(0, half + 7), folder / "data" / "chunk-000" / "file-000.parquet")
     pq.write_table(table.slice(half + 7), folder / "data" / "chunk-000" / "file-001.parquet")
-    (folder / "meta" / "info.json").write_text(json.dumps({"codebase_version": "v3.0", "fps": robot.rate}))
+    features = {name: {"names": names} for name, names in recorded_names(robot).items()}
+    info = {"codebase_version": "v3.0", "fps": robot.rate, "features": features}
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
     return folder

@@ -15,6 +15,7 @@ from hw.robot import Robot
 from policy import checkpoint
 from policy.checkpoint import CheckpointError
 from policy.diffusion.features import raw_layout, token_layout
+from policy.text.encoder import code_size
 
 KIND = "diffusion"  # of a checkpoint
 
@@ -76,6 +77,13 @@ def check_fit(path: Path, head: Mapping[str, Any], robot: Robot) -> DenoiserConf
     for name, ours in (("raw", raw_layout(n)), ("token", token_layout(n))):
         checkpoint.check_layout(path, name, head.get(f"{name}_layout", []), ours.to_header())
     try:
-        return DenoiserConfig(**head["config"])
+        config = DenoiserConfig(**head["config"])
+        size = code_size(config.text) if config.text else 0
     except (TypeError, ConfigError) as error:
         raise CheckpointError(f"{path}: the network's config in its header cannot be used: {error}") from error
+    if config.text_size != size:
+        raise CheckpointError(
+            f"{path}: reads instructions as {config.text_size} numbers, and the encoder '{config.text}' gives {size}: "
+            f"use the program that trained it, of commit {head['git_commit']}, or train it again"
+        )
+    return config

@@ -20,8 +20,9 @@ from hw.config import ConfigError
 from hw.hal import Array
 from hw.mirror import Mirror
 from hw.robot import Robot
+from policy.checkpoint import difference
 from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.features import Emphasis, Normaliser, raw_layout, raw_mirror, to_tokens
+from policy.diffusion.features import Emphasis, Normaliser, raw_mirror, recorded_names, to_tokens
 from policy.latent.actions import LatentActions
 from policy.text.captions import MOTIONS, mirrored, motion_of
 from policy.text.encoder import load_encoder
@@ -59,14 +60,23 @@ def read_recording(folder: Path, robot: Robot) -> Recording:
     files = sorted(folder.glob("data/chunk-*/file-*.parquet"))
     if not files:
         raise DatasetError(f"{folder}: no data/chunk-*/file-*.parquet here; record a dataset with `servoid collect`")
+    described = folder / "meta" / "info.json"
     try:
-        info = json.loads((folder / "meta" / "info.json").read_text())
+        info = json.loads(described.read_text())
     except (OSError, ValueError) as error:
-        raise DatasetError(f"{folder / 'meta' / 'info.json'}: cannot be read ({error})") from error
-    n = len(robot.joints)
+        raise DatasetError(f"{described}: cannot be read ({error})") from error
     if info.get("fps", robot.rate) != robot.rate:
         raise DatasetError(f"{folder}: recorded at {info['fps']} ticks a second, and {robot.name} runs at {robot.rate}")
-    sizes = {"observation.state": raw_layout(n).size, "action": n, "action_applied": n, "command": 3}
+    names = recorded_names(robot)
+    for name, ours in names.items():
+        theirs = tuple(info.get("features", {}).get(name, {}).get("names") or ())
+        if theirs != ours:
+            what = difference(theirs, ours)
+            raise DatasetError(
+                f"{described}: '{name}' is not that of {robot.name}: {what}; give --robot that of the recording, or "
+                "record another one with `servoid collect`"
+            )
+    sizes = {name: len(ours) for name, ours in names.items()}
     parts: dict[str, list[Array]] = {name: [] for name in COLUMNS}
     for file in files:
         try:

@@ -65,6 +65,16 @@ def raw_layout(n_joints: int) -> Layout:
     )
 
 
+def recorded_names(robot: Robot) -> dict[str, tuple[str, ...]]:
+    """Columns of a recording by name, and the names of their numbers: those of `raw_layout`, joints, or a command."""
+    axes = {"displacement": "xyz", "yaw": ("",), "velocity": "xyz", "angular_velocity": "xyz", "gravity": "xyz"}
+    fields = (field for field, _ in raw_layout(len(robot.joints)).fields)
+    state = tuple(f"{field}.{part}".rstrip(".") for field in fields for part in axes.get(field, robot.names))
+    joints = tuple(robot.names)
+    command = ("forward", "left", "turn")
+    return {"observation.state": state, "action": joints, "action_applied": joints, "command": command}
+
+
 def token_layout(n_joints: int) -> Layout:
     """A tick as the network sees it: canonical frame, SI units, before normalisation."""
     return Layout(

@@ -31,6 +31,9 @@ def keyframe_tokens(keyframes: Keyframes, present: Array, n_joints: int) -> tupl
         raise ValueError(f"keyframes: ticks must be at least 1 and rise, not {ticks.tolist()}")
     if np.isinf(rows).any():
         raise ValueError("keyframes: states must be finite, or NaN where they are free")
+    x, y, _ = np.moveaxis(np.isnan(rows[:, raw_layout(n_joints).slice("displacement")]), -1, 0)
+    if (x != y).any():  # turned into the present heading, one that is free would free the other
+        raise ValueError(f"keyframes: x and y must both be given or both be free, at tick {ticks[x != y][0]}")
     rows = np.broadcast_to(rows, (len(present), *rows.shape))
     return ticks, to_tokens(rows, np.asarray(present, dtype=float), n_joints)
 

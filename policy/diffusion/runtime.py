@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hw.config import ConfigError
 from hw.hal import Array, Instruction, Plan, PlanRequest
 from hw.robot import Robot
 from policy.checkpoint import resolve
@@ -55,25 +54,13 @@ class Runtime:
         model do not fit, and where the engine cannot be loaded.
         """
         config = model.config
-        settings.check(config)
+        settings.check(config, model.header.get("training"))
         self.model, self.settings, self.dt = model, settings, dt
         self.cost = cost if settings.guidance.weight > 0 else None
         self.engine = engine or load_engine(settings.engine, model.denoiser)
         self.samples = settings.guidance.samples if self.cost else 1
         self.horizon = settings.horizon or config.horizon  # ticks that are planned,
         self.actions = min(self.horizon, config.action_horizon)  # and those with actions
-        trained = model.header.get("training", {})
-        needed = settings.replan + settings.delay
-        if not trained.get("far_actions", 1.0) and needed > trained["near_actions"]:
-            raise ConfigError(
-                f"diffusion policy: a plan must last replan + delay = {needed} ticks, and this checkpoint learned the "
-                f"actions of the next {trained['near_actions']} only; lower replan or delay"
-            )
-        if settings.delay > trained.get("committed", settings.delay):
-            raise ConfigError(
-                f"diffusion policy: delay {settings.delay} is asked for, and this checkpoint was trained for at most "
-                f"{trained['committed']} ticks: lower it, or train with --committed {settings.delay}"
-            )
         self.matrix = settings.matrix(config)
         self._warm: dict[int, DenoisingMatrix] = {}  # rolling, by the number of fresh frames
         self._signal = cosine_signal(config.levels)
@@ -108,15 +95,17 @@ class Runtime:
         instruction: Instruction,
         seeds: Sequence[tuple[int, int]],
         previous: Previous | None = None,
+        named: Array | None = None,
     ) -> tuple[Array, Array]:
         """Plans of many robots at once, each with its own (seed, tick).
 
         `states` is `(batch, history, raw size)`, the present last; `actions` is `(batch, history - 1 + delay,
         action size)`: those applied, then those that will run anyway, as the model has actions (`Model.space`).
-        `previous` are the plans that run, None at first; only the rolling schedule reads them. Returns actions
-        `(batch, actions, action size)` from the present tick on, joint targets [rad] or latents that are decoded with
-        the state of their own tick; and predicted raw rows `(batch, horizon, raw size)`, the first one tick ahead, in
-        the odometry frame.
+        `previous` are the plans that run, None at first; only the rolling schedule reads them. `named` `(batch, 3)` are
+        velocities that motions have their names from where the instruction has no text; None: from its own. Returns
+        actions `(batch, actions, action size)` from the present tick on, joint targets [rad] or latents that are
+        decoded with the state of their own tick; and predicted raw rows `(batch, horizon, raw size)`, the first one
+        tick ahead, in the odometry frame.
         Batches of different size may differ in the last bits. Raises ValueError like `plan`.
         """
         self._check(states, actions)
@@ -128,7 +117,7 @@ class Runtime:
             keys = [(*pair, *((i,) if i else ())) for pair in seeds for i in range(n)]
             known = self._known(states, actions, instruction)
             matrix, start = self._start(keys, states[:, -1], previous)
-            text = self._text(instruction, len(states))
+            text = self._text(instruction, len(states), named)
             predict = classifier_free(
                 self.engine,
                 None if text is None else text.repeat_interleave(n, 0),
@@ -224,7 +213,7 @@ class Runtime:
         cheapest: Tensor = guidance.cost(states).view(-1, self.samples).argmin(1)
         return first + cheapest
 
-    def _text(self, instruction: Instruction, batch: int) -> Tensor | None:
+    def _text(self, instruction: Instruction, batch: int, named: Array | None) -> Tensor | None:
         """The encoded sentence `(batch, text size)`; where the task gives none, one that names the asked motion.
 
         An empty one tells nothing: motion is then unconditional. A phrasing that was not trained with would be a code
@@ -232,12 +221,13 @@ class Runtime:
         """
         if self._encoder is None or instruction.text == "":
             return None
+        named = instruction.velocity if named is None else named
         if instruction.text is not None:
             sentences = [instruction.text] * batch
-        elif instruction.velocity.ndim == 1:
-            sentences = [caption(instruction.velocity)] * batch
+        elif named.ndim == 1:
+            sentences = [caption(named)] * batch
         else:
-            sentences = [MOTIONS[i].phrasings[0] for i in motion_of(instruction.velocity)]
+            sentences = [MOTIONS[i].phrasings[0] for i in motion_of(named)]
         for sentence in set(sentences) - self._read.keys():
             phrasing = self._phrasebook.familiar(sentence) if self._phrasebook else sentence
             self._read[sentence] = torch.from_numpy(self._encoder.encode([phrasing])[0])

@@ -36,9 +36,9 @@ class Guidance:
 
     `cost` maps normalised states `(batch, state tokens, features)` to `(batch,)`. `gradient` is "analytic": taken on
     the predicted states themselves, which is cheap; or "network": taken on the noisy states, back through the network
-    (UniPhys, eq. 3). `clip` is the norm of a step over one window, in normalised units. With `samples` > 1 so many
-    neighbours in the batch are samples of one window, and all move by the mean of their gradients (Monte-Carlo
-    guidance, UniPhys, eq. 4).
+    (UniPhys, eq. 3). `clip` is the norm of a step over one window. Both are in the network's inputs: deviations, or
+    their projection where it has emphasis. With `samples` > 1 so many neighbours in the batch are samples of one
+    window, and all move by the mean of their gradients (Monte-Carlo guidance, UniPhys, eq. 4).
     """
 
     cost: Callable[[Tensor], Tensor]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +33,7 @@ class GuidanceSettings:
     """Loss guidance: see `policy.diffusion.sampler.Guidance`. A weight of 0 turns it off."""
 
     weight: float = 4000.0
-    clip: float = 12.0
+    clip: float = 12.0  # longest step over a window; both are in the network's inputs, projected where it has emphasis
     gradient: str = "analytic"
     samples: int = 1  # windows denoised side by side for one plan
     choose: str = "mean"  # of them. mean: they share the mean gradient, the first is run; best: the cheapest is run
@@ -131,8 +133,11 @@ class DiffusionSettings:
         if self.stabilise < 0:
             raise ValueError(f"stabilise must not be negative, not {self.stabilise}")
 
-    def check(self, network: DenoiserConfig) -> None:
-        """Raise ConfigError where this network cannot serve, or the engine is not installed."""
+    def check(self, network: DenoiserConfig, training: Mapping[str, Any] | None = None) -> None:
+        """Raise ConfigError where this network cannot serve, or the engine is not installed.
+
+        `training` is how it was trained, by the header of its checkpoint; what that does not say is not asked for.
+        """
         check_engine(self.engine)
         for name, ours in (("history", self.history), ("horizon", self.horizon)):
             most = getattr(network, name)
@@ -141,11 +146,21 @@ class DiffusionSettings:
                     f"diffusion policy: {name} {ours} is asked for, and this checkpoint has 1 to {most} ticks; "
                     f"lower it, or train a model with --{name} {ours}"
                 )
-        horizon = min(self.horizon or network.horizon, network.action_horizon)
-        if self.replan + self.delay > horizon:
+        training, needed = training or {}, self.replan + self.delay
+        if needed > (horizon := min(self.horizon or network.horizon, network.action_horizon)):
             raise ConfigError(
-                f"diffusion policy: a plan must last replan + delay = {self.replan + self.delay} ticks, "
+                f"diffusion policy: a plan must last replan + delay = {needed} ticks, "
                 f"and this one has actions for {horizon}; lower replan or delay"
+            )
+        if needed > (near := _near_alone(training, needed)):
+            raise ConfigError(
+                f"diffusion policy: a plan must last replan + delay = {needed} ticks, and this checkpoint learned the "
+                f"actions of the next {near} only; lower replan or delay"
+            )
+        if self.delay > (committed := training.get("committed", self.delay)):
+            raise ConfigError(
+                f"diffusion policy: delay {self.delay} is asked for, and this checkpoint was trained for at most "
+                f"{committed} ticks: lower it, or train with --committed {self.delay}"
             )
         if self.stabilise > network.levels:
             raise ConfigError(
@@ -157,6 +172,14 @@ class DiffusionSettings:
             self.matrix(network, fresh=1)
         except ValueError as error:
             raise ConfigError(f"diffusion policy: {error}") from error
+
+    def fitted(self, network: DenoiserConfig, training: Mapping[str, Any]) -> DiffusionSettings:
+        """The same with fewer steps, less delay and shorter chunks, where this network could not serve otherwise."""
+        horizon = min(self.horizon or network.horizon, network.action_horizon)
+        actions = _near_alone(training, horizon)
+        delay = min(self.delay, training.get("committed", self.delay), actions // 2)  # no longer than what is executed
+        replan = min(self.replan, actions - delay)
+        return replace(self, steps=min(self.steps, network.levels), delay=delay, replan=replan)
 
     def matrix(self, network: DenoiserConfig, fresh: int | None = None) -> DenoisingMatrix:
         """The denoising matrix of a plan, with what `history` and `horizon` leave out as pure noise.
@@ -188,6 +211,11 @@ class DiffusionSettings:
         first, horizon = 1 - (self.history or network.history), self.horizon or network.horizon
         states, actions = network.state_ticks, network.action_ticks
         return (states >= first) & (states <= horizon), (actions >= first) & (actions < horizon)
+
+
+def _near_alone(training: Mapping[str, Any], ticks: int) -> int:
+    """How many of the next `ticks` have actions that were learned: all, unless far ones had no weight in training."""
+    return ticks if training.get("far_actions", 1.0) else min(ticks, training["near_actions"])
 
 
 def load_settings(name: str = "diffusion") -> DiffusionSettings:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
@@ -46,14 +46,11 @@ class WordEncoder:
     WORD_SIZE = 64  # of WordLlama's 256; they are trained to be cut short
     FLAG_WEIGHT = 1.0
     SCALE = 3.0
+    size = WORD_SIZE + len(FLAGS)
 
     def __init__(self) -> None:
         """Load the weights that the wheel brings. Raises ConfigError where it is missing or incomplete."""
         self._model = _load_wordllama(self.WORD_SIZE)
-
-    @property
-    def size(self) -> int:
-        return self.WORD_SIZE + len(FLAGS)
 
     def encode(self, texts: Sequence[str]) -> Array:
         return np.stack([self._encode(text) for text in texts]) if texts else np.zeros((0, self.size), np.float32)
@@ -71,14 +68,23 @@ class WordEncoder:
         return (self.SCALE * np.concatenate([sentence / norm, self.FLAG_WEIGHT * flagged])).astype(np.float32)
 
 
-_ENCODERS: dict[str, Callable[[], TextEncoder]] = {WordEncoder.name: WordEncoder}
+_ENCODERS = {WordEncoder.name: WordEncoder}
 
 
 def load_encoder(name: str = WordEncoder.name) -> TextEncoder:
     """The encoder of that name. Raises ConfigError for an unknown one, or when what it needs is not installed."""
+    return _encoder(name)()
+
+
+def code_size(name: str) -> int:
+    """Numbers in a code of the encoder of that name, which is not loaded. Raises ConfigError for an unknown one."""
+    return _encoder(name).size
+
+
+def _encoder(name: str) -> type[WordEncoder]:
     if name not in _ENCODERS:
         raise ConfigError(f"unknown text encoder '{name}'; {nearest(name, _ENCODERS)}")
-    return _ENCODERS[name]()
+    return _ENCODERS[name]
 
 
 def _load_wordllama(size: int) -> Any:

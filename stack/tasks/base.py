@@ -67,6 +67,11 @@ class BaseTask:
         """Guidance cost `(batch,)`: the weighted sum of what the instruction holds (see `guidance.total_cost`)."""
         return total_cost(trajectory, instruction, self.settings.cost)
 
+    @property
+    def guides(self) -> bool:
+        """Whether its cost can guide a plan; where it is zero, planners need no gradient of it, and no samples."""
+        return True
+
     def done(self, state: State) -> bool:
         """Whether the episode may end before its time."""
         return False

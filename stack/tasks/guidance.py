@@ -14,6 +14,7 @@ from hw.hal import Array, Instruction
 
 _STANDING = 1e-3  # m/s and rad/s: an instructed twist below it means to stand
 _SLOW = 0.05  # m/s below which the direction of a motion says little
+_NEAR = 0.1  # m from a goal within which its bearing says little
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Weights:
     steering: float = 0.0  # of 1 - cos of the angle between the velocity over the ground and the one asked
     heading: float = 0.0  # of 1 - cos of the angle between where each tick's robot faces and the velocity asked
     goal: float = 0.0  # per m of each tick's distance from the goal
-    facing: float = 0.0  # of 1 - cos of each tick's bearing of the goal
+    facing: float = 0.0  # of 1 - cos of each tick's bearing of the goal, less within 0.1 m of it
     waypoint: float = 0.0  # per m^2 of each tick's distance from the goal
     path: float = 10.0  # per m^2 of each tick's distance from where the path wants it
     repulsion: float = 0.1  # of exp(-sharpness * distance) from each obstacle, at each tick
@@ -44,6 +45,11 @@ class Weights:
         for key in ("sharpness", "margin"):
             if getattr(self, key) == 0.0:
                 raise ValueError(f"{key}: must be positive")
+
+    @property
+    def twist(self) -> bool:
+        """Whether any term counts that is about the velocity, which every instruction holds."""
+        return any((self.velocity, self.yaw_rate, self.displacement, self.yaw, self.stand))
 
 
 class Trajectory(Protocol):
@@ -79,11 +85,13 @@ def goal_cost(trajectory: Trajectory, goal: Array, weights: Weights) -> Any:
     """Of each tick, for a goal `(2,)` m: `(batch,)`.
 
     `w1 |p - g| + w2 (1 - cos(heading, g - p))` (UniPhys, eq. 5), and `w3 |p - g|^2` (Diffuse-CLoC's G_wp, section 4.1).
+    The bearing of a near goal turns with every step, by 1 / d, so facing it is weighted with d^2 / (d^2 + 0.1^2).
     """
     way = trajectory.displacement.new_tensor(np.asarray(goal, dtype=float)) - trajectory.displacement
     distance = _norm(way)
-    ahead = (way[..., 0] * trajectory.yaw.cos() + way[..., 1] * trajectory.yaw.sin()) / distance
-    return (weights.goal * distance + weights.facing * (1.0 - ahead) + weights.waypoint * distance**2).mean(-1)
+    ahead = way[..., 0] * trajectory.yaw.cos() + way[..., 1] * trajectory.yaw.sin()
+    turned = distance * (distance - ahead) / (distance**2 + _NEAR**2)
+    return (weights.goal * distance + weights.facing * turned + weights.waypoint * distance**2).mean(-1)
 
 
 def ground_cost(trajectory: Trajectory, asked: Array, weights: Weights) -> Any:

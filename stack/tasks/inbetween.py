@@ -102,6 +102,11 @@ class Inbetween(BaseTask):
         velocity = np.clip(np.array([*way, turn]) / seconds, -_FASTEST, _FASTEST)
         return Instruction(velocity=velocity, keyframes=Keyframes(ahead, frames.astype(np.float32)))
 
+    @property
+    def guides(self) -> bool:
+        """By the velocity alone, there being no cost of keyframes."""
+        return self.settings.cost.twist
+
     def done(self, state: State) -> bool:
         return self._tick >= self._ticks[-1]
 

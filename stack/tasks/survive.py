@@ -34,5 +34,10 @@ class Survive(Walk):
         told = tick * self.dt < self.settings.told
         return replace(instruction, text=caption(instruction.velocity) if told else "")
 
+    @property
+    def guides(self) -> bool:
+        """By the velocity alone, there being nothing else in its instructions."""
+        return self.settings.cost.twist
+
     def metrics(self, trace: Trace) -> dict[str, float]:
         return {"episode_ticks": float(len(trace.yaw)), **super().metrics(trace)}

@@ -65,6 +65,11 @@ class Text(BaseTask):
         number = min(tick // max(round(self.settings.every / self.dt), 1), len(self._motions) - 1)
         return Instruction(velocity=twist_of(self._motions[number]), text=self._sentences[number])
 
+    @property
+    def guides(self) -> bool:
+        """By the velocity alone, there being nothing else in its instructions."""
+        return self.settings.cost.twist
+
     def success(self, trace: Trace) -> bool:
         """Never fallen, and every sentence followed."""
         return not trace.fallen and self._followed(trace) == 1.0

@@ -10,9 +10,13 @@ import torch
 from task_bodies import DT, moves, state
 
 from hw.hal import Instruction
-from stack.tasks import load_settings
+from hw.robot import load_robot
+from stack.policies import make_policy
+from stack.tasks import load_settings, load_task
 from stack.tasks.frames import to_heading
 from stack.tasks.guidance import Weights, goal_cost, ground_cost, obstacle_cost, path_cost, total_cost
+
+TWIST = tuple(f"cost.{name}" for name in ("velocity", "yaw_rate", "displacement", "yaw", "stand"))
 
 
 def value(cost: torch.Tensor) -> float:
@@ -51,7 +55,25 @@ def test_goal_cost_wants_to_be_near_and_to_face_the_goal() -> None:
     goal, weights = np.array([1.0, 0.0]), Weights(goal=2.0, facing=3.0)
     assert value(goal_cost(moves(np.zeros((3, 2))), goal, weights)) == pytest.approx(2.0, rel=1e-5)
     away = goal_cost(moves(np.zeros((3, 2)), yaw=np.pi), goal, weights)
-    assert value(away) == pytest.approx(2.0 + 3.0 * 2.0, rel=1e-5)
+    assert value(away) == pytest.approx(2.0 + 3.0 * 2.0, rel=0.01)
+
+
+def pull(distance: float, weights: Weights, bearing: float = 1.0) -> tuple[float, float]:
+    """The cost of a goal in sight, and the size of its gradient on the place."""
+    here = moves(np.zeros((1, 2)))
+    cost = goal_cost(here, distance * np.array([np.cos(bearing), np.sin(bearing)]), weights)
+    (gradient,) = torch.autograd.grad(cost.sum(), here.displacement)
+    return value(cost), float(gradient.norm())
+
+
+def test_facing_a_near_goal_does_not_outweigh_being_there() -> None:
+    facing, goal = Weights(facing=1.0), Weights(goal=1.0)
+    for distance in (0.001, 0.02, 0.1):
+        assert pull(distance, facing)[1] < 5.0 * pull(distance, goal)[1]
+    assert pull(0.02, facing)[1] < 3.0 * pull(0.02, goal)[1]
+    # Who faces it is not pushed off, and further away facing is the paper's: 1 - cos, turned by 1 / distance.
+    assert pull(0.02, facing, bearing=0.0)[1] == pytest.approx(0.0, abs=1e-3)
+    assert pull(1.0, facing) == pytest.approx((1.0 - np.cos(1.0), np.sin(1.0)), rel=0.02)
 
 
 def test_a_waypoint_costs_the_square_of_its_distance() -> None:
@@ -114,3 +136,23 @@ def test_weights_choose_the_terms_and_zero_leaves_the_planner_to_itself() -> Non
     )
     with pytest.raises(ValueError, match="margin: must be positive"):
         Weights(margin=0.0)
+
+
+@pytest.mark.parametrize(
+    ("task", "settings", "guides"),
+    [
+        ("survive", {}, False),
+        ("text", {}, False),
+        ("inbetween", {}, False),
+        ("text", {"cost.yaw": "0.1"}, True),
+        ("walk", {}, True),
+        ("goal", dict.fromkeys(TWIST, "0") | {"cost.goal": "1"}, True),
+    ],
+)
+def test_a_task_whose_cost_is_zero_makes_a_policy_without_guidance(
+    monkeypatch: pytest.MonkeyPatch, task: str, settings: dict[str, str], guides: bool
+) -> None:
+    costs: list[object] = []
+    monkeypatch.setattr("stack.diffusion_policy.diffusion_policy", lambda robot, s, cost, process: costs.append(cost))
+    make_policy("diffusion", load_robot(), load_task(task, settings), realtime=False)
+    assert [cost is not None for cost in costs] == [guides]

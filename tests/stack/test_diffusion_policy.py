@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -17,8 +20,9 @@ from policy.diffusion.denoiser import Denoiser
 from policy.diffusion.features import Normaliser, raw_layout
 from policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 from policy.text.captions import caption
+from stack import planner as planner_module
 from stack.diffusion_policy import DiffusionPolicy, diffusion_policy
-from stack.planner import InlinePlanner
+from stack.planner import InlinePlanner, ProcessPlanner
 from stack.trim import Trim
 
 ROBOT = load_robot()
@@ -114,6 +118,48 @@ def test_a_late_plan_is_not_adopted_and_the_last_goes_on_by_its_tick() -> None:
     assert policy.take_events() == ()
 
 
+class FakePipe:
+    """The loop's end of a pipe to a process that plans by a clock in ticks, `takes` for the plan of each."""
+
+    def __init__(self, takes: Callable[[int], float]) -> None:
+        self.now, self._takes = 0.0, takes
+        self._answers: list[tuple[float, object]] = [(0.0, None)]  # when there, and what; the first: it is ready
+
+    def send(self, message: tuple[int, int, PlanRequest]) -> None:
+        serial, seed, asked = message
+        assert not self._answers, "it is busy"
+        self._answers.append((self.now + self._takes(asked.tick), (serial, marked(asked, seed))))
+
+    def poll(self, timeout: float) -> bool:
+        return bool(self._answers) and self._answers[0][0] <= self.now
+
+    def recv(self) -> object:
+        return self._answers.pop(0)[1]
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("replan", "delay", "slow", "missed"),
+    [(4, 2, 2.6, [20]), (4, 4, 5.2, [20, 24]), (2, 2, 2.5, [20, 22]), (1, 1, 1.3, [20, 21])],
+)
+@pytest.mark.parametrize("usual", [0.3, 0.7, 0.95])
+def test_planning_goes_on_after_a_slow_plan(
+    monkeypatch: pytest.MonkeyPatch, replan: int, delay: int, slow: float, missed: list[int], usual: float
+) -> None:
+    """Missed are the slow one, and one that found the planner busy: sent late, it would make all that follow late."""
+    pipe = FakePipe(lambda tick: slow if tick == 20 else usual * delay)
+    context = SimpleNamespace(Pipe=lambda: (pipe, MagicMock()), Process=MagicMock())
+    monkeypatch.setattr(planner_module.multiprocessing, "get_context", lambda method: context)
+    policy = DiffusionPolicy(ProcessPlanner(MagicMock()), history=4, replan=replan, delay=delay, wait=False)
+    for tick in range(60):
+        pipe.now = float(tick)
+        policy.act(state(tick), np.full(20, 0.5), INSTRUCTION)
+    requested = [tick for tick in range(3, 60 - delay) if tick % replan == 0]
+    assert policy.adopted == [(tick, tick + delay) for tick in requested if tick not in missed]
+
+
 def test_a_motion_has_the_name_of_what_was_asked_not_of_its_correction() -> None:
     spy = Spy()
     policy = DiffusionPolicy(spy, history=4, replan=4, delay=2, trim=Trim(ROBOT.dt, rate=5.0))
@@ -181,12 +227,16 @@ def slow_down(trajectory: Any, instruction: Instruction) -> Any:
 
 @pytest.fixture
 def settings(tmp_path: Path) -> DiffusionSettings:
-    """Settings of a small network with random weights."""
+    return untrained(tmp_path)
+
+
+def untrained(tmp_path: Path, **training: Any) -> DiffusionSettings:
+    """Settings of a small network with random weights, whose header says of its `training` what is given."""
     torch.manual_seed(0)
     config, path = DenoiserConfig(54, 20, width=32, heads=2), tmp_path / "net.safetensors"
     states = Normaliser(torch.zeros(54), torch.ones(54))
     actions = Normaliser(torch.tensor(ROBOT.home, dtype=torch.float32), torch.full((20,), 0.1))
-    facts: dict[str, Any] = {"data": "none", "licence": "none", "results": {}, "training": {}}
+    facts: dict[str, Any] = {"data": "none", "licence": "none", "results": {}, "training": training}
     checkpoint.save(path, Denoiser(config).state_dict(), config, states, actions, ROBOT, **facts)
     return DiffusionSettings(checkpoint=str(path), steps=5, replan=4, delay=2)
 
@@ -244,6 +294,16 @@ def test_a_checkpoint_for_another_rate_is_refused_before_anything_starts(
         diffusion_policy(ROBOT, replace(settings, replan=15, delay=2), process=process)
     with pytest.raises(ConfigError, match="horizon 32 is asked for"):
         diffusion_policy(ROBOT, replace(settings, horizon=32), process=process)
+
+
+@pytest.mark.parametrize("process", [False, True])
+def test_settings_that_the_training_does_not_fit_are_refused_before_anything_starts(
+    tmp_path: Path, process: bool
+) -> None:
+    with pytest.raises(ConfigError, match="trained for at most 1 ticks"):
+        diffusion_policy(ROBOT, untrained(tmp_path, committed=1), process=process)
+    with pytest.raises(ConfigError, match="learned the actions of the next 5 only"):
+        diffusion_policy(ROBOT, untrained(tmp_path, far_actions=0.0, near_actions=5), process=process)
 
 
 def test_rolling_gives_the_same_actions_in_line_and_beside_the_loop(settings: DiffusionSettings) -> None:

@@ -65,7 +65,7 @@ def test_inline_and_process_planners_answer_alike() -> None:
         process.close()
 
 
-def test_a_slow_planner_never_blocks_and_skips_to_the_newest_request() -> None:
+def test_a_slow_planner_never_blocks_and_skips_what_it_cannot_begin_at_once() -> None:
     planner = ProcessPlanner(partial(build, seconds=0.5))
     try:
         start = time.monotonic()
@@ -73,8 +73,10 @@ def test_a_slow_planner_never_blocks_and_skips_to_the_newest_request() -> None:
             planner.submit(request(tick))
             assert planner.collect(tick, wait=False) is None
         assert time.monotonic() - start < 0.3
-        assert until_ready(planner, 8).tick == 8  # 0 came too late to be wanted, and 4 was never planned
-        assert time.monotonic() - start < 1.4
+        time.sleep(0.6)
+        planner.submit(request(12))
+        assert until_ready(planner, 12).tick == 12  # 0 came too late to be wanted, and 4 and 8 were never planned
+        assert time.monotonic() - start < 1.9
     finally:
         planner.close()
 
@@ -123,12 +125,13 @@ def test_a_planner_that_cannot_start_says_why() -> None:
         ProcessPlanner(build_badly)
 
 
-def test_ctrl_c_leaves_the_process_to_the_loop() -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_the_group_leaves_the_process_to_the_loop(number: signal.Signals) -> None:
     planner = ProcessPlanner(build)
     try:
         pid = planner._process.pid
         assert pid is not None
-        os.kill(pid, signal.SIGINT)
+        os.kill(pid, number)
         planner.submit(request(0))
         assert planner.collect(0, wait=True) is not None
     finally:
@@ -160,6 +163,23 @@ def test_the_process_dies_with_its_parent() -> None:
     while alive(child) and time.monotonic() < end:
         time.sleep(0.02)
     assert not alive(child)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 60.0])
+def test_a_program_that_forgets_to_close_ends_all_the_same(seconds: float) -> None:
+    """Idle or in the middle of a plan: multiprocessing's own end is a SIGTERM, which the process does not heed."""
+    code = """
+        import sys
+        from functools import partial
+        sys.path.insert(0, sys.argv[1])
+        from test_planner import build, request
+        from stack.planner import ProcessPlanner
+        if __name__ == "__main__":
+            planner = ProcessPlanner(partial(build, seconds=float(sys.argv[2])))
+            planner.submit(request(0))
+    """
+    command = [sys.executable, "-c", textwrap.dedent(code), os.path.dirname(__file__), str(seconds)]
+    assert subprocess.run(command, timeout=30).returncode == 0
 
 
 def alive(pid: int) -> bool:

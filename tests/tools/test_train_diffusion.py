@@ -18,6 +18,7 @@ from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.dataset import Windows, read_recording
 from policy.diffusion.denoiser import Denoiser
 from policy.diffusion.schedule import cosine_signal
+from policy.diffusion.settings import load_settings
 from policy.diffusion.training import (
     Average,
     Objective,
@@ -142,12 +143,20 @@ def test_training_lowers_the_loss_of_held_out_windows(windows: Windows, tmp_path
     assert run._validation_loss() < 0.7 * before
 
 
-def test_survival_is_measured_of_a_network_with_a_single_action(
-    synthetic_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("shape", "training"),
+    [({"actions": 1}, {}), ({"actions": 3}, {}), ({"levels": 4}, {}), ({}, {"far_actions": 0.0, "near_actions": 5})],
+)
+def test_survival_is_measured_of_a_network_that_the_shipped_settings_do_not_fit(
+    synthetic_dataset: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    shape: dict[str, int],
+    training: dict[str, Any],
 ) -> None:
-    short = replace(CONFIG, actions=1)
+    short = replace(CONFIG, **shape)
     windows = Windows(read_recording(synthetic_dataset, ROBOT), ROBOT, short)
-    run = Trainer(windows, ROBOT, short, QUICK, tmp_path, "made up", "Apache-2.0", None)
+    run = Trainer(windows, ROBOT, short, replace(QUICK, **training), tmp_path, "made up", "Apache-2.0", None)
     run._ship(tmp_path / "one.safetensors", {})
     shares: list[float] = []
     made = fleet.Fleet.__init__
@@ -157,7 +166,7 @@ def test_survival_is_measured_of_a_network_with_a_single_action(
         made(self, *args, **options)
 
     monkeypatch.setattr(fleet.Fleet, "__init__", noted)
-    assert 0.0 <= closed_loop_survival(tmp_path / "one.safetensors", 0.5, 2, 0)["survival"] <= 1.0
+    assert 0.0 <= closed_loop_survival(tmp_path / "one.safetensors", 0.1, 2, 0)["survival"] <= 1.0
     assert shares == [0.5]  # robots drawn at random
 
 
@@ -210,6 +219,21 @@ def test_a_history_without_what_ran_is_refused(tmp_path: Path) -> None:
     diffusion.add_arguments(parser)
     with pytest.raises(ConfigError, match="--history 1: at least 2"):
         diffusion.main(parser.parse_args(["--data", str(tmp_path), "--out", str(tmp_path), "--history", "1"]))
+
+
+def test_what_cannot_be_measured_is_refused_before_the_data_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parser = argparse.ArgumentParser()
+    diffusion.add_arguments(parser)
+    options = ["--data", str(tmp_path), "--out", str(tmp_path), "--threads", "1", "--text", ""]
+    for committed in ("-1", "17"):
+        with pytest.raises(ConfigError, match=f"--committed {committed}: 0 to the horizon of 16"):
+            diffusion.main(parser.parse_args([*options, "--committed", committed]))
+    stabilised = replace(load_settings(), stabilise=9)
+    monkeypatch.setattr("policy.diffusion.settings.load_settings", lambda: stabilised)
+    with pytest.raises(ConfigError, match="stabilise must be at most 8"):
+        diffusion.main(parser.parse_args([*options, "--levels", "8"]))
 
 
 def test_the_past_is_clean_in_three_quarters_of_the_windows_and_half_share_one_level() -> None:

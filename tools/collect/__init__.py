@@ -145,19 +145,16 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
 
 def _features(robot: Robot) -> dict[str, Feature]:
     """The dataset's columns and the names of their numbers."""
-    from policy.diffusion.features import raw_layout
+    from policy.diffusion.features import recorded_names
     from tools.lerobot import Feature
 
-    axes = {"displacement": "xyz", "yaw": [""], "velocity": "xyz", "angular_velocity": "xyz", "gravity": "xyz"}
-    names = []
-    for field, _ in raw_layout(len(robot.joints)).fields:
-        names += [f"{field}.{part}".rstrip(".") for part in axes.get(field, robot.names)]
-    return {
-        "observation.state": Feature(tuple(names), {"mirroring": MIRRORING}),
-        "action": Feature(robot.names, {"meaning": "the expert's joint targets after the limits, rad"}),
-        "action_applied": Feature(robot.names, {"meaning": "the joint targets that ran, with noise, rad"}),
-        "command": Feature(("forward", "left", "turn"), {"meaning": "the velocity asked for, m/s and rad/s"}),
+    notes = {
+        "observation.state": {"mirroring": MIRRORING},
+        "action": {"meaning": "the expert's joint targets after the limits, rad"},
+        "action_applied": {"meaning": "the joint targets that ran, with noise, rad"},
+        "command": {"meaning": "the velocity asked for, m/s and rad/s"},
     }
+    return {name: Feature(names, notes[name]) for name, names in recorded_names(robot).items()}
 
 
 def _source(path: Path) -> dict[str, str]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from hw.config import ConfigError
 from hw.hal import Array
-from tools.train.timed import Survival, TimedTrainer, add_run_arguments, same_network
+from tools.train.timed import Survival, TimedTrainer, add_run_arguments, same
 
 if TYPE_CHECKING:
     import torch
@@ -122,7 +122,14 @@ def main(args: argparse.Namespace) -> int:
     )
     names = "minutes", "steps", "batch", "learning_rate", "committed", "evaluate_every", "seed", "precision"
     settings = Settings(**{name: getattr(args, name) for name in (*names, *OBJECTIVE)})
-    Objective(**{name: getattr(settings, name) for name in OBJECTIVE})  # refused before the data is read
+    # What cannot be trained or measured is refused before the data is read.
+    Objective(**{name: getattr(settings, name) for name in OBJECTIVE})
+    if not 0 <= settings.committed <= config.horizon:
+        raise ConfigError(f"--committed {settings.committed}: 0 to the horizon of {config.horizon} ticks is needed")
+    if survival is not None:
+        from tools.train.survival import planning
+
+        planning(config, asdict(settings))
     recording = read_recording(args.data, robot)
     windows = Windows(recording, robot, config, emphasis=args.emphasis, seed=args.seed, latents=latents)
     source = f"{args.data.resolve().name}: {len(recording.spans)} episodes, {len(recording.raw)} ticks"
@@ -149,6 +156,8 @@ def _survival(args: argparse.Namespace) -> Survival:
 class Trainer(TimedTrainer):
     """Trains a denoiser; checkpoints hold the averaged network."""
 
+    settings: Settings
+
     LOSS = "validation_action_loss"
     COLUMNS = ("minutes", *MEANS, LOSS, "survival", "velocity_error")
     PANELS = (("state_loss", "action_loss", LOSS), ("survival",), ("velocity_error",))
@@ -170,13 +179,12 @@ class Trainer(TimedTrainer):
         from policy.diffusion.schedule import cosine_signal
         from policy.diffusion.training import Average, Objective
 
-        if settings.committed > config.horizon:
-            raise ConfigError(f"--committed {settings.committed} is longer than the horizon of {config.horizon} ticks")
-        super().__init__(out, settings.minutes, settings.steps, settings.evaluate_every, survival)
+        super().__init__(out, settings, survival)
         self.objective = Objective(**{name: getattr(settings, name) for name in OBJECTIVE})
         torch.manual_seed(settings.seed)
-        self.windows, self.robot, self.config, self.settings = windows, robot, config, settings
+        self.windows, self.robot, self.config = windows, robot, config
         self.source, self.licence = source, licence
+        self.begun_with: dict[str, Any] = {}  # the checkpoint that training began with, if any
         self.network = Denoiser(config)
         self.average = Average(self.network, settings.average)
         self.optimiser = torch.optim.AdamW(
@@ -189,6 +197,7 @@ class Trainer(TimedTrainer):
         """Take weights and normalisation of a checkpoint, to go on with other data. Raises ConfigError."""
         from policy.diffusion.checkpoint import load
         from policy.latent.actions import same_latents
+        from stack.provenance import sha256
 
         model = load(path, self.robot)
         if model.config != self.config:
@@ -198,6 +207,8 @@ class Trainer(TimedTrainer):
         self.network.load_state_dict(model.denoiser.state_dict())
         self.average.weights = {name: p.detach().clone() for name, p in self.network.named_parameters()}
         self.windows.states, self.windows.actions = model.states, model.actions
+        known = {name: model.header[name] for name in ("git_commit", "data", "licence", "results")}
+        self.begun_with = {"checkpoint": path.name, "sha256": sha256(path), **known}
 
     def _title(self) -> str:
         size = f"{self.network.parameter_count:,} parameters, {self.config.tokens} tokens"
@@ -273,7 +284,7 @@ class Trainer(TimedTrainer):
             self.robot,
             data=self.source,
             licence=self.licence,
-            results={**self.progress, **results},
+            results={**self.progress, **results, **({"begun_with": self.begun_with} if self.begun_with else {})},
             training=asdict(self.settings),
             latents=self.windows.latents,
         )
@@ -287,6 +298,7 @@ class Trainer(TimedTrainer):
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
             "source": self.source,
+            "begun_with": self.begun_with,
             "latents": _tensors(self.windows.latents.to_tensors() if self.windows.latents else {}),
             # Whole, with the matrix of the emphasis: another seed or --init may have made them.
             "states": _tensors(self.windows.states.to_numpy()),
@@ -296,7 +308,7 @@ class Trainer(TimedTrainer):
     def _restore(self, path: Path, saved: Mapping[str, Any]) -> None:
         from policy.diffusion.features import Normaliser
 
-        same_network(path, asdict(self.config), saved["config"])
+        same(path, "another network", asdict(self.config), saved["config"])
         if saved["source"] != self.source:
             raise ConfigError(
                 f"{path}: trained on {saved['source']}, not on {self.source}; use --no-resume or another --out"
@@ -308,6 +320,7 @@ class Trainer(TimedTrainer):
         self.windows.states, self.windows.actions = (
             Normaliser.from_numpy(_arrays(saved[name])).to_torch() for name in ("states", "actions")
         )
+        self.begun_with = saved.get("begun_with", {})  # unknown to an older program
         self.network.load_state_dict(saved["network"])
         self.average.weights = saved["average"]
         self.average.updates = saved["updates"]

@@ -19,12 +19,25 @@ _BIAS_LEFT = 0.0005  # rad/s of gyro bias that standing before a run leaves
 
 
 class Fleet:
-    """`n` robots. `randomise` is the share of episodes on a randomised robot."""
+    """`n` robots. `randomise` is the share of episodes on a randomised robot.
+
+    Episodes draw from streams of their own by `seed`, or by `(seed, tag)`, so that what is measured is not what was
+    trained on. A tag is beyond the number of any world: a stream that ends in zeros is that of the shorter one.
+    """
 
     def __init__(
-        self, robot: Robot, n: int, odometry: Mlp | None, *, randomise: float = 0.0, seed: int = 0, threads: int = 0
+        self,
+        robot: Robot,
+        n: int,
+        odometry: Mlp | None,
+        *,
+        randomise: float = 0.0,
+        seed: int = 0,
+        tag: int | None = None,
+        threads: int = 0,
     ) -> None:
-        self.robot, self.n, self._seed = robot, n, seed
+        self.robot, self.n = robot, n
+        self._stream = [seed] if tag is None else [seed, tag]
         self.worlds = Worlds(robot, n, threads=threads, randomise=randomise)
         self.estimator = Estimator(robot, odometry, (n,))
         self.applied = np.tile(robot.home, (n, 1))
@@ -47,7 +60,7 @@ class Fleet:
         if not len(ids):
             return
         for i in ids:
-            self.rngs[i] = np.random.default_rng([self._seed, int(i), int(self._episodes[i])])
+            self.rngs[i] = np.random.default_rng([*self._stream, int(i), int(self._episodes[i])])
             self._episodes[i] += 1
         pose = np.tile(self.robot.home, (len(ids), 1)) if joints is None else joints[ids]
         self.worlds.reset(ids, [self.rngs[i] for i in ids], pose)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hw.config import ConfigError
-from tools.train.timed import Survival, TimedTrainer, add_run_arguments, same_network
+from tools.train.timed import Survival, TimedTrainer, add_run_arguments, same
 
 if TYPE_CHECKING:
     from hw.robot import Robot
@@ -107,6 +107,8 @@ def _survival(robot: Robot, args: argparse.Namespace) -> Survival:
 class LatentTrainer(TimedTrainer):
     """Trains the VAE; `latent.safetensors` is the one through which the expert walks best."""
 
+    settings: Settings
+
     BEST = "latent.safetensors"
     LOSS = "reconstruction_rad"
     COLUMNS = ("minutes", *LOSSES, "beta", "steps_per_s", *MEASURED, "survival", "velocity_error")
@@ -127,9 +129,9 @@ class LatentTrainer(TimedTrainer):
 
         from policy.latent.network import LatentNetwork
 
-        super().__init__(out, settings.minutes, settings.steps, settings.evaluate_every, survival)
+        super().__init__(out, settings, survival)
         torch.manual_seed(settings.seed)
-        self.pairs, self.robot, self.config, self.settings = pairs, robot, config, settings
+        self.pairs, self.robot, self.config = pairs, robot, config
         self.source, self.licence = source, licence
         self.network = LatentNetwork(config, pairs.states, pairs.actions)
         self.optimiser = torch.optim.Adam(self.network.parameters(), settings.learning_rate)
@@ -198,7 +200,7 @@ class LatentTrainer(TimedTrainer):
     def _restore(self, path: Path, saved: Mapping[str, Any]) -> None:
         import torch
 
-        same_network(path, asdict(self.config), saved["config"])
+        same(path, "another network", asdict(self.config), saved["config"])
         ours = self.pairs.states.mean, self.pairs.actions.mean
         if not all(torch.equal(a, b) for a, b in zip(ours, saved["normalisation"], strict=True)):
             raise ConfigError(f"{path}: trained on other data; use --no-resume or another --out")

@@ -58,7 +58,9 @@ class PlannedWalker:
             previous = None
             if self._predicted is not None:
                 previous = Previous(tick - self._made, self._predicted, self._plan)
-            plan, predicted = self._runtime.plan_batch(self._states, actions, Instruction(asked), seeds, previous)
+            window = self._states, actions, Instruction(asked)
+            # As on a robot, what is asked has its name before it is corrected.
+            plan, predicted = self._runtime.plan_batch(*window, seeds, previous, named=command)
             self._requested = tick
             if settings.delay:
                 self._waiting = plan, predicted

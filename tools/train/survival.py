@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from hw.robot import load_robot
 
 if TYPE_CHECKING:
     from hw.robot import Robot
+    from policy.diffusion.config import DenoiserConfig
+    from policy.diffusion.settings import DiffusionSettings
     from tools.collect.recorder import Driver
     from tools.train.fleet import Fleet
 
@@ -21,30 +23,36 @@ _CHANGE = 125  # ticks between commands
 _PUSH_EVERY = 50  # ticks
 _PUSH = 0.3  # m/s, in a random direction
 _RANDOMISED = 0.5  # share of worlds with a robot drawn at random
+_MEASURED = 2**31  # sets these worlds apart from those that data is collected in, with the same seed
 
 
 def closed_loop_survival(
     checkpoint: Path, seconds: float, worlds: int, seed: int, robot_name: str = "op3"
 ) -> dict[str, float]:
-    """Run a diffusion checkpoint in `worlds` worlds, all planned as one batch: see `survival_of`.
-
-    Uses the settings of configs/policies/diffusion.yaml, with shorter delay and chunks where the network has too few
-    actions for them, or was trained for less delay.
-    """
+    """Run a diffusion checkpoint in `worlds` worlds, all planned as one batch: see `survival_of`."""
     from policy.checkpoint import read_header
     from policy.diffusion.config import check_fit
     from policy.diffusion.runtime import load_runtime
-    from policy.diffusion.settings import load_settings
     from stack.tasks import load_task
     from tools.train.planned import PlannedWalker
 
-    robot, settings = load_robot(robot_name), replace(load_settings(), checkpoint=str(checkpoint))
-    head = read_header(checkpoint)
-    actions = check_fit(checkpoint, head, robot).action_horizon
-    delay = min(settings.delay, head["training"]["committed"], actions - 1)
-    settings = replace(settings, delay=delay, replan=min(settings.replan, actions - delay))
+    robot, head = load_robot(robot_name), read_header(checkpoint)
+    settings = planning(check_fit(checkpoint, head, robot), head["training"])
+    settings = replace(settings, checkpoint=str(checkpoint))
     runtime = load_runtime(robot, settings, load_task("walk", {}, robot.dt).cost)
     return survival_of(partial(PlannedWalker, runtime=runtime, seed=seed), robot, seconds, worlds, seed)
+
+
+def planning(network: DenoiserConfig, training: Mapping[str, Any]) -> DiffusionSettings:
+    """The settings of configs/policies/diffusion.yaml as far as the network can serve them.
+
+    Raises ConfigError where it cannot.
+    """
+    from policy.diffusion.settings import load_settings
+
+    settings = load_settings().fitted(network, training)
+    settings.check(network, training)
+    return settings
 
 
 def survival_of(
@@ -61,7 +69,7 @@ def survival_of(
     from stack.odometry import load_odometry
     from tools.train.fleet import Fleet
 
-    fleet = Fleet(robot, worlds, load_odometry(robot), randomise=_RANDOMISED, seed=seed)
+    fleet = Fleet(robot, worlds, load_odometry(robot), randomise=_RANDOMISED, seed=seed, tag=_MEASURED)
     walker, everything = drive(fleet), np.ones(worlds, bool)
     fleet.reset(everything)
     walker.reset(everything)

@@ -1,4 +1,4 @@
-"""A training run of some time or steps, in a folder where it can be resumed, that keeps the best network."""
+"""A training run of a given time or number of steps, in a folder where it goes on, that keeps its best network."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,6 +16,8 @@ from hw.config import ConfigError
 
 # From a checkpoint's path to what was measured; "survival" in it is the share of worlds that stayed up, 0 to 1.
 Survival = Callable[[Path], Mapping[str, float]]
+
+BUDGET = ("minutes", "steps", "evaluate_every")  # settings that may change where a run goes on
 
 
 def add_run_arguments(parser: argparse.ArgumentParser, minutes: float, evaluate_every: float, otherwise: str) -> None:
@@ -29,7 +32,12 @@ def add_run_arguments(parser: argparse.ArgumentParser, minutes: float, evaluate_
         default=0,
         help="train for so many steps instead, the same on any machine; evaluated as often as in --minutes",
     )
-    parser.add_argument("--resume", action=argparse.BooleanOptionalAction, default=True, help="continue in --out")
+    parser.add_argument(
+        "--resume",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="continue in --out, with the options of before; --minutes, --steps and --evaluate-every may be others",
+    )
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch threads (default: all cores)")
     parser.add_argument("--evaluate-every", type=float, default=evaluate_every, help="minutes; 0: only at the end")
     parser.add_argument("--survival-seconds", type=float, default=10.0)
@@ -50,15 +58,18 @@ class TimedTrainer:
     COLUMNS: ClassVar[tuple[str, ...]]  # of the log: "minutes", and all that is measured
     PANELS: ClassVar[Sequence[Sequence[str]]]  # columns that are drawn, by picture
 
-    def __init__(self, out: Path, minutes: float, steps: int, evaluate_every: float, survival: Survival | None) -> None:
-        """Minutes of training, evaluations not counted, or steps where they are not 0.
+    def __init__(self, out: Path, settings: Any, survival: Survival | None) -> None:
+        """`settings` is a dataclass that has `BUDGET`, and what else the trainer of a network is told.
 
+        There, `minutes` are of training, evaluations not counted, or else `steps` where they are not 0;
         `evaluate_every` are minutes, of `minutes`; 0: only at the end. Raises ConfigError for less than nothing.
         """
-        if minutes <= 0 or steps < 0 or evaluate_every < 0:
+        minutes, every = settings.minutes, settings.evaluate_every
+        if minutes <= 0 or settings.steps < 0 or every < 0:
             raise ConfigError("--minutes must be positive, --steps and --evaluate-every not negative")
-        self.out, self.minutes, self.steps, self.survival = out, minutes, steps, survival
-        self.every = evaluate_every / minutes or math.inf  # share of the budget from an evaluation to the next
+        self.out, self.settings, self.survival = out, settings, survival
+        self.minutes, self.steps = minutes, settings.steps
+        self.every = every / minutes or math.inf  # share of the budget from an evaluation to the next
         self.step = 0
         self.seconds = 0.0  # of training, evaluations not counted
         self.evaluated = 0.0  # share of the budget that was used at the last evaluation
@@ -176,7 +187,7 @@ class TimedTrainer:
         part = path.with_suffix(".part")
         best = list(self.best) if self.best else []
         run = {"step": self.step, "seconds": self.seconds, "evaluated": self.evaluated, "best": best}
-        torch.save({**self._state(), **run}, part)
+        torch.save({**self._state(), **run, "settings": asdict(self.settings)}, part)
         part.replace(path)
 
     def resume(self) -> bool:
@@ -192,6 +203,9 @@ class TimedTrainer:
             saved: dict[str, Any] = torch.load(path, weights_only=True)
         except (RuntimeError, EOFError, OSError, pickle.UnpicklingError) as error:
             raise ConfigError(f"{path}: cannot be resumed ({error}); use --no-resume or another --out") from error
+        ours = {name: value for name, value in asdict(self.settings).items() if name not in BUDGET}
+        # A checkpoint's header states them for the whole run. Those of an older program are not known.
+        same(path, "other settings", ours, ours | saved.get("settings", {}))
         self._restore(path, saved)
         self.step, self.seconds = saved["step"], saved["seconds"]
         self.evaluated = min(saved["evaluated"], self.share)  # of another budget, perhaps
@@ -200,9 +214,9 @@ class TimedTrainer:
         return True
 
 
-def same_network(path: Path, ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> None:
-    """Refuse to resume a network of another config. Raises ConfigError naming what changed."""
+def same(path: Path, otherwise: str, ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> None:
+    """Refuse to resume what was begun `otherwise`, with another config say. Raises ConfigError naming what changed."""
     changed = [f"{key} was {theirs.get(key)}, is {value}" for key, value in ours.items() if theirs.get(key) != value]
     if changed:
         what = "; ".join(changed)
-        raise ConfigError(f"{path}: another network ({what}); use its options, --no-resume or another --out")
+        raise ConfigError(f"{path}: {otherwise} ({what}); use its options, --no-resume or another --out")

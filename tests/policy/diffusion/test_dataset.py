@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -140,6 +141,21 @@ def test_global_states_are_emphasised_and_recovered(synthetic_dataset: Path) -> 
 def test_a_missing_column_is_named(copy: Path) -> None:
     edit(copy, lambda table: table.drop_columns("action_applied"))
     with pytest.raises(DatasetError, match=r"file-001\.parquet: no column 'action_applied'"):
+        read_recording(copy, ROBOT)
+
+
+def test_joints_in_another_order_are_refused_by_name(copy: Path) -> None:
+    """As many joints, of the same robot: only their names tell."""
+    swapped = replace(ROBOT, joints=(ROBOT.joints[1], ROBOT.joints[0], *ROBOT.joints[2:]))
+    first, second = ROBOT.names[:2]
+    what = rf"entry 13 is position\.{first}, and position\.{second} is needed"
+    with pytest.raises(DatasetError, match=rf"info\.json: 'observation\.state' is not that of op3: {what}"):
+        read_recording(copy, swapped)
+    path = copy / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    info["features"]["action_applied"]["names"].pop(3)
+    path.write_text(json.dumps(info))
+    with pytest.raises(DatasetError, match=f"'action_applied' .* 19 entries, 20 needed; missing: {ROBOT.names[3]}"):
         read_recording(copy, ROBOT)
 
 

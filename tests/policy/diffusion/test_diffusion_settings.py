@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,6 +53,27 @@ def test_what_a_checkpoint_does_not_have_is_refused_with_the_remedy() -> None:
         DiffusionSettings(schedule="rolling", rolling=Rolling(state_level=30)).check(NETWORK)
     with pytest.raises(ConfigError, match="stabilise must be at most 20"):
         DiffusionSettings(stabilise=21).check(NETWORK)
+
+
+@pytest.mark.parametrize(
+    ("shape", "training", "expected"),
+    [
+        ({}, {"committed": 2}, (5, 4, 2)),
+        ({}, {"committed": 1}, (5, 4, 1)),
+        ({"actions": 3}, {"committed": 2}, (5, 2, 1)),
+        ({"actions": 1}, {"committed": 2}, (5, 1, 0)),
+        ({}, {"committed": 2, "far_actions": 0.0, "near_actions": 5}, (5, 3, 2)),
+        ({}, {"far_actions": 0.0, "near_actions": 1}, (5, 1, 0)),
+        ({"levels": 4}, {"committed": 2}, (4, 4, 2)),
+    ],
+)
+def test_settings_are_fitted_to_what_a_network_can_do(
+    shape: dict[str, int], training: dict[str, Any], expected: tuple[int, int, int]
+) -> None:
+    network = DenoiserConfig(108, 20, **shape)
+    settings = DiffusionSettings().fitted(network, training)
+    assert (settings.steps, settings.replan, settings.delay) == expected
+    settings.check(network, training)
 
 
 def test_every_file_of_diffusion_settings_loads_and_fits_the_default_network() -> None:

@@ -161,6 +161,11 @@ def test_keyframes_that_make_no_sense_are_refused() -> None:
     for ticks, match in (((0, 5), "at least 1 and rise"), ((6, 6), "at least 1 and rise")):
         with pytest.raises(ValueError, match=match):
             runtime.plan(replace(asked, instruction=with_keyframes(*ticks)[0]), 0)
+    for feature in (0, 1):  # the other would be lost as well, when both are turned into the present heading
+        half, rows = with_keyframes(6, 12)
+        rows[1, feature] = np.nan
+        with pytest.raises(ValueError, match="x and y must both be given or both be free, at tick 12"):
+            runtime.plan(replace(asked, instruction=half), 0)
     short = Instruction(np.zeros(3), keyframes=Keyframes(np.array([3]), np.zeros((1, 20))))
     with pytest.raises(ValueError, match=r"states are \(1, 20\) for ticks of \(1,\), \(k, 53\)"):
         runtime.plan(replace(asked, instruction=short), 0)

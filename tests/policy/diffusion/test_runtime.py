@@ -20,7 +20,7 @@ from policy.diffusion.features import Normaliser, Trajectory, raw_layout
 from policy.diffusion.runtime import Runtime
 from policy.diffusion.settings import DiffusionSettings, GuidanceSettings, load_settings
 from policy.text.captions import MOTIONS, NAMES
-from policy.text.encoder import load_encoder
+from policy.text.encoder import code_size, load_encoder
 from policy.text.understanding import Phrasebook
 
 ROBOT = load_robot()
@@ -73,6 +73,20 @@ def test_an_empty_sentence_leaves_the_velocity_untold() -> None:
     assert not np.array_equal(first(None, 0.2), first(None, -0.1))
     assert not np.array_equal(first("", 0.2), first(None, 0.2))
     np.testing.assert_array_equal(first("", 0.2), first("", -0.1))
+
+
+def test_each_of_a_batch_is_told_the_name_of_its_own_motion_or_of_the_one_that_is_named() -> None:
+    pytest.importorskip("wordllama")
+    runtime = Runtime(model(text="words", text_size=load_encoder("words").size), SETTINGS, ROBOT.dt)
+    asked, told = np.array([[0.1, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.6]])
+
+    def first(velocity: Array, named: Array | None) -> Array:
+        here = request()
+        window = here.states[None], here.actions[None], Instruction(velocity)
+        return runtime.plan_batch(*window, [(7, here.tick)], named=named)[0]
+
+    np.testing.assert_array_equal(first(asked, None), first(told, asked))
+    assert not np.array_equal(first(asked, None), first(asked, told))
 
 
 def test_a_sentence_is_read_as_the_nearest_that_was_trained_with_unless_told_otherwise() -> None:
@@ -189,3 +203,21 @@ def test_a_checkpoint_plans_as_what_was_saved(tmp_path: Path) -> None:
     checkpoint.save(path, weights, made.config, made.states, made.actions, ROBOT, **facts)
     with pytest.raises(CheckpointError, match="do not fit its own header"):
         checkpoint.load(path, ROBOT)
+
+
+def test_a_checkpoint_whose_encoder_gives_other_codes_now_is_refused(tmp_path: Path) -> None:
+    path, size = tmp_path / "net.safetensors", code_size("words")
+    facts: dict[str, Any] = {"data": "made up", "licence": "Apache-2.0", "results": {}, "training": {}}
+
+    def load(text: str, text_size: int) -> checkpoint.Model:
+        made = model(text=text, text_size=text_size)
+        checkpoint.save(path, made.denoiser.state_dict(), made.config, made.states, made.actions, ROBOT, **facts)
+        return checkpoint.load(path, ROBOT)
+
+    assert load("words", size).config.text_size == size
+    with pytest.raises(
+        CheckpointError, match=rf"as {size - 1} numbers, .* gives {size}: .* commit .* or train it again"
+    ):
+        load("words", size - 1)
+    with pytest.raises(CheckpointError, match="unknown text encoder 'word'"):
+        load("word", size)

@@ -1,0 +1,52 @@
+"""A fleet that is planned for as one batch is asked for the same as a robot by itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from hw.hal import Array, Instruction
+from hw.robot import load_robot
+from policy.diffusion.actions import JOINT_TARGETS
+from policy.diffusion.features import raw_layout
+from policy.diffusion.settings import DiffusionSettings
+from tools.train.fleet import Fleet
+from tools.train.planned import PlannedWalker
+
+ROBOT = load_robot()
+
+
+class Spy:
+    """Stands in for the runtime: holds the home pose, and remembers what it was asked."""
+
+    settings = DiffusionSettings(trim=5.0)
+    model = SimpleNamespace(config=SimpleNamespace(history=4, action_size=20), space=JOINT_TARGETS)
+    actions = 16
+
+    def __init__(self) -> None:
+        self.asked: Instruction
+        self.named: Array
+
+    def plan_batch(
+        self, states: Array, actions: Array, instruction: Instruction, seeds: Any, previous: Any, named: Array
+    ) -> tuple[Array, Array]:
+        self.asked, self.named = instruction, named
+        return np.tile(ROBOT.home, (len(states), 16, 1)), np.zeros((len(states), 16, raw_layout(20).size))
+
+
+def test_a_motion_has_the_name_of_what_was_asked_not_of_its_correction() -> None:
+    spy, fleet = Spy(), Fleet(ROBOT, 2, None, threads=1)
+    walker, everything = PlannedWalker(fleet, spy), np.ones(2, bool)  # type: ignore[arg-type]
+    fleet.reset(everything)
+    walker.reset(everything)
+    turning = replace(fleet.observe(), angular_velocity=np.tile([0.0, 0.0, 0.4], (2, 1)))
+    command = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    for _ in range(200):
+        fleet.state = turning
+        walker.act(command)
+    assert (spy.asked.velocity[:, 2] < -0.2).all(), "the correction"
+    assert spy.asked.text is None
+    np.testing.assert_array_equal(spy.named, command)
