@@ -43,10 +43,10 @@ class Firmware:
     of e + Kd de/dt + feed-forward, limited by goal PWM, then by current, then by the supply.
     """
 
-    def __init__(self, servos: tuple[Servo, ...], constant: Array, resistance: Array, delay: Array) -> None:
+    def __init__(self, servos: tuple[Servo, ...], constant: Array, resistance: Array, delay: float) -> None:
         """`constant` [V s/rad] and `resistance` [Ohm] are the motors' at the joint; `delay` [s] from goal to torque."""
         n = self.n = len(servos)
-        self._k, self._r, self._delay_ns = constant, resistance, np.round(delay * 1e9).astype(int)
+        self._k, self._r, self._delay_ns = constant, resistance, round(delay * 1e9)
         self.torque_per_ampere = np.array([servo.torque_per_ampere for servo in servos])
         self._no_load = np.array([servo.no_load_speed for servo in servos])
         self._stall = np.array([servo.stall_torque for servo in servos])
@@ -87,7 +87,7 @@ class Firmware:
 
     def submit(self, servo: int, name: str, value: float, now_ns: int) -> None:
         """A goal that was written at `now_ns`: it drives the motor after the servo's own delay."""
-        self._pending.append(_Pending(now_ns + int(self._delay_ns[servo]), servo, name, value))
+        self._pending.append(_Pending(now_ns + self._delay_ns, servo, name, value))
 
     def flush(self, servo: int, angle: float) -> None:
         """Forget what was underway: for torque-on and mode changes, from rest at `angle`."""

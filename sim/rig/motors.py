@@ -38,13 +38,14 @@ class Motors:
         self.robot, self.plant = robot, plant
         self._direction = np.array([joint.direction for joint in robot.joints], float)
         self._zero = np.array([joint.zero for joint in robot.joints])
-        self._delay = np.maximum([servo.command_delay - _cycle(robot) for servo in robot.servos], 0.0)
         self.reset()
 
     def reset(self) -> None:
         """New motors, cold, for a plant that was just reset."""
         plant = self.plant
-        self.firmware = Firmware(self.robot.servos, plant.constant, plant.resistance, self._delay)
+        steps = np.ceil(plant.body.command_delay / TIMESTEP - 1e-6)  # as in simulation, goals act from whole steps on
+        delay = max(float(steps) * TIMESTEP - _cycle(self.robot), 0.0)
+        self.firmware = Firmware(self.robot.servos, plant.constant, plant.resistance, delay)
         self.firmware.set_stiffness(plant.stiffness)
         self.open_circuit = plant.body.voltage  # V of the battery at rest with the servos idle
         self.sag = 0.0  # V below that: a fault

@@ -88,19 +88,22 @@ def test_the_truth_is_asked_for_once_an_instant(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_seed_draws_the_same_robot_as_in_simulation() -> None:
-    """What a robot at rest shows of its draw: its battery's voltage and its gyro's bias about the vertical."""
+    """What a robot shows of its draw: battery voltage, the gyro's bias about the vertical, how late its head obeys."""
+    turned = ROBOT.home.copy()
+    turned[ROBOT.names.index("head_pan")] = 0.5
     shown = []
     for make in (SimBackend, VirtualBackend):
         for seed in (3, 4):
             body = make(ROBOT, seed=seed, randomise=True)
             sensors, motors = body.connect()
-            start, seen = body.clock.now_ns(), []
-            for tick in range(1, 81):
+            start, seen, head = body.clock.now_ns(), [], []
+            for tick in range(1, 86):
                 body.clock.sleep_until(start + tick * TICK)
                 seen.append(sensors.read())
-                motors.write(HOME)
-            turn = np.mean([o.angular_velocity[2] for o in seen[50:]])
-            shown.append((float(np.nanmedian(seen[-1].voltage)), float(turn)))
+                head.append(body.truth.joints[0, ROBOT.names.index("head_pan")])
+                motors.write(HOME if tick <= 80 else replace(HOME, position=turned))
+            turn = np.mean([o.angular_velocity[2] for o in seen[50:80]])
+            shown.append((float(np.nanmedian(seen[79].voltage)), float(turn), *head[80:]))
             body.close()
     sim, other_sim, virtual, other_virtual = shown
     assert virtual == pytest.approx(sim, abs=0.002)
