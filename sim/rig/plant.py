@@ -86,7 +86,7 @@ class Plant:
         data.qvel[:] = 0.0
         data.qpos[self._qpos] = pose - self.body.zero
         data.qpos[0:2] = 0.0
-        height, data.qpos[3:7] = self._legs.stand(pose)
+        height, data.qpos[3:7] = self._legs.stand(pose - self.body.zero)
         data.qpos[2] = height + CLEARANCE
         self.held = True
         self._play = data.qpos[self._qpos].copy()
@@ -100,7 +100,7 @@ class Plant:
     def release(self) -> None:
         """Put the held robot on its feet where it is, and let go."""
         if self.held:
-            height, self.data.qpos[3:7] = self._legs.stand(self.joints)
+            height, self.data.qpos[3:7] = self._legs.stand(self.data.qpos[self._qpos])
             self.data.qpos[2] = height
             self.data.qvel[0:6] = 0.0
             self.held, self._ticks = False, 0

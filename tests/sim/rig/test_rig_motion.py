@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import mujoco
 import numpy as np
 import pytest
 from rig_host import BOARD, Host
@@ -12,8 +13,10 @@ from hw.dynamixel import codec
 from hw.dynamixel.tables import table
 from hw.hal import Array, Command, Mode
 from hw.imu.mounting import Mounting
+from hw.legs import Legs
 from hw.robot import Robot
 from sim.rig.board import Board
+from sim.rig.plant import Plant
 from sim.rig.rig import Rig
 from sim.worlds import Worlds
 
@@ -73,6 +76,20 @@ def test_torque_on_everywhere_puts_the_robot_on_its_feet(host: Host) -> None:
     host.write_all("torque_enable", [0] * 20)
     host.wait(1.5)
     assert plant.truth.fallen[0], "without torque it collapses"
+
+
+def test_a_robot_is_put_with_its_soles_on_the_floor_whatever_its_encoders_say(robot: Robot) -> None:
+    """Its zeros are off: standing by its encoders it would begin above the floor or in it, and tilted."""
+    plant, legs = Plant(robot), Legs(robot)
+    for seed in range(5):
+        plant.reset(seed, randomise=True)
+        plant.release()
+        true = plant.data.qpos[plant._qpos]
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, plant.data.qpos[3:7])
+        corners = legs.soles(legs.pick(true))[1] @ turn.reshape(3, 3).T + plant.data.qpos[:3]
+        assert corners[..., 2].min() == pytest.approx(0.0, abs=1e-4)
+        assert np.ptp(corners[0, :, 2]) < 1e-4, "the first foot is flat"
 
 
 def test_a_limp_joint_of_a_held_robot_keeps_its_pose(host: Host) -> None:
