@@ -128,12 +128,13 @@ class Firmware:
             if not self.halted[item.servo]:
                 getattr(self, item.name)[item.servo] = item.value
                 self._plan(item.servo)
+        velocity, before = self.mode == VELOCITY, self.reference_speed
         self._follow()
         position = (self.mode >= POSITION) & (self.mode <= CURRENT_POSITION)  # 3, 4 and 5
         limit = np.minimum(self.pwm_limit, np.where(self.mode == PWM, 1.0, np.abs(self.goal_pwm)))
         duty = np.where(position, self._position(angle), 0.0)
-        velocity = self.mode == VELOCITY
         if velocity.any():
+            self._ramp_speed(velocity, before)
             duty = np.where(velocity, self._velocity(speed, limit), duty)
         duty = np.where(self.mode == PWM, self.goal_pwm, duty)
         limited = (self.mode == CURRENT) | (self.mode == CURRENT_POSITION)
@@ -176,13 +177,13 @@ class Firmware:
         self._last_error = error
         return duty
 
-    def _velocity(self, speed: Array, limit: Array) -> Array:
+    def _ramp_speed(self, which: Array, before: Array) -> None:
+        """Advance the speeds of `which` servos from those `before` toward their goals: they follow no position."""
         ramp = self.profile_acceleration * TIMESTEP
-        self.reference_speed = np.where(
-            self.mode == VELOCITY,
-            self.reference_speed + np.clip(self.goal_velocity - self.reference_speed, -ramp, ramp),
-            self.reference_speed,
-        )
+        speed = before + np.clip(self.goal_velocity - before, -ramp, ramp)
+        self.reference_speed = np.where(which, speed, self.reference_speed)
+
+    def _velocity(self, speed: Array, limit: Array) -> Array:
         error = self.reference_speed - speed
         integral = self._velocity_integral + self.velocity_i * error * TIMESTEP
         self._velocity_integral = np.where(self.powered, np.clip(integral, -limit, limit), 0.0)

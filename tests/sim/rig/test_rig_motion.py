@@ -114,6 +114,20 @@ def test_velocity_mode_reaches_and_holds_a_speed(host: Host) -> None:
     assert abs(host.read(PAN, "present_velocity")) <= 2
 
 
+def test_velocity_mode_speeds_up_as_its_profile_says(host: Host) -> None:
+    """5 units are 1.87 rad/s2. It moves beside servos in position mode, whose profile is another matter."""
+    rad = 0.229 * 2 * math.pi / 60
+    host.write(PAN, "operating_mode", 1)
+    host.write(PAN, "profile_acceleration", 5)
+    host.write(PAN, "torque_enable", 1)
+    host.write(PAN, "goal_velocity", round(2.0 / rad))
+    host.wait(0.5)
+    assert 0.4 < host.read(PAN, "present_velocity") * rad < 1.0, "friction is still to be overcome"
+    assert host.read(PAN, "velocity_trajectory") * rad == pytest.approx(0.94, abs=0.1)
+    host.wait(1.0)
+    assert host.read(PAN, "present_velocity") * rad == pytest.approx(2.0, abs=0.1)
+
+
 def test_pwm_mode_drives_in_proportion_to_the_duty(host: Host) -> None:
     host.write(PAN, "operating_mode", 16)
     host.write(PAN, "torque_enable", 1)
