@@ -16,6 +16,8 @@ from sim.scene import Stage, count_robots
 from sim.truth import Truth
 from sim.worlds import Worlds
 
+OTHERS_STREAM = 2  # distinguishes the other robots' random streams from others of the same seed; 1 is the task's
+
 
 class SimBackend:
     """A robot in MuJoCo. `truth` and `stage` are for evaluation; of them, the loop is only shown what `look` sees.
@@ -32,7 +34,9 @@ class SimBackend:
         self._worlds = Worlds(
             robot, n, threads=1, randomise=float(randomise), model=build(robot, scene), together=n > 1
         )
-        rngs = [np.random.default_rng([seed, number]) for number in range(n)]
+        # numpy pads a seed with zeros: what other streams of this seed are told apart by must not be 0 either.
+        streams = [[seed, 0], *([seed, OTHERS_STREAM, number] for number in range(1, n))]
+        rngs = [np.random.default_rng(stream) for stream in streams]
         places = np.zeros((n, 3))
         if scene is not None and scene.robots is not None:
             places[1:] = scene.robots[:, :3]

@@ -59,7 +59,8 @@ class Plant:
     def reset(self, seed: int, *, episode: int = 0, randomise: bool = False, pose: Array | None = None) -> None:
         """Hold the robot at `pose` (default: home), every draw from the stream of this seed and episode.
 
-        The stream is used as `sim.worlds` uses it: the same seed is the same robot with the same noise.
+        The stream is that of `sim.backend`, used as `sim.worlds` uses it: the same seed is the same robot with the same
+        noise.
         """
         self._rng = np.random.default_rng([seed, episode])
         randomise = self._rng.random() < float(randomise)
