@@ -20,8 +20,9 @@ _FOUND, _FORCE, _NET = 1, 2, 3  # data bits and reduction of MuJoCo's contact se
 def build(robot: Robot, scene: Scene | None = None) -> mujoco.MjModel:
     """Compile the model of `robot` on a floor, with a scene. Actuator i drives joint i of the robot's file.
 
-    The MJCF's own actuators, sensors and keyframes are replaced. Raises ConfigError naming what the MJCF lacks, and
-    ValueError for a scene of other robots and obstacles: what a robot feels is told by its place among robots alone.
+    The MJCF's own actuators, sensors and keyframes are replaced. Raises ConfigError naming what the MJCF lacks or the
+    joint whose servo cannot be simulated beside the others, and ValueError for a scene of other robots and obstacles:
+    what a robot feels is told by its place among robots alone.
     """
     result = spec(robot, robots := count_robots(scene))
     if scene is not None:
@@ -33,6 +34,7 @@ def build(robot: Robot, scene: Scene | None = None) -> mujoco.MjModel:
 
 def spec(robot: Robot, robots: int = 1) -> mujoco.MjSpec:
     """The editable model of so many times `robot`, for scenes that add bodies to it. Raises ConfigError."""
+    _check_delays(robot)
     result = _load(robot)
     result.option.timestep = TIMESTEP
     result.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -84,6 +86,19 @@ def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
     extra = [name for joint in model.joints if (name := joint.name) not in robot.names and joint.type != 0]
     if extra:
         raise ConfigError(f"{path}: joints that robot {robot.name!r} does not list: {', '.join(extra)}")
+
+
+def _check_delays(robot: Robot) -> None:
+    """Refuse servos that differ in what is simulated, and drawn, once for the whole robot."""
+    first = robot.servos[0]
+    for joint, servo in zip(robot.joints, robot.servos, strict=True):
+        for key in ("command_delay", "position_latency"):
+            if getattr(servo, key) != getattr(first, key):
+                raise ConfigError(
+                    f"{robot.name}: {joint.name}: {key} of its servo {servo.name} is {getattr(servo, key):g} s, but that "
+                    f"of {robot.names[0]}'s {first.name} is {getattr(first, key):g} s: simulation has one for all servos "
+                    "of a robot; give both files the same"
+                )
 
 
 def _add_floor(model: mujoco.MjSpec) -> None:
