@@ -18,7 +18,7 @@ from hw.legs import Legs
 from hw.robot import Robot
 from sim.crowd import Crowd
 from sim.model import TIMESTEP, build
-from sim.randomise import COMMAND_DELAY, LATENCY, Body, draw
+from sim.randomise import Body, draw, longest
 from sim.scene import robot_bodies
 from sim.truth import Truth
 
@@ -67,8 +67,7 @@ class Worlds:
         self._voltage_unit = servos[0].voltage_unit
 
         # Commands that may still be on their way, and samples that may still be on theirs.
-        delay = max(COMMAND_DELAY[1], *(servo.command_delay for servo in servos))
-        latency = max(LATENCY[1], robot.imu.latency, *(servo.position_latency for servo in servos))
+        delay, latency = longest(robot)
         self._delayed = int(np.ceil(delay / robot.dt - 1e-6)) + 1
         self._imu_span = max(round(robot.imu.average / TIMESTEP), 1)
         span = max(2 * self.substeps, round(latency / TIMESTEP) + 1 + self._imu_span)
