@@ -80,7 +80,6 @@ class LocalBackend:
         rig.advance(-(-rig.now_ns // _TOGETHER_NS) * _TOGETHER_NS)
         rig.scenario = Scenario(seed=seed)
         rig.reset(seed, randomise=randomise)
-        rig.take_accepted()
         self._line = LocalLine(rig)
         self.clock: Clock = self._line
         self._body = DynamixelBackend(on_the_board(rig.robot), port=self._line, clock=self._line, name=self.name)

@@ -104,7 +104,8 @@ def _truth(rig: Rig) -> dict[str, Any]:
 
 
 def _accepted(rig: Rig) -> dict[str, Any]:
-    return {"accepted": rig.take_accepted(), "forgotten": rig.forgotten}
+    forgotten = rig.forgotten
+    return {"accepted": rig.take_accepted(), "forgotten": forgotten}
 
 
 def _servos(rig: Rig) -> dict[str, Any]:
