@@ -38,10 +38,15 @@ class Delivery:
         return [word for pair in named for word in pair] + ["--assembly", self.assembly]
 
     def check(self, robot: Robot) -> None:
-        """Raise ConfigError for a joint that the robot has not."""
+        """Raise ConfigError for a joint that the robot has not, and for a bus at a baud that its servos have not."""
         for name in (*self.fresh, *self.only):
             if name not in robot.names:
                 raise ConfigError(f"{robot.name} has no joint '{name}'; {nearest(name, robot.names)}")
+        for servo in robot.servos:
+            bauds = table(servo.model_number).bauds
+            if robot.bus.baud not in bauds:
+                known = ", ".join(map(str, bauds))
+                raise ConfigError(f"{robot.name}: bus.baud: servos have no {robot.bus.baud} bit/s; they have {known}")
 
     def assembled(self, robot: Robot, seed: int) -> Robot:
         """The robot with the zeros and directions of this rig."""
