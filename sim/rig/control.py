@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import select
 import socket
 import subprocess
 import sys
@@ -203,6 +204,8 @@ class RigProcess:
 
     def _first_line(self) -> dict[str, Any]:
         assert self.process.stdout is not None
+        if not select.select([self.process.stdout], [], [], _START_SECONDS)[0]:
+            return {"error": f"nothing was heard of it for {_START_SECONDS:g} s: what else keeps this machine busy?"}
         line = self.process.stdout.readline()
         if not line:
             return {"error": f"ended with code {self.process.wait(_START_SECONDS)}"}

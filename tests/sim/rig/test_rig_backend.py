@@ -13,6 +13,7 @@ from hw.dynamixel.backend import DynamixelBackend
 from hw.hal import BackendError, Command, Mode
 from hw.robot import load_robot
 from sim.backend import SimBackend
+from sim.rig import control
 from sim.rig.backend import VirtualBackend
 from sim.rig.control import RigProcess
 
@@ -150,6 +151,21 @@ def test_ctrl_c_while_it_starts_leaves_no_process(monkeypatch: pytest.MonkeyPatc
         VirtualBackend(ROBOT).connect()
     (process,) = started
     assert process.poll() is not None
+
+
+def test_a_rig_that_hangs_while_it_starts_is_given_up_and_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+    popen = subprocess.Popen
+
+    def hangs(command: list[str], **options: Any) -> Any:
+        started.append(popen(["sleep", "60"], **options))
+        return started[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", hangs)
+    monkeypatch.setattr(control, "_START_SECONDS", 0.2)
+    with pytest.raises(BackendError, match=r"did not start: nothing was heard of it for 0\.2 s"):
+        RigProcess(ROBOT)
+    assert started[0].poll() is not None
 
 
 def test_a_rig_that_died_is_a_bus_error_and_closing_still_ends_it() -> None:
