@@ -95,9 +95,9 @@ def _check_delays(robot: Robot) -> None:
         for key in ("command_delay", "position_latency"):
             if getattr(servo, key) != getattr(first, key):
                 raise ConfigError(
-                    f"{robot.name}: {joint.name}: {key} of its servo {servo.name} is {getattr(servo, key):g} s, but that "
-                    f"of {robot.names[0]}'s {first.name} is {getattr(first, key):g} s: simulation has one for all servos "
-                    "of a robot; give both files the same"
+                    f"{robot.name}: {joint.name}: {key} of its servo {servo.name} is {getattr(servo, key):g} s, "
+                    f"that of {robot.names[0]}'s {first.name} {getattr(first, key):g} s: simulation has one for all "
+                    "servos of a robot; give both files the same"
                 )
 
 

@@ -56,18 +56,13 @@ class Control:
         self._file.close()
         self._stream.close()
 
-    def reset(self, seed: int, *, episode: int = 0, randomise: bool = False, pose: Array | None = None) -> None:
-        """A rig as delivered, without power, held at `pose` (default: home)."""
-        joints = None if pose is None else np.asarray(pose).tolist()
-        self.call("reset", seed=seed, episode=episode, randomise=randomise, pose=joints)
-
-    def release(self) -> None:
-        """Put the robot on its feet now. By itself it is let go when all servos have torque."""
-        self.call("release")
+    def reset(self, seed: int, *, randomise: bool = False) -> None:
+        """A rig as delivered, without power, held at home. It is let go when all servos have torque."""
+        self.call("reset", seed=seed, randomise=randomise)
 
     def hold(self) -> None:
-        """Keep holding the robot when all servos have torque, until `release` or a reset."""
-        self.call("hold", auto_release=False)
+        """Keep holding the robot when all servos have torque, until a reset."""
+        self.call("hold")
 
     def push(self, velocity: Array) -> None:
         """Change the base's velocity by `(2,)` m/s, world frame."""

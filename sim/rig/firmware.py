@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hw.faults import INPUT_VOLTAGE, OVERHEATING, OVERLOAD
 from hw.hal import Array
 from hw.robot import Servo
 from sim.model import TIMESTEP
 
 CURRENT, VELOCITY, POSITION, EXTENDED, CURRENT_POSITION, PWM = 0, 1, 3, 4, 5, 16
-VOLTAGE_ERROR, OVERHEATING, ENCODER_ERROR, SHOCK, OVERLOAD = 1, 4, 8, 16, 32  # bits of the hardware error
 
 FULL_PWM = 885.0  # PWM counts of full duty
 _SAMPLE = 0.001  # s, the firmware's own period, which its I and D gains are per
@@ -40,7 +40,8 @@ class Firmware:
     """State and control laws of `n` servos. Angles rad, speeds rad/s, currents A, output as duty -1..1.
 
     Law (e-Manual, with the datasheet's gain replaced by the one identified for the servo): duty = Kp e + Ki integral
-    of e + Kd de/dt + feed-forward, limited by goal PWM, then by current, then by the supply.
+    of e + Kd de/dt + feed-forward of speed, limited by goal PWM, then by current, then by the supply. That of
+    acceleration, the register `feedforward_2nd_gain`, has no effect.
     """
 
     def __init__(self, servos: tuple[Servo, ...], constant: Array, resistance: Array, delay: float) -> None:
@@ -61,7 +62,7 @@ class Firmware:
             return np.zeros(n)
 
         self.powered, self.mode = np.zeros(n, bool), np.full(n, POSITION)
-        self.p, self.i, self.d, self.ff_velocity, self.ff_acceleration = (zeros() for _ in range(5))
+        self.p, self.i, self.d, self.ff_velocity = (zeros() for _ in range(4))
         self.velocity_p, self.velocity_i = zeros(), zeros()  # duty per rad/s, duty per rad
         self.pwm_limit, self.goal_pwm = np.ones(n), np.ones(n)
         self.current_limit, self.goal_current = np.full(n, np.inf), zeros()
@@ -75,7 +76,6 @@ class Firmware:
         self.voltage_range = np.tile([0.0, np.inf], (n, 1))
         self.duty, self.current = zeros(), zeros()  # outputs of the newest step
         self.winding, self.case = np.full(n, AMBIENT), np.full(n, AMBIENT)
-        self.heat = zeros()  # W from elsewhere: a fault
         self._integral, self._velocity_integral, self._stalled = zeros(), zeros(), zeros()
         self._last_error = zeros()
         self._cruise, self._ramp = np.full(n, np.inf), np.full(n, np.inf)
@@ -206,7 +206,7 @@ class Firmware:
     def settle(self, torque: Array, speed: Array, supply: float) -> Array:
         """After the physics step: heat and protections. Returns the current that each servo draws [A]."""
         self.current = torque / self.torque_per_ampere
-        loss = self.current**2 * self._winding + self.heat
+        loss = self.current**2 * self._winding
         flow = (self.winding - self.case) / _WINDING_TO_CASE
         self.winding += TIMESTEP * (loss - flow) / _WINDING_CAPACITY
         self.case += TIMESTEP * (flow - (self.case - AMBIENT) / _CASE_TO_AIR) / _CASE_CAPACITY
@@ -215,5 +215,5 @@ class Firmware:
         error = self.injected | np.where(self.winding > self.temperature_limit, OVERHEATING, 0)
         error |= np.where(self._stalled > _STALL_SECONDS, OVERLOAD, 0)
         outside = (supply < self.voltage_range[:, 0]) | (supply > self.voltage_range[:, 1])
-        self.error |= error | np.where(outside, VOLTAGE_ERROR, 0)
+        self.error |= error | np.where(outside, INPUT_VOLTAGE, 0)
         return np.maximum(self.duty * self.current, 0.0)

@@ -11,11 +11,10 @@ from hw.robot import Robot
 from sim.model import TIMESTEP
 from sim.rig.firmware import Firmware
 from sim.rig.plant import Plant
+from sim.rig.wire import FRAME_BITS
 
 BATTERY_RESISTANCE = 0.04  # Ohm: a 3S pack of the size that fits such a robot, with its wires
-IDLE_CURRENT = 0.04  # A that a servo draws without turning: XM430 datasheet's standby
 STEP_NS = round(TIMESTEP * 1e9)
-FRAME_BITS = 10  # of a byte on the wire
 
 
 class Sample(NamedTuple):
@@ -50,7 +49,6 @@ class Motors:
         self.open_circuit = plant.body.voltage  # V of the battery at rest with the servos idle
         self.sag = 0.0  # V below that: a fault
         self.supply = self.open_circuit
-        self.current = IDLE_CURRENT * len(self._zero)  # A drawn by all servos
         self.steps = 0  # samples taken
         self.sense()
 
@@ -69,7 +67,6 @@ class Motors:
         volts = firmware.step(now_ns, angle, speed, self.supply)
         plant.step(self._direction * volts, firmware.powered, self.supply)
         draw = firmware.settle(self._direction * plant.torque, self._direction * plant.joint_speed, self.supply)
-        self.current = float(draw.sum()) + IDLE_CURRENT * firmware.n
         self.supply = max(self.open_circuit - self.sag - BATTERY_RESISTANCE * float(draw.sum()), 0.0)
         self.sense()
 

@@ -50,14 +50,9 @@ def find(name: str, rig: Rig) -> Callable[..., dict[str, Any]]:
     return partial(_OPERATIONS[name], rig)
 
 
-def _release(rig: Rig) -> dict[str, Any]:
-    rig.plant.release()
-    return {}
-
-
-def _hold(rig: Rig, auto_release: bool) -> dict[str, Any]:
-    """Whether the robot is let go as soon as all servos have torque, or only by `release`."""
-    rig.auto_release = auto_release
+def _hold(rig: Rig) -> dict[str, Any]:
+    """The robot is not let go when all servos have torque, until a reset."""
+    rig.auto_release = False
     return {}
 
 
@@ -118,7 +113,6 @@ def _statistics(rig: Rig) -> dict[str, Any]:
 
 
 _OPERATIONS: dict[str, Callable[..., dict[str, Any]]] = {
-    "release": _release,
     "hold": _hold,
     "push": _push,
     "furnish": _furnish,

@@ -56,13 +56,13 @@ class Plant:
         self.truth = Truth(self.model, robot, self.data.qpos[None], self.data.qvel[None], self.data.sensordata[None])
         self.reset(0)
 
-    def reset(self, seed: int, *, episode: int = 0, randomise: bool = False, pose: Array | None = None) -> None:
-        """Hold the robot at `pose` (default: home), every draw from the stream of this seed and episode.
+    def reset(self, seed: int, *, randomise: bool = False) -> None:
+        """Hold the robot at home, every draw from the stream of this seed.
 
         The stream is that of `sim.backend`, used as `sim.worlds` uses it: the same seed is the same robot with the same
         noise.
         """
-        self._rng = np.random.default_rng([seed, episode])
+        self._rng = np.random.default_rng([seed, 0])
         randomise = self._rng.random() < float(randomise)
         self.body: Body = draw(self._rng, self.robot, self._bodies, randomise)
         self.stiffness = self.body.stiffness / self.robot.servos[0].stiffness  # factor on every servo's
@@ -74,12 +74,12 @@ class Plant:
         mujoco.mj_setConst(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
         self.held, self._noise_block, self._ticks = True, -1, 0
-        self._idle_rng = np.random.default_rng([seed, episode, 1])  # while held: the episode's stream waits
+        self._idle_rng = np.random.default_rng([seed, 0, 1])  # while held: the episode's stream waits
         self._idle = self._idle_rng.standard_normal(6 + len(self.robot.joints))
         self._joint_age = round(self.body.joint_latency / TIMESTEP)
         self._imu_age = max(round(self.body.imu_latency / TIMESTEP) - 1, 0)  # sensor data is a substep old already
         self._imu_span = max(round(self.robot.imu.average / TIMESTEP), 1)
-        self.place(self.robot.home if pose is None else pose)
+        self.place(self.robot.home)
 
     def place(self, pose: Array) -> None:
         """Move the joints to `pose` as by hand, and hold the robot there, still and with its history still."""

@@ -68,9 +68,9 @@ class Rig:
         self.wire = Wire()
         self.reset(seed, randomise=randomise)
 
-    def reset(self, seed: int, *, episode: int = 0, randomise: bool = False, pose: Array | None = None) -> None:
-        """A rig as delivered, its power off, held at `pose` (default: home); time goes on, faults begin anew."""
-        self.plant.reset(seed, episode=episode, randomise=randomise, pose=pose)
+    def reset(self, seed: int, *, randomise: bool = False) -> None:
+        """A rig as delivered, its power off, held at home; time goes on, faults begin anew."""
+        self.plant.reset(seed, randomise=randomise)
         self.motors.reset()
         self.auto_release = True  # onto its feet as soon as all servos have torque
         baud, self.wire = self.wire.host_baud, Wire()
