@@ -65,7 +65,9 @@ def scene_sensors(model: mujoco.MjModel) -> Array:
 
 
 def plain(scene: Scene) -> dict[str, Any]:
-    """A scene as JSON values."""
+    """A scene as JSON values. Raises ValueError for one of several robots."""
+    if scene.robots is not None:
+        raise ValueError("a virtual rig has one robot, and this scene has others")
     goal = None if scene.goal is None else scene.goal.tolist()
     return {"pillars": scene.pillars.tolist(), "spheres": scene.spheres.tolist(), "goal": goal}
 

@@ -112,5 +112,5 @@ class Truth:
 
     @property
     def touching(self) -> Array:
-        """Whether each body touches an obstacle of the scene `(n,)`."""
+        """Whether each body touches an obstacle of the scene, or another robot `(n,)`."""
         return np.any(self._sensors[:, self._scene] > 0, axis=-1)

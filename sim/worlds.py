@@ -189,7 +189,7 @@ class Worlds:
         self._mocap[world] = places
 
     def observe(self) -> Observation:
-        """What the rig's sensors say now: delayed, quantised, biased and noisy."""
+        """What the rig's sensors say now: delayed, biased and noisy, and quantised but for those of the IMU."""
         rows, last = np.arange(self.n), self._record["qpos"].shape[1] - 1
         noise = self._draw_noise()
         at = last - self._joint_age

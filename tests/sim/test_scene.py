@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +99,8 @@ def test_a_scene_survives_its_way_to_a_rig() -> None:
     np.testing.assert_array_equal(back.pillars, scene.pillars)
     np.testing.assert_array_equal(back.goal, scene.goal)
     assert back.spheres.shape == (0, 4)
+    with pytest.raises(ValueError, match="has one robot"):  # whoever waits for the others would wait for ever
+        plain(replace(scene, robots=np.zeros((1, 5))))
 
 
 def test_pillars_and_spheres_are_drawn() -> None:
