@@ -11,10 +11,10 @@ from hw.config import ConfigError
 from hw.hal import Scene
 from hw.robot import Robot, Servo
 from sim.crowd import add_others, prefix
-from sim.scene import PREFIX, add_scene, count_robots
+from sim.scene import FOUND, PREFIX, add_scene, count_robots
 
 TIMESTEP = 0.004  # s
-_FOUND, _FORCE, _NET = 1, 2, 3  # data bits and reduction of MuJoCo's contact sensor
+_FORCE, _NET = 2, 3  # data bit beside FOUND, and reduction, of MuJoCo's contact sensor
 
 
 def build(robot: Robot, scene: Scene | None = None) -> mujoco.MjModel:
@@ -172,16 +172,16 @@ def _add_sensors(model: mujoco.MjSpec, robot: Robot, number: int, robots: int) -
     add("gyro", kind.mjSENS_GYRO, obj.mjOBJ_SITE, own + robot.imu_site)
     add("accelerometer", kind.mjSENS_ACCELEROMETER, obj.mjOBJ_SITE, own + robot.imu_site)
     whole = {"reftype": obj.mjOBJ_XBODY, "refname": own + robot.base}
-    add("floor", kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, "floor", intprm=[_FOUND, 0, 1], **whole)
+    add("floor", kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, "floor", intprm=[FOUND, 0, 1], **whole)
     for name, foot in robot.feet.items():
         body = model.geom(own + foot.geoms[0]).parent
         site = f"{name}_foot"
         body.add_site(name=own + site, pos=foot.sole, group=4)
         sole = {"reftype": obj.mjOBJ_BODY, "refname": body.name}
-        add(f"{name}_contact", kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, "floor", intprm=[_FOUND | _FORCE, _NET, 1], **sole)
+        add(f"{name}_contact", kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, "floor", intprm=[FOUND | _FORCE, _NET, 1], **sole)
         add(f"{name}_position", kind.mjSENS_FRAMEPOS, obj.mjOBJ_SITE, own + site)
         add(f"{name}_velocity", kind.mjSENS_FRAMELINVEL, obj.mjOBJ_SITE, own + site)
         add(f"{name}_up", kind.mjSENS_FRAMEZAXIS, obj.mjOBJ_SITE, own + site)
     for other in (i for i in range(robots) if i != number):  # of the scene's sensors: what it touches beside the floor
         base = prefix(other) + robot.base
-        add(f"{PREFIX}robot{other}", kind.mjSENS_CONTACT, obj.mjOBJ_XBODY, base, intprm=[_FOUND, 0, 1], **whole)
+        add(f"{PREFIX}robot{other}", kind.mjSENS_CONTACT, obj.mjOBJ_XBODY, base, intprm=[FOUND, 0, 1], **whole)
