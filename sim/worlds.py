@@ -96,7 +96,9 @@ class Worlds:
         self._fresh = {key: value[:, -self.substeps :].copy() for key, value in self._record.items()}
         self.ticks = np.zeros(n, int)  # since each world's reset
         self.tick = 0
-        self.truth = Truth(self.model, robot, self._state_qpos, self._state_qvel, self._sensors)
+        self.truth = Truth(
+            self.model, robot, self._state_qpos, self._state_qvel, self._sensors, self._fresh["sensordata"]
+        )
 
     def reset(
         self,
@@ -129,6 +131,7 @@ class Worlds:
         self._play[ids] = pose - self._zero[ids]
         for key, value in self._record.items():
             value[ids] = self.batch.bind(key)[ids][:, None]
+        self._fresh["sensordata"][ids] = self._sensors[ids][:, None]
         # The limp body has just been put down; its sensors have read a standing one for long.
         self._record["sensordata"][ids, :, 0:3] = 0.0
         self._record["sensordata"][ids, :, 3:6] = -_GRAVITY * self.truth.gravity[ids][:, None]

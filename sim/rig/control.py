@@ -17,7 +17,7 @@ from hw.hal import Array, BackendError, Scene
 from hw.robot import Robot, load_robot, save_robot
 from sim.model import build
 from sim.rig.delivery import Delivery
-from sim.scene import plain
+from sim.scene import plain, scene_sensors
 from sim.truth import Truth
 
 _START_SECONDS = 60.0
@@ -135,13 +135,16 @@ class RigTruth:
             "qvel": np.zeros((1, model.nv)),
             "sensordata": np.zeros((1, model.nsensordata)),
         }
-        self._truth = Truth(model, robot, *self._arrays.values())
+        self._recent, self._scene = np.zeros((1, 1, model.nsensordata)), scene_sensors(model)
+        qpos, qvel, sensors = self._arrays.values()
+        self._truth = Truth(model, robot, qpos, qvel, sensors, self._recent)
 
     def fetch(self) -> Truth:
         """The truth of now; a later call changes what this one returned."""
         answer = self._control.call("truth")
         for name, array in self._arrays.items():
             array[0] = answer[name]
+        self._recent[..., self._scene] = answer["touches"]
         return self._truth
 
 

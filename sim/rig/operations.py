@@ -95,7 +95,7 @@ def _inject(rig: Rig, fault: dict[str, Any]) -> dict[str, Any]:
 def _truth(rig: Rig) -> dict[str, Any]:
     plant = rig.plant
     values = {name: getattr(plant.data, name).tolist() for name in ("qpos", "qvel", "sensordata")}
-    return {**values, "held": plant.held}
+    return {**values, "touches": plant.touches.tolist(), "held": plant.held}
 
 
 def _accepted(rig: Rig) -> dict[str, Any]:

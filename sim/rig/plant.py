@@ -15,7 +15,7 @@ from hw.legs import Legs
 from hw.robot import Robot
 from sim.model import TIMESTEP, build
 from sim.randomise import Body, draw
-from sim.scene import robot_bodies
+from sim.scene import robot_bodies, scene_sensors
 from sim.truth import Truth
 
 CLEARANCE = 0.05  # m between the soles and the floor while the robot is held
@@ -41,7 +41,7 @@ class Plant:
         robot = self.robot
         self.model = build(robot, scene)
         self.data = mujoco.MjData(self.model)
-        self._bodies = robot_bodies(self.model)
+        self._bodies, self._scene = robot_bodies(self.model), scene_sensors(self.model)
         joints = [self.model.joint(name) for name in robot.names]
         self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
@@ -53,7 +53,9 @@ class Plant:
         self.model.actuator_gainprm[:, _KP] = self.constant / self.resistance
         self._braking = np.array([servo.braking_torque for servo in robot.servos])
         self._noise = np.zeros((_NOISE_ROWS, 6 + len(joints)))
-        self.truth = Truth(self.model, robot, self.data.qpos[None], self.data.qvel[None], self.data.sensordata[None])
+        self._recent = np.zeros((max(round(robot.dt / TIMESTEP), 1), self.model.nsensordata))  # of the last tick
+        views = (view[None] for view in (self.data.qpos, self.data.qvel, self.data.sensordata, self._recent))
+        self.truth = Truth(self.model, robot, *views)
         self.reset(0)
 
     def reset(self, seed: int, *, randomise: bool = False) -> None:
@@ -94,7 +96,7 @@ class Plant:
         self._force = np.zeros((self._joint_age + 1, self.model.nu))
         self._angle = np.repeat(self._play[None], self._joint_age + 1, 0)
         self._speed = np.zeros_like(self._angle)
-        mujoco.mj_forward(self.model, data)
+        self._forward()
         gravity = -self.truth.gravity[0] * -self.model.opt.gravity[2]
         self._imu = np.repeat(np.concatenate([np.zeros(3), gravity])[None], self._imu_age + self._imu_span, 0)
 
@@ -105,7 +107,12 @@ class Plant:
             self.data.qpos[2] = height
             self.data.qvel[0:6] = 0.0
             self.held, self._ticks = False, 0
-            mujoco.mj_forward(self.model, self.data)
+            self._forward()
+
+    def _forward(self) -> None:
+        """Sense the body where it was put."""
+        mujoco.mj_forward(self.model, self.data)
+        self._recent[:] = self.data.sensordata
 
     def step(self, volts: Array, powered: Array, supply: float) -> None:
         """Advance by one `TIMESTEP` with `volts` across the windings of `powered` servos; the rest turn freely."""
@@ -130,6 +137,7 @@ class Plant:
         _push(self._angle, self._play)
         _push(self._speed, data.qvel[self._dof])
         _push(self._force, data.actuator_force)
+        _push(self._recent, data.sensordata)
         if not self.held:
             _push(self._imu, data.sensordata[:6])
 
@@ -145,6 +153,11 @@ class Plant:
     def joints(self) -> Array:
         """True joint angles as an ideal encoder would show them, mounted as this robot's are [rad]."""
         return self.data.qpos[self._qpos] + self.body.zero
+
+    @property
+    def touches(self) -> Array:
+        """Contacts of the scene's sensors within the last tick `(n,)`."""
+        return self._recent[:, self._scene].max(0)
 
     @property
     def joint_speed(self) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hw.dynamixel.backend import DynamixelBackend
-from hw.hal import BackendError, Command, Mode
+from hw.hal import BackendError, Command, Mode, Scene
 from hw.robot import load_robot
 from sim.backend import SimBackend
 from sim.rig import control
@@ -86,6 +86,14 @@ def test_the_truth_is_asked_for_once_an_instant(monkeypatch: pytest.MonkeyPatch)
     _ = body.truth.angular_velocity
     body.close()
     assert [op for op in asked if op in ("truth", "push")] == ["truth", "truth", "push", "truth"]
+
+
+@pytest.mark.parametrize(("ahead", "touching"), [(0.10, True), (0.30, False)])
+def test_whether_it_touches_the_scene_is_told_by_the_rig(ahead: float, touching: bool) -> None:
+    body = VirtualBackend(ROBOT, scene=Scene(np.array([[ahead, 0.0, 0.05]]), np.zeros((0, 4))))
+    body.connect()
+    assert body.truth.touching.tolist() == [touching]
+    body.close()
 
 
 def test_a_seed_draws_the_same_robot_as_in_simulation() -> None:
