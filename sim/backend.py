@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hw.hal import Array, Command, Mode, Observation, Percept, Scene, State
+from hw.hal import Array, Command, Mode, Observation, Percept, Scene, State, World
 from hw.robot import Robot
 from sim.model import build
 from sim.scene import Stage, count_robots
@@ -139,7 +139,7 @@ class OtherClock:
 class SimSensors:
     """Reads the sensors of a body of the world. Reading twice within a tick draws noise once."""
 
-    def __init__(self, worlds: Worlds, number: int) -> None:
+    def __init__(self, worlds: World, number: int) -> None:
         self._worlds, self._number = worlds, number
 
     def read(self) -> Observation:
