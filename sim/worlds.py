@@ -15,15 +15,15 @@ from mujoco.batch import Batch
 from hw.config import ConfigError
 from hw.hal import Array, Command, Mode, Observation
 from hw.legs import Legs
-from hw.robot import Robot
+from hw.robot import Imu, Robot
 from sim.crowd import Crowd
 from sim.model import TIMESTEP, build
 from sim.randomise import Body, draw, longest
 from sim.scene import robot_bodies
 from sim.truth import Truth
 
-_NOISE_ROWS = 64  # ticks of sensor noise drawn at a time
-_VELOCITY_NOISE = 0.02  # rad/s, standard deviation, before quantisation
+NOISE_ROWS = 64  # ticks of sensor noise drawn at a time
+VELOCITY_NOISE = 0.02  # rad/s, standard deviation, before quantisation
 _GRAVITY = 9.81  # m/s2
 _KP, _VMAX = 4, 7  # indices in a dcmotor's gainprm
 
@@ -88,7 +88,7 @@ class Worlds:
         self._delay, self._joint_age, self._imu_age = np.zeros(n), np.zeros(n, int), np.zeros(n, int)
         self._zero, self._backlash = np.zeros((n, nj)), np.zeros((n, 1))
         self._gyro_bias, self._acc_bias, self._tilt = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2))
-        self._noise, self._noise_block = np.zeros((n, _NOISE_ROWS, 6 + nj)), np.full(n, -1)
+        self._noise, self._noise_block = np.zeros((n, NOISE_ROWS, 6 + nj)), np.full(n, -1)
         self._commands = np.zeros((n, self._delayed, nj))  # oldest first
         self._play = np.zeros((n, nj))
         recorded = ("qpos", "qvel", "sensordata", "actuator_force")
@@ -199,14 +199,12 @@ class Worlds:
         q = self._record["qpos"][rows, at][:, self._qpos]
         self._play = np.clip(self._play, q - self._backlash / 2, q + self._backlash / 2)
         position = np.round((self._play + self._zero) / self._tick_angle) * self._tick_angle
-        speed = self._record["qvel"][rows, at][:, self._dof] + _VELOCITY_NOISE * noise[:, 6:]
+        speed = self._record["qvel"][rows, at][:, self._dof] + VELOCITY_NOISE * noise[:, 6:]
         velocity = np.round(speed / self._velocity_unit) * self._velocity_unit
         effort = np.round(self._record["actuator_force"][rows, at] / self._unit) * self._unit
         span = last - self._imu_age[:, None] - np.arange(self._imu_span)
         imu = self._record["sensordata"][rows[:, None], span, :6].mean(1)
-        errors = self.robot.imu
-        gyro = _tilt(imu[:, 0:3], self._tilt) + self._gyro_bias + errors.gyro_noise * noise[:, 0:3]
-        force = _tilt(imu[:, 3:6], self._tilt) + self._acc_bias + errors.accelerometer_noise * noise[:, 3:6]
+        gyro, force = with_errors(imu, noise, self.robot.imu, self._tilt, self._gyro_bias, self._acc_bias)
         shape = position.shape
         voltage = np.round(self._supply / self._voltage_unit) * self._voltage_unit
         return Observation(
@@ -229,17 +227,29 @@ class Worlds:
 
         A second call within a tick gives the same.
         """
-        block, row = np.divmod(self.ticks, _NOISE_ROWS)
+        block, row = np.divmod(self.ticks, NOISE_ROWS)
         for i in np.flatnonzero(block != self._noise_block):
             self._rngs[i].standard_normal(out=self._noise[i])
         self._noise_block[:] = block
         return self._noise[np.arange(self.n), row]
 
 
+def with_errors(
+    imu: Array, noise: Array, errors: Imu, tilt: Array, gyro_bias: Array, force_bias: Array
+) -> tuple[Array, Array]:
+    """Angular velocity and specific force, `(..., 3)` each, as an IMU errs about the true `imu` `(..., 6)`.
+
+    `noise` `(..., 6)`, or longer, is standard normal; `tilt` `(..., 2)` are small mounting errors about x and y [rad].
+    """
+    gyro = _tilt(imu[..., 0:3], tilt) + gyro_bias + errors.gyro_noise * noise[..., 0:3]
+    force = _tilt(imu[..., 3:6], tilt) + force_bias + errors.accelerometer_noise * noise[..., 3:6]
+    return gyro, force
+
+
 def _tilt(vector: Array, angles: Array) -> Array:
-    """Turn `(n, 3)` by small angles `(n, 2)` about x and y."""
-    x, y = angles[:, 0], angles[:, 1]
-    return vector + np.stack([y * vector[:, 2], -x * vector[:, 2], x * vector[:, 1] - y * vector[:, 0]], -1)
+    """Turn `(..., 3)` by small angles `(..., 2)` about x and y."""
+    x, y = angles[..., 0], angles[..., 1]
+    return vector + np.stack([y * vector[..., 2], -x * vector[..., 2], x * vector[..., 1] - y * vector[..., 0]], -1)
 
 
 def _headed(orientation: Array, heading: Array) -> Array:

@@ -17,10 +17,9 @@ from sim.model import TIMESTEP, build
 from sim.randomise import Body, draw
 from sim.scene import robot_bodies, scene_sensors
 from sim.truth import Truth
+from sim.worlds import NOISE_ROWS, VELOCITY_NOISE, with_errors
 
 CLEARANCE = 0.05  # m between the soles and the floor while the robot is held
-_NOISE_ROWS = 64
-_VELOCITY_NOISE = 0.02  # rad/s, as in sim.worlds
 _R, _K, _KP, _VMAX = 0, 1, 4, 7  # indices in a dcmotor's gainprm
 
 
@@ -52,7 +51,7 @@ class Plant:
         self.constant = self.model.actuator_gainprm[:, _K].copy()  # V s/rad
         self.model.actuator_gainprm[:, _KP] = self.constant / self.resistance
         self._braking = np.array([servo.braking_torque for servo in robot.servos])
-        self._noise = np.zeros((_NOISE_ROWS, 6 + len(joints)))
+        self._noise = np.zeros((NOISE_ROWS, 6 + len(joints)))
         self._recent = np.zeros((max(round(robot.dt / TIMESTEP), 1), self.model.nsensordata))  # of the last tick
         views = (view[None] for view in (self.data.qpos, self.data.qvel, self.data.sensordata, self._recent))
         self.truth = Truth(self.model, robot, *views)
@@ -172,23 +171,22 @@ class Plant:
     @property
     def encoder(self) -> tuple[Array, Array, Array]:
         """What the servos have measured by now: angle [rad], speed [rad/s] with noise, torque [N m]."""
-        noise = _VELOCITY_NOISE * self._row()[6:]
+        noise = VELOCITY_NOISE * self._row()[6:]
         return self._angle[0] + self.body.zero, self._speed[0] + noise, self._force[0]
 
     @property
     def imu(self) -> Array:
         """Angular velocity [rad/s] and specific force [m/s2] `(6,)` in the base frame, with the board's errors."""
-        mean, noise, errors = self._imu[: self._imu_span].mean(0), self._row()[:6], self.robot.imu
-        gyro = _tilt(mean[:3], self.body.imu_tilt) + self.body.gyro_bias + errors.gyro_noise * noise[:3]
-        force = _tilt(mean[3:], self.body.imu_tilt) + self.body.accelerometer_bias
-        return np.concatenate([gyro, force + errors.accelerometer_noise * noise[3:]])
+        mean, body = self._imu[: self._imu_span].mean(0), self.body
+        errors = self.robot.imu, body.imu_tilt, body.gyro_bias, body.accelerometer_bias
+        return np.concatenate(with_errors(mean, self._row(), *errors))
 
     def _row(self) -> Array:
         """Standard normal noise `(6 + n_joints,)` of this control tick: a second read within it gives the same."""
         if self.held:
             return self._idle
         tick = int(self._ticks * TIMESTEP / self.robot.dt + 1e-6)
-        block, row = divmod(tick, _NOISE_ROWS)
+        block, row = divmod(tick, NOISE_ROWS)
         if block != self._noise_block:
             self._rng.standard_normal(out=self._noise)
             self._noise_block = block
@@ -198,9 +196,3 @@ class Plant:
 def _push(history: Array, newest: Array) -> None:
     history[:-1] = history[1:]
     history[-1] = newest
-
-
-def _tilt(vector: Array, angles: Array) -> Array:
-    """Turn `(3,)` by small angles `(2,)` about x and y."""
-    x, y = angles
-    return vector + np.array([y * vector[2], -x * vector[2], x * vector[1] - y * vector[0]])
