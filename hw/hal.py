@@ -199,7 +199,7 @@ class Truth(Protocol):
 
     @property
     def touching(self) -> Array:
-        """Whether each body touches an obstacle of the scene, or another robot `(n,)`."""
+        """Whether each body touches an obstacle of the scene, or another robot, or did within the last tick `(n,)`."""
         ...
 
 

@@ -74,7 +74,7 @@ def _check_derating(robot: Robot, marks: Marks) -> None:
 
 def _check_imu(robot: Robot, marks: Marks) -> None:
     imu = robot.imu
-    for key in ("gyro_noise", "gyro_bias", "accelerometer_noise", "accelerometer_bias", "latency"):
+    for key in ("gyro_noise", "gyro_bias", "accelerometer_noise", "accelerometer_bias", "average", "latency"):
         _require_not_negative(getattr(imu, key), f"imu.{key}", marks)
     _require_positive(imu.baud, "imu.baud", marks)
     for i, sign in enumerate((*imu.signs, imu.yaw_sign)):

@@ -9,12 +9,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hw.hal import Array, Command, Mode, Observation, Percept, Scene, State
+from hw.hal import Array, Command, Mode, Observation, Percept, Scene, State, World
 from hw.robot import Robot
 from sim.model import build
 from sim.scene import Stage, count_robots
 from sim.truth import Truth
 from sim.worlds import Worlds
+
+OTHERS_STREAM = 2  # distinguishes the other robots' random streams from others of the same seed; 1 is the task's
 
 
 class SimBackend:
@@ -32,7 +34,9 @@ class SimBackend:
         self._worlds = Worlds(
             robot, n, threads=1, randomise=float(randomise), model=build(robot, scene), together=n > 1
         )
-        rngs = [np.random.default_rng([seed, number]) for number in range(n)]
+        # numpy pads a seed with zeros: what other streams of this seed are told apart by must not be 0 either.
+        streams = [[seed, 0], *([seed, OTHERS_STREAM, number] for number in range(1, n))]
+        rngs = [np.random.default_rng(stream) for stream in streams]
         places = np.zeros((n, 3))
         if scene is not None and scene.robots is not None:
             places[1:] = scene.robots[:, :3]
@@ -135,7 +139,7 @@ class OtherClock:
 class SimSensors:
     """Reads the sensors of a body of the world. Reading twice within a tick draws noise once."""
 
-    def __init__(self, worlds: Worlds, number: int) -> None:
+    def __init__(self, worlds: World, number: int) -> None:
         self._worlds, self._number = worlds, number
 
     def read(self) -> Observation:

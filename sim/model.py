@@ -11,17 +11,18 @@ from hw.config import ConfigError
 from hw.hal import Scene
 from hw.robot import Robot, Servo
 from sim.crowd import add_others, prefix
-from sim.scene import PREFIX, add_scene, count_robots
+from sim.scene import FOUND, PREFIX, add_scene, count_robots
 
 TIMESTEP = 0.004  # s
-_FOUND, _FORCE, _NET = 1, 2, 3  # data bits and reduction of MuJoCo's contact sensor
+_FORCE, _NET = 2, 3  # data bit beside FOUND, and reduction, of MuJoCo's contact sensor
 
 
 def build(robot: Robot, scene: Scene | None = None) -> mujoco.MjModel:
     """Compile the model of `robot` on a floor, with a scene. Actuator i drives joint i of the robot's file.
 
-    The MJCF's own actuators, sensors and keyframes are replaced. Raises ConfigError naming what the MJCF lacks, and
-    ValueError for a scene of other robots and obstacles: what a robot feels is told by its place among robots alone.
+    The MJCF's own actuators, sensors and keyframes are replaced. Raises ConfigError naming what the MJCF lacks or the
+    joint whose servo cannot be simulated beside the others, and ValueError for a scene of other robots and obstacles:
+    what a robot feels is told by its place among robots alone.
     """
     result = spec(robot, robots := count_robots(scene))
     if scene is not None:
@@ -33,6 +34,7 @@ def build(robot: Robot, scene: Scene | None = None) -> mujoco.MjModel:
 
 def spec(robot: Robot, robots: int = 1) -> mujoco.MjSpec:
     """The editable model of so many times `robot`, for scenes that add bodies to it. Raises ConfigError."""
+    _check_delays(robot)
     result = _load(robot)
     result.option.timestep = TIMESTEP
     result.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -84,6 +86,19 @@ def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
     extra = [name for joint in model.joints if (name := joint.name) not in robot.names and joint.type != 0]
     if extra:
         raise ConfigError(f"{path}: joints that robot {robot.name!r} does not list: {', '.join(extra)}")
+
+
+def _check_delays(robot: Robot) -> None:
+    """Refuse servos that differ in what is simulated, and drawn, once for the whole robot."""
+    first = robot.servos[0]
+    for joint, servo in zip(robot.joints, robot.servos, strict=True):
+        for key in ("command_delay", "position_latency"):
+            if getattr(servo, key) != getattr(first, key):
+                raise ConfigError(
+                    f"{robot.name}: {joint.name}: {key} of its servo {servo.name} is {getattr(servo, key):g} s, "
+                    f"that of {robot.names[0]}'s {first.name} {getattr(first, key):g} s: simulation has one for all "
+                    "servos of a robot; give both files the same"
+                )
 
 
 def _add_floor(model: mujoco.MjSpec) -> None:
@@ -157,16 +172,16 @@ def _add_sensors(model: mujoco.MjSpec, robot: Robot, number: int, robots: int) -
     add("gyro", kind.mjSENS_GYRO, obj.mjOBJ_SITE, own + robot.imu_site)
     add("accelerometer", kind.mjSENS_ACCELEROMETER, obj.mjOBJ_SITE, own + robot.imu_site)
     whole = {"reftype": obj.mjOBJ_XBODY, "refname": own + robot.base}
-    add("floor", kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, "floor", intprm=[_FOUND, 0, 1], **whole)
+    add("floor", kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, "floor", intprm=[FOUND, 0, 1], **whole)
     for name, foot in robot.feet.items():
         body = model.geom(own + foot.geoms[0]).parent
         site = f"{name}_foot"
         body.add_site(name=own + site, pos=foot.sole, group=4)
         sole = {"reftype": obj.mjOBJ_BODY, "refname": body.name}
-        add(f"{name}_contact", kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, "floor", intprm=[_FOUND | _FORCE, _NET, 1], **sole)
+        add(f"{name}_contact", kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, "floor", intprm=[FOUND | _FORCE, _NET, 1], **sole)
         add(f"{name}_position", kind.mjSENS_FRAMEPOS, obj.mjOBJ_SITE, own + site)
         add(f"{name}_velocity", kind.mjSENS_FRAMELINVEL, obj.mjOBJ_SITE, own + site)
         add(f"{name}_up", kind.mjSENS_FRAMEZAXIS, obj.mjOBJ_SITE, own + site)
     for other in (i for i in range(robots) if i != number):  # of the scene's sensors: what it touches beside the floor
         base = prefix(other) + robot.base
-        add(f"{PREFIX}robot{other}", kind.mjSENS_CONTACT, obj.mjOBJ_XBODY, base, intprm=[_FOUND, 0, 1], **whole)
+        add(f"{PREFIX}robot{other}", kind.mjSENS_CONTACT, obj.mjOBJ_XBODY, base, intprm=[FOUND, 0, 1], **whole)

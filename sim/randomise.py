@@ -9,13 +9,14 @@ import numpy as np
 from hw.hal import Array
 from hw.robot import Robot
 
-# Ranges of the randomised robot.
-STIFFNESS = (5.0, 19.0)  # N m/rad at the servo's nominal voltage
-VOLTAGE = (11.0, 12.6)  # V
+# Ranges of the randomised robot. Where a nominal value follows, they are those of an XM430-W350 and of the IMU of an
+# OP3-class robot: another one's range is as much wider or narrower as its own value is greater or smaller.
+STIFFNESS, _STIFFNESS = (5.0, 19.0), 9.4  # N m/rad at the servo's nominal voltage
+VOLTAGE, _VOLTAGE = (11.0, 12.6), 12.0  # V
 FRICTION = (0.4, 1.2)  # of the floor
 MASS = (0.9, 1.1)  # factor on each body
-COMMAND_DELAY = (0.008, 0.040)  # s
-LATENCY = (0.0, 0.012)  # s, of joints and of the IMU, each its own
+COMMAND_DELAY, _COMMAND_DELAY = (0.008, 0.040), 0.020  # s
+LATENCY, _LATENCY = (0.0, 0.012), 0.004  # s, of joints and of the IMU, each its own
 ZERO = 0.03  # rad, half-width
 BACKLASH = np.deg2rad(0.25)  # rad, whole play of a gear
 IMU_TILT = 0.02  # rad, half-width of the mounting error about x and y
@@ -62,16 +63,23 @@ def draw(rng: np.random.Generator, robot: Robot, n_bodies: int, randomise: bool)
             imu_tilt=np.zeros(2),
         )
     return Body(
-        stiffness=rng.uniform(*STIFFNESS),
-        voltage=rng.uniform(*VOLTAGE),
+        stiffness=rng.uniform(*STIFFNESS) * (servo.stiffness / _STIFFNESS),
+        voltage=rng.uniform(*VOLTAGE) * (servo.voltage / _VOLTAGE),
         friction=rng.uniform(*FRICTION),
         mass=rng.uniform(*MASS, n_bodies),
-        command_delay=rng.uniform(*COMMAND_DELAY),
-        joint_latency=rng.uniform(*LATENCY),
-        imu_latency=rng.uniform(*LATENCY),
+        command_delay=rng.uniform(*COMMAND_DELAY) * (servo.command_delay / _COMMAND_DELAY),
+        joint_latency=rng.uniform(*LATENCY) * (servo.position_latency / _LATENCY),
+        imu_latency=rng.uniform(*LATENCY) * (imu.latency / _LATENCY),
         zero=rng.uniform(-ZERO, ZERO, n),
         backlash=BACKLASH,
         gyro_bias=gyro,
         accelerometer_bias=accelerometer,
         imu_tilt=rng.uniform(-IMU_TILT, IMU_TILT, 2),
     )
+
+
+def longest(robot: Robot) -> tuple[float, float]:
+    """The longest command delay and the longest latency that `draw` gives this robot [s]."""
+    servo = robot.servos[0]
+    latency = max(servo.position_latency, robot.imu.latency)
+    return COMMAND_DELAY[1] * (servo.command_delay / _COMMAND_DELAY), LATENCY[1] * (latency / _LATENCY)

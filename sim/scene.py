@@ -14,7 +14,7 @@ from sim.crowd import prefix
 PREFIX = "scene/"  # of the names of a scene's bodies, which follow the robot's
 PILLAR_HEIGHT = 0.4  # m: taller than the robot's shoulders
 PILLAR_COLOUR, SPHERE_COLOUR = (0.55, 0.42, 0.32, 1.0), (0.80, 0.20, 0.20, 1.0)
-_FOUND = 1  # data bit of MuJoCo's contact sensor
+FOUND = 1  # data bit of MuJoCo's contact sensor
 
 
 def add_scene(model: mujoco.MjSpec, scene: Scene) -> None:
@@ -35,7 +35,7 @@ def add_scene(model: mujoco.MjSpec, scene: Scene) -> None:
             type=mujoco.mjtSensor.mjSENS_CONTACT,
             objtype=mujoco.mjtObj.mjOBJ_BODY,
             objname=body.name,
-            intprm=[_FOUND, 0, 1],
+            intprm=[FOUND, 0, 1],
         )
 
 
@@ -65,7 +65,9 @@ def scene_sensors(model: mujoco.MjModel) -> Array:
 
 
 def plain(scene: Scene) -> dict[str, Any]:
-    """A scene as JSON values."""
+    """A scene as JSON values. Raises ValueError for one of several robots."""
+    if scene.robots is not None:
+        raise ValueError("a virtual rig has one robot, and this scene has others")
     goal = None if scene.goal is None else scene.goal.tolist()
     return {"pillars": scene.pillars.tolist(), "spheres": scene.spheres.tolist(), "goal": goal}
 

@@ -16,8 +16,12 @@ FALL_TILT = np.deg2rad(60.0)
 class Truth:
     """Live views of the worlds' truth. All arrays are `(n, ...)`, world frame unless said otherwise."""
 
-    def __init__(self, model: mujoco.MjModel, robot: Robot, qpos: Array, qvel: Array, sensors: Array) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, robot: Robot, qpos: Array, qvel: Array, sensors: Array, recent: Array | None = None
+    ) -> None:
+        """`recent` `(n, substeps, ...)` are the sensors at the substeps of the last tick; by default those of now."""
         self._robot, self._qpos, self._qvel, self._sensors = robot, qpos, qvel, sensors
+        self._recent = sensors[:, None] if recent is None else recent
         self._at = {model.sensor(i).name: slice(int(a := model.sensor(i).adr[0]), int(a + model.sensor(i).dim[0]))
                     for i in range(model.nsensor)}  # fmt: skip
         self._scene = scene_sensors(model)
@@ -112,5 +116,5 @@ class Truth:
 
     @property
     def touching(self) -> Array:
-        """Whether each body touches an obstacle of the scene `(n,)`."""
-        return np.any(self._sensors[:, self._scene] > 0, axis=-1)
+        """Whether each body touches an obstacle of the scene, or another robot, or did within the last tick `(n,)`."""
+        return np.any(self._recent[:, :, self._scene] > 0, axis=(1, 2))

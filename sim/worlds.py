@@ -15,15 +15,15 @@ from mujoco.batch import Batch
 from hw.config import ConfigError
 from hw.hal import Array, Command, Mode, Observation
 from hw.legs import Legs
-from hw.robot import Robot
+from hw.robot import Imu, Robot
 from sim.crowd import Crowd
 from sim.model import TIMESTEP, build
-from sim.randomise import COMMAND_DELAY, LATENCY, Body, draw
+from sim.randomise import Body, draw, longest
 from sim.scene import robot_bodies
 from sim.truth import Truth
 
-_NOISE_ROWS = 64  # ticks of sensor noise drawn at a time
-_VELOCITY_NOISE = 0.02  # rad/s, standard deviation, before quantisation
+NOISE_ROWS = 64  # ticks of sensor noise drawn at a time
+VELOCITY_NOISE = 0.02  # rad/s, standard deviation, before quantisation
 _GRAVITY = 9.81  # m/s2
 _KP, _VMAX = 4, 7  # indices in a dcmotor's gainprm
 
@@ -67,8 +67,7 @@ class Worlds:
         self._voltage_unit = servos[0].voltage_unit
 
         # Commands that may still be on their way, and samples that may still be on theirs.
-        delay = max(COMMAND_DELAY[1], *(servo.command_delay for servo in servos))
-        latency = max(LATENCY[1], robot.imu.latency, *(servo.position_latency for servo in servos))
+        delay, latency = longest(robot)
         self._delayed = int(np.ceil(delay / robot.dt - 1e-6)) + 1
         self._imu_span = max(round(robot.imu.average / TIMESTEP), 1)
         span = max(2 * self.substeps, round(latency / TIMESTEP) + 1 + self._imu_span)
@@ -89,7 +88,7 @@ class Worlds:
         self._delay, self._joint_age, self._imu_age = np.zeros(n), np.zeros(n, int), np.zeros(n, int)
         self._zero, self._backlash = np.zeros((n, nj)), np.zeros((n, 1))
         self._gyro_bias, self._acc_bias, self._tilt = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2))
-        self._noise, self._noise_block = np.zeros((n, _NOISE_ROWS, 6 + nj)), np.full(n, -1)
+        self._noise, self._noise_block = np.zeros((n, NOISE_ROWS, 6 + nj)), np.full(n, -1)
         self._commands = np.zeros((n, self._delayed, nj))  # oldest first
         self._play = np.zeros((n, nj))
         recorded = ("qpos", "qvel", "sensordata", "actuator_force")
@@ -97,7 +96,9 @@ class Worlds:
         self._fresh = {key: value[:, -self.substeps :].copy() for key, value in self._record.items()}
         self.ticks = np.zeros(n, int)  # since each world's reset
         self.tick = 0
-        self.truth = Truth(self.model, robot, self._state_qpos, self._state_qvel, self._sensors)
+        self.truth = Truth(
+            self.model, robot, self._state_qpos, self._state_qvel, self._sensors, self._fresh["sensordata"]
+        )
 
     def reset(
         self,
@@ -130,6 +131,7 @@ class Worlds:
         self._play[ids] = pose - self._zero[ids]
         for key, value in self._record.items():
             value[ids] = self.batch.bind(key)[ids][:, None]
+        self._fresh["sensordata"][ids] = self._sensors[ids][:, None]
         # The limp body has just been put down; its sensors have read a standing one for long.
         self._record["sensordata"][ids, :, 0:3] = 0.0
         self._record["sensordata"][ids, :, 3:6] = -_GRAVITY * self.truth.gravity[ids][:, None]
@@ -190,21 +192,19 @@ class Worlds:
         self._mocap[world] = places
 
     def observe(self) -> Observation:
-        """What the rig's sensors say now: delayed, quantised, biased and noisy."""
+        """What the rig's sensors say now: delayed, biased and noisy, and quantised but for those of the IMU."""
         rows, last = np.arange(self.n), self._record["qpos"].shape[1] - 1
         noise = self._draw_noise()
         at = last - self._joint_age
         q = self._record["qpos"][rows, at][:, self._qpos]
         self._play = np.clip(self._play, q - self._backlash / 2, q + self._backlash / 2)
         position = np.round((self._play + self._zero) / self._tick_angle) * self._tick_angle
-        speed = self._record["qvel"][rows, at][:, self._dof] + _VELOCITY_NOISE * noise[:, 6:]
+        speed = self._record["qvel"][rows, at][:, self._dof] + VELOCITY_NOISE * noise[:, 6:]
         velocity = np.round(speed / self._velocity_unit) * self._velocity_unit
         effort = np.round(self._record["actuator_force"][rows, at] / self._unit) * self._unit
         span = last - self._imu_age[:, None] - np.arange(self._imu_span)
         imu = self._record["sensordata"][rows[:, None], span, :6].mean(1)
-        errors = self.robot.imu
-        gyro = _tilt(imu[:, 0:3], self._tilt) + self._gyro_bias + errors.gyro_noise * noise[:, 0:3]
-        force = _tilt(imu[:, 3:6], self._tilt) + self._acc_bias + errors.accelerometer_noise * noise[:, 3:6]
+        gyro, force = with_errors(imu, noise, self.robot.imu, self._tilt, self._gyro_bias, self._acc_bias)
         shape = position.shape
         voltage = np.round(self._supply / self._voltage_unit) * self._voltage_unit
         return Observation(
@@ -227,17 +227,29 @@ class Worlds:
 
         A second call within a tick gives the same.
         """
-        block, row = np.divmod(self.ticks, _NOISE_ROWS)
+        block, row = np.divmod(self.ticks, NOISE_ROWS)
         for i in np.flatnonzero(block != self._noise_block):
             self._rngs[i].standard_normal(out=self._noise[i])
         self._noise_block[:] = block
         return self._noise[np.arange(self.n), row]
 
 
+def with_errors(
+    imu: Array, noise: Array, errors: Imu, tilt: Array, gyro_bias: Array, force_bias: Array
+) -> tuple[Array, Array]:
+    """Angular velocity and specific force, `(..., 3)` each, as an IMU errs about the true `imu` `(..., 6)`.
+
+    `noise` `(..., 6)`, or longer, is standard normal; `tilt` `(..., 2)` are small mounting errors about x and y [rad].
+    """
+    gyro = _tilt(imu[..., 0:3], tilt) + gyro_bias + errors.gyro_noise * noise[..., 0:3]
+    force = _tilt(imu[..., 3:6], tilt) + force_bias + errors.accelerometer_noise * noise[..., 3:6]
+    return gyro, force
+
+
 def _tilt(vector: Array, angles: Array) -> Array:
-    """Turn `(n, 3)` by small angles `(n, 2)` about x and y."""
-    x, y = angles[:, 0], angles[:, 1]
-    return vector + np.stack([y * vector[:, 2], -x * vector[:, 2], x * vector[:, 1] - y * vector[:, 0]], -1)
+    """Turn `(..., 3)` by small angles `(..., 2)` about x and y."""
+    x, y = angles[..., 0], angles[..., 1]
+    return vector + np.stack([y * vector[..., 2], -x * vector[..., 2], x * vector[..., 1] - y * vector[..., 0]], -1)
 
 
 def _headed(orientation: Array, heading: Array) -> Array:

@@ -17,7 +17,7 @@ from stack.backends import BACKENDS
 from stack.director import DONE
 from stack.event import Event
 from stack.flightlog import FlightLog, read_log
-from stack.logformat import MACHINE_DEPENDENT, messages, plain
+from stack.logformat import MACHINE_DEPENDENT, event_message, messages, plain
 from stack.loop import TickRecord
 from stack.session import Script, Settings, run
 from tools import exit_codes
@@ -77,17 +77,18 @@ def replay(log: FlightLog) -> tuple[int, Difference | None]:
     stops = [Event(**event) for event in log.messages["/event"] if event["kind"] in ("interrupt", "record")]
     plans = frozenset(int(message["requested"]) for message in log.messages["/plan"])
     recorded = _by_tick(log)
-    repeated: dict[int, Tick] = {}
+    repeated: dict[int, Tick] = defaultdict(lambda: defaultdict(list))
 
     def compare(record: TickRecord) -> None:
-        tick: Tick = defaultdict(list)
         for channel, message in messages(record):
-            tick[channel].append(plain(message))
-        repeated[record.tick] = tick
+            if channel != "/event":
+                repeated[record.tick][channel].append(plain(message))
 
     velocities = log.column("/instruction", "velocity").reshape(-1, 3)
     ended = any(event["kind"] == "task" and event["text"] == DONE for event in log.messages["/event"])
-    run(settings, on_tick=compare, script=Script(tuple(stops), plans if plans else None, velocities, ended))
+    result = run(settings, on_tick=compare, script=Script(tuple(stops), plans if plans else None, velocities, ended))
+    for event in result.events:  # of their own ticks, as in the log: what befalls other robots comes between two
+        repeated[event.tick]["/event"].append(plain(event_message(event)))
     for number in sorted(recorded.keys() | (repeated.keys() if log.complete else set())):
         difference = _difference(number, recorded.get(number), repeated.get(number))
         if difference is not None:

@@ -67,11 +67,11 @@ class Counters:
 class Bus:
     """Protocol 2.0 on a port. Methods raise BackendError when the port is gone; a servo that is silent is a None."""
 
-    def __init__(self, port: Port, clock: Clock, *, return_delay: float = 0.0, margin: float = MARGIN) -> None:
-        """`return_delay` [s] is the servos' setting, `margin` [s] what an answer may be later than predicted."""
+    def __init__(self, port: Port, clock: Clock, *, margin: float = MARGIN) -> None:
+        """`margin` [s] is what an answer may be later than predicted."""
         self.port, self.clock = port, clock
         self.counters = Counters()
-        self.return_delay = return_delay
+        self.return_delay = 0.0  # s: the servos' setting
         self.margin = margin
         # In real time the line itself says when something comes; by a simulated clock it has to be asked.
         self._wakes = port if isinstance(port, SerialPort) and isinstance(clock, WallClock) else None

@@ -14,7 +14,7 @@ from hw.dynamixel.tables import ControlTable, table
 from hw.hal import BackendError
 
 BAUDS = table("xm430-w350").bauds  # bit/s; the same for every model
-FACTORY_ID, FACTORY_BAUD = 1, 57600
+FACTORY_BAUD = 57600
 PATIENCE = 0.03  # s of margin for a bus on which nothing is known: adapters come with a latency timer of 16 ms
 BOOT_SECONDS = 1.0  # after the servos' power was switched on
 PING_ANSWER = 14  # bytes

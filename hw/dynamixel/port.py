@@ -11,6 +11,7 @@ import os
 import select
 import termios
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
@@ -56,7 +57,7 @@ class SerialPort:
         except (OSError, ValueError, termios.error) as error:
             raise BackendError(_cannot_open(self.name, baud, error)) from error
         self._fd: int = self._serial.fileno()
-        self.low_latency = self._ask_low_latency()
+        self._ask_low_latency()
         self._exclusive(True)
 
     @property
@@ -140,12 +141,10 @@ class SerialPort:
             f"{self.name}: the adapter takes no more bytes: unplug it and plug it in again (is its other end powered?)"
         )
 
-    def _ask_low_latency(self) -> bool:
-        try:
+    def _ask_low_latency(self) -> None:
+        # A pty or a driver may be without it: slower by its latency timer, which `doctor` reports.
+        with suppress(OSError, ValueError, NotImplementedError, AttributeError, termios.error):
             self._serial.set_low_latency_mode(True)
-        except (OSError, ValueError, NotImplementedError, AttributeError, termios.error):
-            return False  # a pty or a driver without it: slower by its latency timer, which `doctor` reports
-        return True
 
     def _exclusive(self, on: bool) -> None:
         """Keep programs out that ask for no lock. Not on a pty: its far end keeps the mark if this process dies."""

@@ -197,5 +197,5 @@ class VirtualTruth:
 
     @property
     def touching(self) -> Array:
-        """Whether the robot touches an obstacle of the scene `(1,)`."""
+        """Whether the robot touches an obstacle of the scene, or did within the last tick `(1,)`."""
         return self._now().touching

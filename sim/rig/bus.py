@@ -34,13 +34,9 @@ class Bus:
         self._parser = Parser()
         self._heard_ns = 0
 
-    def clear(self) -> None:
-        """Forget what is half received."""
-        self._parser.reset()
-
     def receive(self, data: bytes, baud: int, now_ns: int) -> None:
         """Bytes of the host whose last arrived at `now_ns`."""
-        if now_ns - self._heard_ns > _SILENCE_NS:
+        if now_ns - _wire_ns(len(data), baud) - self._heard_ns > _SILENCE_NS:
             self._parser.reset()
         self._heard_ns = now_ns
         for packet in self._parser.feed(data):

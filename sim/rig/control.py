@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import select
 import socket
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from hw.hal import Array, BackendError, Scene
 from hw.robot import Robot, load_robot, save_robot
 from sim.model import build
 from sim.rig.delivery import Delivery
-from sim.scene import plain
+from sim.scene import plain, scene_sensors
 from sim.truth import Truth
 
 _START_SECONDS = 60.0
@@ -55,18 +56,13 @@ class Control:
         self._file.close()
         self._stream.close()
 
-    def reset(self, seed: int, *, episode: int = 0, randomise: bool = False, pose: Array | None = None) -> None:
-        """A rig as delivered, without power, held at `pose` (default: home)."""
-        joints = None if pose is None else np.asarray(pose).tolist()
-        self.call("reset", seed=seed, episode=episode, randomise=randomise, pose=joints)
-
-    def release(self) -> None:
-        """Put the robot on its feet now. By itself it is let go when all servos have torque."""
-        self.call("release")
+    def reset(self, seed: int, *, randomise: bool = False) -> None:
+        """A rig as delivered, without power, held at home. It is let go when all servos have torque."""
+        self.call("reset", seed=seed, randomise=randomise)
 
     def hold(self) -> None:
-        """Keep holding the robot when all servos have torque, until `release` or a reset."""
-        self.call("hold", auto_release=False)
+        """Keep holding the robot when all servos have torque, until a reset."""
+        self.call("hold")
 
     def push(self, velocity: Array) -> None:
         """Change the base's velocity by `(2,)` m/s, world frame."""
@@ -139,13 +135,16 @@ class RigTruth:
             "qvel": np.zeros((1, model.nv)),
             "sensordata": np.zeros((1, model.nsensordata)),
         }
-        self._truth = Truth(model, robot, *self._arrays.values())
+        self._recent, self._scene = np.zeros((1, 1, model.nsensordata)), scene_sensors(model)
+        qpos, qvel, sensors = self._arrays.values()
+        self._truth = Truth(model, robot, qpos, qvel, sensors, self._recent)
 
     def fetch(self) -> Truth:
         """The truth of now; a later call changes what this one returned."""
         answer = self._control.call("truth")
         for name, array in self._arrays.items():
             array[0] = answer[name]
+        self._recent[..., self._scene] = answer["touches"]
         return self._truth
 
 
@@ -203,6 +202,8 @@ class RigProcess:
 
     def _first_line(self) -> dict[str, Any]:
         assert self.process.stdout is not None
+        if not select.select([self.process.stdout], [], [], _START_SECONDS)[0]:
+            return {"error": f"nothing was heard of it for {_START_SECONDS:g} s: what else keeps this machine busy?"}
         line = self.process.stdout.readline()
         if not line:
             return {"error": f"ended with code {self.process.wait(_START_SECONDS)}"}

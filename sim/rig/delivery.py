@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from hw.config import ConfigError, nearest
-from hw.dynamixel.tables import table
+from hw.dynamixel.tables import ControlTable, table
 from hw.robot import Robot
 
 Assembly = Literal["file", "random"]
@@ -38,10 +38,21 @@ class Delivery:
         return [word for pair in named for word in pair] + ["--assembly", self.assembly]
 
     def check(self, robot: Robot) -> None:
-        """Raise ConfigError for a joint that the robot has not."""
+        """Raise ConfigError for a joint that the robot has not, and for a baud or ticks that its servos have not."""
         for name in (*self.fresh, *self.only):
             if name not in robot.names:
                 raise ConfigError(f"{robot.name} has no joint '{name}'; {nearest(name, robot.names)}")
+        for servo in robot.servos:
+            items = table(servo.model_number)
+            if robot.bus.baud not in items.bauds:
+                known = ", ".join(map(str, items.bauds))
+                raise ConfigError(f"{robot.name}: bus.baud: servos have no {robot.bus.baud} bit/s; they have {known}")
+            turn = ticks_per_turn(items)
+            if (servo.ticks_per_turn, servo.center_tick) != (turn, turn // 2):
+                raise ConfigError(
+                    f"servo {servo.name}: a virtual {items.name} has ticks_per_turn {turn} and center_tick "
+                    f"{turn // 2}, not {servo.ticks_per_turn} and {servo.center_tick}"
+                )
 
     def assembled(self, robot: Robot, seed: int) -> Robot:
         """The robot with the zeros and directions of this rig."""
@@ -82,6 +93,11 @@ class Delivery:
     def unplugged(self, names: Collection[str]) -> set[str]:
         """Joints whose servos are not on the bus."""
         return set(names) - set(self.only) if self.only else set()
+
+
+def ticks_per_turn(items: ControlTable) -> int:
+    """How many ticks the servos of a control table count in a turn; the tick of angle 0 is half as many."""
+    return round(2 * math.pi / items.item("present_position").scale)
 
 
 def add_delivery_arguments(parser: argparse.ArgumentParser) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 
 from hw.config import ConfigError, load_yaml, nearest
 from hw.dynamixel import codec
+from hw.faults import ENCODER, INPUT_VOLTAGE, OVERHEATING, OVERLOAD, SHOCK
 from hw.robot import Robot
 
 Kind = Literal[
@@ -31,7 +32,9 @@ Kind = Literal[
 KINDS: tuple[str, ...] = get_args(Kind)
 MISSPOKEN = ("wrong_id", "error_status")  # whole packets that say something wrong
 STATUS_KINDS = ("drop", "late", "truncate", "duplicate", "wrong_id", "corrupt", "error_status")
-ALERTS = {"voltage": 1, "overheating": 4, "encoder": 8, "shock": 16, "overload": 32}  # bits of the hardware error
+ALERTS = {
+    "voltage": INPUT_VOLTAGE, "overheating": OVERHEATING, "encoder": ENCODER, "shock": SHOCK, "overload": OVERLOAD,
+}  # fmt: skip
 
 
 class Outcome(Enum):

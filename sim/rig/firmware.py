@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hw.faults import INPUT_VOLTAGE, OVERHEATING, OVERLOAD
 from hw.hal import Array
 from hw.robot import Servo
 from sim.model import TIMESTEP
 
 CURRENT, VELOCITY, POSITION, EXTENDED, CURRENT_POSITION, PWM = 0, 1, 3, 4, 5, 16
-VOLTAGE_ERROR, OVERHEATING, ENCODER_ERROR, SHOCK, OVERLOAD = 1, 4, 8, 16, 32  # bits of the hardware error
 
 FULL_PWM = 885.0  # PWM counts of full duty
 _SAMPLE = 0.001  # s, the firmware's own period, which its I and D gains are per
@@ -40,13 +40,14 @@ class Firmware:
     """State and control laws of `n` servos. Angles rad, speeds rad/s, currents A, output as duty -1..1.
 
     Law (e-Manual, with the datasheet's gain replaced by the one identified for the servo): duty = Kp e + Ki integral
-    of e + Kd de/dt + feed-forward, limited by goal PWM, then by current, then by the supply.
+    of e + Kd de/dt + feed-forward of speed, limited by goal PWM, then by current, then by the supply. That of
+    acceleration, the register `feedforward_2nd_gain`, has no effect.
     """
 
-    def __init__(self, servos: tuple[Servo, ...], constant: Array, resistance: Array, delay: Array) -> None:
+    def __init__(self, servos: tuple[Servo, ...], constant: Array, resistance: Array, delay: float) -> None:
         """`constant` [V s/rad] and `resistance` [Ohm] are the motors' at the joint; `delay` [s] from goal to torque."""
         n = self.n = len(servos)
-        self._k, self._r, self._delay_ns = constant, resistance, np.round(delay * 1e9).astype(int)
+        self._k, self._r, self._delay_ns = constant, resistance, round(delay * 1e9)
         self.torque_per_ampere = np.array([servo.torque_per_ampere for servo in servos])
         self._no_load = np.array([servo.no_load_speed for servo in servos])
         self._stall = np.array([servo.stall_torque for servo in servos])
@@ -61,7 +62,7 @@ class Firmware:
             return np.zeros(n)
 
         self.powered, self.mode = np.zeros(n, bool), np.full(n, POSITION)
-        self.p, self.i, self.d, self.ff_velocity, self.ff_acceleration = (zeros() for _ in range(5))
+        self.p, self.i, self.d, self.ff_velocity = (zeros() for _ in range(4))
         self.velocity_p, self.velocity_i = zeros(), zeros()  # duty per rad/s, duty per rad
         self.pwm_limit, self.goal_pwm = np.ones(n), np.ones(n)
         self.current_limit, self.goal_current = np.full(n, np.inf), zeros()
@@ -75,7 +76,6 @@ class Firmware:
         self.voltage_range = np.tile([0.0, np.inf], (n, 1))
         self.duty, self.current = zeros(), zeros()  # outputs of the newest step
         self.winding, self.case = np.full(n, AMBIENT), np.full(n, AMBIENT)
-        self.heat = zeros()  # W from elsewhere: a fault
         self._integral, self._velocity_integral, self._stalled = zeros(), zeros(), zeros()
         self._last_error = zeros()
         self._cruise, self._ramp = np.full(n, np.inf), np.full(n, np.inf)
@@ -87,7 +87,7 @@ class Firmware:
 
     def submit(self, servo: int, name: str, value: float, now_ns: int) -> None:
         """A goal that was written at `now_ns`: it drives the motor after the servo's own delay."""
-        self._pending.append(_Pending(now_ns + int(self._delay_ns[servo]), servo, name, value))
+        self._pending.append(_Pending(now_ns + self._delay_ns, servo, name, value))
 
     def flush(self, servo: int, angle: float) -> None:
         """Forget what was underway: for torque-on and mode changes, from rest at `angle`."""
@@ -128,12 +128,13 @@ class Firmware:
             if not self.halted[item.servo]:
                 getattr(self, item.name)[item.servo] = item.value
                 self._plan(item.servo)
+        velocity, before = self.mode == VELOCITY, self.reference_speed
         self._follow()
         position = (self.mode >= POSITION) & (self.mode <= CURRENT_POSITION)  # 3, 4 and 5
         limit = np.minimum(self.pwm_limit, np.where(self.mode == PWM, 1.0, np.abs(self.goal_pwm)))
         duty = np.where(position, self._position(angle), 0.0)
-        velocity = self.mode == VELOCITY
         if velocity.any():
+            self._ramp_speed(velocity, before)
             duty = np.where(velocity, self._velocity(speed, limit), duty)
         duty = np.where(self.mode == PWM, self.goal_pwm, duty)
         limited = (self.mode == CURRENT) | (self.mode == CURRENT_POSITION)
@@ -176,13 +177,13 @@ class Firmware:
         self._last_error = error
         return duty
 
-    def _velocity(self, speed: Array, limit: Array) -> Array:
+    def _ramp_speed(self, which: Array, before: Array) -> None:
+        """Advance the speeds of `which` servos from those `before` toward their goals: they follow no position."""
         ramp = self.profile_acceleration * TIMESTEP
-        self.reference_speed = np.where(
-            self.mode == VELOCITY,
-            self.reference_speed + np.clip(self.goal_velocity - self.reference_speed, -ramp, ramp),
-            self.reference_speed,
-        )
+        speed = before + np.clip(self.goal_velocity - before, -ramp, ramp)
+        self.reference_speed = np.where(which, speed, self.reference_speed)
+
+    def _velocity(self, speed: Array, limit: Array) -> Array:
         error = self.reference_speed - speed
         integral = self._velocity_integral + self.velocity_i * error * TIMESTEP
         self._velocity_integral = np.where(self.powered, np.clip(integral, -limit, limit), 0.0)
@@ -205,7 +206,7 @@ class Firmware:
     def settle(self, torque: Array, speed: Array, supply: float) -> Array:
         """After the physics step: heat and protections. Returns the current that each servo draws [A]."""
         self.current = torque / self.torque_per_ampere
-        loss = self.current**2 * self._winding + self.heat
+        loss = self.current**2 * self._winding
         flow = (self.winding - self.case) / _WINDING_TO_CASE
         self.winding += TIMESTEP * (loss - flow) / _WINDING_CAPACITY
         self.case += TIMESTEP * (flow - (self.case - AMBIENT) / _CASE_TO_AIR) / _CASE_CAPACITY
@@ -214,5 +215,5 @@ class Firmware:
         error = self.injected | np.where(self.winding > self.temperature_limit, OVERHEATING, 0)
         error |= np.where(self._stalled > _STALL_SECONDS, OVERLOAD, 0)
         outside = (supply < self.voltage_range[:, 0]) | (supply > self.voltage_range[:, 1])
-        self.error |= error | np.where(outside, VOLTAGE_ERROR, 0)
+        self.error |= error | np.where(outside, INPUT_VOLTAGE, 0)
         return np.maximum(self.duty * self.current, 0.0)

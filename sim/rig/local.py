@@ -74,13 +74,12 @@ class LocalBackend:
 
     name = "virtual"
 
-    def __init__(self, rig: Rig, *, seed: int = 0, randomise: bool = False) -> None:
+    def __init__(self, rig: Rig, *, seed: int = 0) -> None:
         self.rig = rig
         # Ticks and an adapter's batches fall together as in every run before: what happens does not depend on those.
         rig.advance(-(-rig.now_ns // _TOGETHER_NS) * _TOGETHER_NS)
         rig.scenario = Scenario(seed=seed)
-        rig.reset(seed, randomise=randomise)
-        rig.take_accepted()
+        rig.reset(seed)
         self._line = LocalLine(rig)
         self.clock: Clock = self._line
         self._body = DynamixelBackend(on_the_board(rig.robot), port=self._line, clock=self._line, name=self.name)

@@ -11,11 +11,10 @@ from hw.robot import Robot
 from sim.model import TIMESTEP
 from sim.rig.firmware import Firmware
 from sim.rig.plant import Plant
+from sim.rig.wire import FRAME_BITS
 
 BATTERY_RESISTANCE = 0.04  # Ohm: a 3S pack of the size that fits such a robot, with its wires
-IDLE_CURRENT = 0.04  # A that a servo draws without turning: XM430 datasheet's standby
 STEP_NS = round(TIMESTEP * 1e9)
-FRAME_BITS = 10  # of a byte on the wire
 
 
 class Sample(NamedTuple):
@@ -38,18 +37,18 @@ class Motors:
         self.robot, self.plant = robot, plant
         self._direction = np.array([joint.direction for joint in robot.joints], float)
         self._zero = np.array([joint.zero for joint in robot.joints])
-        self._delay = np.maximum([servo.command_delay - _cycle(robot) for servo in robot.servos], 0.0)
         self.reset()
 
     def reset(self) -> None:
         """New motors, cold, for a plant that was just reset."""
         plant = self.plant
-        self.firmware = Firmware(self.robot.servos, plant.constant, plant.resistance, self._delay)
+        steps = np.ceil(plant.body.command_delay / TIMESTEP - 1e-6)  # as in simulation, goals act from whole steps on
+        delay = max(float(steps) * TIMESTEP - _cycle(self.robot), 0.0)
+        self.firmware = Firmware(self.robot.servos, plant.constant, plant.resistance, delay)
         self.firmware.set_stiffness(plant.stiffness)
         self.open_circuit = plant.body.voltage  # V of the battery at rest with the servos idle
         self.sag = 0.0  # V below that: a fault
         self.supply = self.open_circuit
-        self.current = IDLE_CURRENT * len(self._zero)  # A drawn by all servos
         self.steps = 0  # samples taken
         self.sense()
 
@@ -68,7 +67,6 @@ class Motors:
         volts = firmware.step(now_ns, angle, speed, self.supply)
         plant.step(self._direction * volts, firmware.powered, self.supply)
         draw = firmware.settle(self._direction * plant.torque, self._direction * plant.joint_speed, self.supply)
-        self.current = float(draw.sum()) + IDLE_CURRENT * firmware.n
         self.supply = max(self.open_circuit - self.sag - BATTERY_RESISTANCE * float(draw.sum()), 0.0)
         self.sense()
 

@@ -50,14 +50,9 @@ def find(name: str, rig: Rig) -> Callable[..., dict[str, Any]]:
     return partial(_OPERATIONS[name], rig)
 
 
-def _release(rig: Rig) -> dict[str, Any]:
-    rig.plant.release()
-    return {}
-
-
-def _hold(rig: Rig, auto_release: bool) -> dict[str, Any]:
-    """Whether the robot is let go as soon as all servos have torque, or only by `release`."""
-    rig.auto_release = auto_release
+def _hold(rig: Rig) -> dict[str, Any]:
+    """The robot is not let go when all servos have torque, until a reset."""
+    rig.auto_release = False
     return {}
 
 
@@ -100,11 +95,12 @@ def _inject(rig: Rig, fault: dict[str, Any]) -> dict[str, Any]:
 def _truth(rig: Rig) -> dict[str, Any]:
     plant = rig.plant
     values = {name: getattr(plant.data, name).tolist() for name in ("qpos", "qvel", "sensordata")}
-    return {**values, "held": plant.held}
+    return {**values, "touches": plant.touches.tolist(), "held": plant.held}
 
 
 def _accepted(rig: Rig) -> dict[str, Any]:
-    return {"accepted": rig.take_accepted(), "forgotten": rig.forgotten}
+    forgotten = rig.forgotten
+    return {"accepted": rig.take_accepted(), "forgotten": forgotten}
 
 
 def _servos(rig: Rig) -> dict[str, Any]:
@@ -117,7 +113,6 @@ def _statistics(rig: Rig) -> dict[str, Any]:
 
 
 _OPERATIONS: dict[str, Callable[..., dict[str, Any]]] = {
-    "release": _release,
     "hold": _hold,
     "push": _push,
     "furnish": _furnish,

@@ -15,12 +15,11 @@ from hw.legs import Legs
 from hw.robot import Robot
 from sim.model import TIMESTEP, build
 from sim.randomise import Body, draw
-from sim.scene import robot_bodies
+from sim.scene import robot_bodies, scene_sensors
 from sim.truth import Truth
+from sim.worlds import NOISE_ROWS, VELOCITY_NOISE, with_errors
 
 CLEARANCE = 0.05  # m between the soles and the floor while the robot is held
-_NOISE_ROWS = 64
-_VELOCITY_NOISE = 0.02  # rad/s, as in sim.worlds
 _R, _K, _KP, _VMAX = 0, 1, 4, 7  # indices in a dcmotor's gainprm
 
 
@@ -41,7 +40,7 @@ class Plant:
         robot = self.robot
         self.model = build(robot, scene)
         self.data = mujoco.MjData(self.model)
-        self._bodies = robot_bodies(self.model)
+        self._bodies, self._scene = robot_bodies(self.model), scene_sensors(self.model)
         joints = [self.model.joint(name) for name in robot.names]
         self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
@@ -52,16 +51,19 @@ class Plant:
         self.constant = self.model.actuator_gainprm[:, _K].copy()  # V s/rad
         self.model.actuator_gainprm[:, _KP] = self.constant / self.resistance
         self._braking = np.array([servo.braking_torque for servo in robot.servos])
-        self._noise = np.zeros((_NOISE_ROWS, 6 + len(joints)))
-        self.truth = Truth(self.model, robot, self.data.qpos[None], self.data.qvel[None], self.data.sensordata[None])
+        self._noise = np.zeros((NOISE_ROWS, 6 + len(joints)))
+        self._recent = np.zeros((max(round(robot.dt / TIMESTEP), 1), self.model.nsensordata))  # of the last tick
+        views = (view[None] for view in (self.data.qpos, self.data.qvel, self.data.sensordata, self._recent))
+        self.truth = Truth(self.model, robot, *views)
         self.reset(0)
 
-    def reset(self, seed: int, *, episode: int = 0, randomise: bool = False, pose: Array | None = None) -> None:
-        """Hold the robot at `pose` (default: home), every draw from the stream of this seed and episode.
+    def reset(self, seed: int, *, randomise: bool = False) -> None:
+        """Hold the robot at home, every draw from the stream of this seed.
 
-        The stream is used as `sim.worlds` uses it: the same seed is the same robot with the same noise.
+        The stream is that of `sim.backend`, used as `sim.worlds` uses it: the same seed is the same robot with the same
+        noise.
         """
-        self._rng = np.random.default_rng([seed, episode])
+        self._rng = np.random.default_rng([seed, 0])
         randomise = self._rng.random() < float(randomise)
         self.body: Body = draw(self._rng, self.robot, self._bodies, randomise)
         self.stiffness = self.body.stiffness / self.robot.servos[0].stiffness  # factor on every servo's
@@ -73,12 +75,12 @@ class Plant:
         mujoco.mj_setConst(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
         self.held, self._noise_block, self._ticks = True, -1, 0
-        self._idle_rng = np.random.default_rng([seed, episode, 1])  # while held: the episode's stream waits
+        self._idle_rng = np.random.default_rng([seed, 0, 1])  # while held: the episode's stream waits
         self._idle = self._idle_rng.standard_normal(6 + len(self.robot.joints))
         self._joint_age = round(self.body.joint_latency / TIMESTEP)
         self._imu_age = max(round(self.body.imu_latency / TIMESTEP) - 1, 0)  # sensor data is a substep old already
         self._imu_span = max(round(self.robot.imu.average / TIMESTEP), 1)
-        self.place(self.robot.home if pose is None else pose)
+        self.place(self.robot.home)
 
     def place(self, pose: Array) -> None:
         """Move the joints to `pose` as by hand, and hold the robot there, still and with its history still."""
@@ -86,25 +88,30 @@ class Plant:
         data.qvel[:] = 0.0
         data.qpos[self._qpos] = pose - self.body.zero
         data.qpos[0:2] = 0.0
-        height, data.qpos[3:7] = self._legs.stand(pose)
+        height, data.qpos[3:7] = self._legs.stand(pose - self.body.zero)
         data.qpos[2] = height + CLEARANCE
         self.held = True
         self._play = data.qpos[self._qpos].copy()
         self._force = np.zeros((self._joint_age + 1, self.model.nu))
         self._angle = np.repeat(self._play[None], self._joint_age + 1, 0)
         self._speed = np.zeros_like(self._angle)
-        mujoco.mj_forward(self.model, data)
+        self._forward()
         gravity = -self.truth.gravity[0] * -self.model.opt.gravity[2]
         self._imu = np.repeat(np.concatenate([np.zeros(3), gravity])[None], self._imu_age + self._imu_span, 0)
 
     def release(self) -> None:
         """Put the held robot on its feet where it is, and let go."""
         if self.held:
-            height, self.data.qpos[3:7] = self._legs.stand(self.joints)
+            height, self.data.qpos[3:7] = self._legs.stand(self.data.qpos[self._qpos])
             self.data.qpos[2] = height
             self.data.qvel[0:6] = 0.0
             self.held, self._ticks = False, 0
-            mujoco.mj_forward(self.model, self.data)
+            self._forward()
+
+    def _forward(self) -> None:
+        """Sense the body where it was put."""
+        mujoco.mj_forward(self.model, self.data)
+        self._recent[:] = self.data.sensordata
 
     def step(self, volts: Array, powered: Array, supply: float) -> None:
         """Advance by one `TIMESTEP` with `volts` across the windings of `powered` servos; the rest turn freely."""
@@ -129,6 +136,7 @@ class Plant:
         _push(self._angle, self._play)
         _push(self._speed, data.qvel[self._dof])
         _push(self._force, data.actuator_force)
+        _push(self._recent, data.sensordata)
         if not self.held:
             _push(self._imu, data.sensordata[:6])
 
@@ -146,6 +154,11 @@ class Plant:
         return self.data.qpos[self._qpos] + self.body.zero
 
     @property
+    def touches(self) -> Array:
+        """Contacts of the scene's sensors within the last tick `(n,)`."""
+        return self._recent[:, self._scene].max(0)
+
+    @property
     def joint_speed(self) -> Array:
         """True joint speeds [rad/s]."""
         return self.data.qvel[self._dof]
@@ -158,23 +171,22 @@ class Plant:
     @property
     def encoder(self) -> tuple[Array, Array, Array]:
         """What the servos have measured by now: angle [rad], speed [rad/s] with noise, torque [N m]."""
-        noise = _VELOCITY_NOISE * self._row()[6:]
+        noise = VELOCITY_NOISE * self._row()[6:]
         return self._angle[0] + self.body.zero, self._speed[0] + noise, self._force[0]
 
     @property
     def imu(self) -> Array:
         """Angular velocity [rad/s] and specific force [m/s2] `(6,)` in the base frame, with the board's errors."""
-        mean, noise, errors = self._imu[: self._imu_span].mean(0), self._row()[:6], self.robot.imu
-        gyro = _tilt(mean[:3], self.body.imu_tilt) + self.body.gyro_bias + errors.gyro_noise * noise[:3]
-        force = _tilt(mean[3:], self.body.imu_tilt) + self.body.accelerometer_bias
-        return np.concatenate([gyro, force + errors.accelerometer_noise * noise[3:]])
+        mean, body = self._imu[: self._imu_span].mean(0), self.body
+        errors = self.robot.imu, body.imu_tilt, body.gyro_bias, body.accelerometer_bias
+        return np.concatenate(with_errors(mean, self._row(), *errors))
 
     def _row(self) -> Array:
         """Standard normal noise `(6 + n_joints,)` of this control tick: a second read within it gives the same."""
         if self.held:
             return self._idle
         tick = int(self._ticks * TIMESTEP / self.robot.dt + 1e-6)
-        block, row = divmod(tick, _NOISE_ROWS)
+        block, row = divmod(tick, NOISE_ROWS)
         if block != self._noise_block:
             self._rng.standard_normal(out=self._noise)
             self._noise_block = block
@@ -184,9 +196,3 @@ class Plant:
 def _push(history: Array, newest: Array) -> None:
     history[:-1] = history[1:]
     history[-1] = newest
-
-
-def _tilt(vector: Array, angles: Array) -> Array:
-    """Turn `(3,)` by small angles `(2,)` about x and y."""
-    x, y = angles
-    return vector + np.array([y * vector[2], -x * vector[2], x * vector[1] - y * vector[0]])

@@ -66,13 +66,11 @@ class Rig:
         self.motors = Motors(robot, self.plant)
         self.now_ns = 0
         self.wire = Wire()
-        self.accepted: deque[Accepted] = deque(maxlen=_REMEMBERED)
-        self.forgotten = 0  # accepted writes that nobody asked for in time
         self.reset(seed, randomise=randomise)
 
-    def reset(self, seed: int, *, episode: int = 0, randomise: bool = False, pose: Array | None = None) -> None:
-        """A rig as delivered, its power off, held at `pose` (default: home); time goes on, faults begin anew."""
-        self.plant.reset(seed, episode=episode, randomise=randomise, pose=pose)
+    def reset(self, seed: int, *, randomise: bool = False) -> None:
+        """A rig as delivered, its power off, held at home; time goes on, faults begin anew."""
+        self.plant.reset(seed, randomise=randomise)
         self.motors.reset()
         self.auto_release = True  # onto its feet as soon as all servos have torque
         baud, self.wire = self.wire.host_baud, Wire()
@@ -83,6 +81,8 @@ class Rig:
         self._echo = self._babbles = self._cut = False
         self._next_step_ns = (self.now_ns // STEP_NS + 1) * STEP_NS
         self._held_back: list[tuple[int, bytes]] = []
+        self.accepted: deque[Accepted] = deque(maxlen=_REMEMBERED)
+        self.forgotten = 0  # accepted writes that nobody asked for in time
         self.servos = [
             VirtualServo(self.motors, i, servo.model_number, eeprom, self._record)
             for i, (servo, eeprom) in enumerate(zip(self.robot.servos, self.delivery.eeprom(self.robot), strict=True))
@@ -298,7 +298,8 @@ class Rig:
         ]
 
     def take_accepted(self) -> list[dict[str, Any]]:
-        """Writes that servos took since this was last asked, oldest first."""
+        """Writes that servos took since this was last asked or the rig reset, oldest first; `forgotten` begins anew."""
         taken = [asdict(entry) for entry in self.accepted]
         self.accepted.clear()
+        self.forgotten = 0
         return taken

@@ -25,8 +25,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Literal
 
-import numpy as np
-
 from hw.clock import wake_sharply
 from hw.config import ConfigError
 from hw.robot import load_robot
@@ -234,13 +232,10 @@ class Server:
         heard = self._exchange(max(to, self.rig.now_ns), visible=True)
         return {"now": self.rig.now_ns, "heard": heard}
 
-    def _reset(
-        self, seed: int, episode: int = 0, randomise: bool = False, pose: list[float] | None = None
-    ) -> dict[str, Any]:
+    def _reset(self, seed: int, randomise: bool = False) -> dict[str, Any]:
         if self.terminal.is_open:
             self.terminal.flush()
-        array = None if pose is None else np.asarray(pose, float)
-        self.rig.reset(seed, episode=episode, randomise=randomise, pose=array)
+        self.rig.reset(seed, randomise=randomise)
         self._plug()
         return {}
 

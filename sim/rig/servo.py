@@ -8,12 +8,11 @@ from collections.abc import Callable
 
 from hw.dynamixel.codec import StatusError
 from hw.dynamixel.tables import Item, table
+from sim.rig.delivery import ticks_per_turn
 from sim.rig.device import Device
 from sim.rig.firmware import CURRENT, CURRENT_POSITION, EXTENDED, FULL_PWM, POSITION, PWM
 from sim.rig.motors import Motors
 
-TURN = 4096  # ticks
-CENTRE = 2048  # tick of angle 0
 FIRMWARE = 52  # the newest that changed anything in the tables
 _HOMING_RANGE = 1024  # ticks that count in position mode
 _TURNS_RANGE = 1_048_575  # ticks of the modes that count turns
@@ -49,6 +48,8 @@ class VirtualServo(Device):
         super().__init__(table(model), {"firmware_version": FIRMWARE, **eeprom})
         items = self.table
         self._tick = items.item("present_position").scale
+        self._turn = ticks_per_turn(items)
+        self._centre = self._turn // 2  # tick of angle 0
         self._speed = items.item("present_velocity").scale
         self._acceleration = items.item("profile_acceleration").scale
         self._voltage = items.item("present_input_voltage").scale
@@ -74,11 +75,11 @@ class VirtualServo(Device):
 
     def angle_of(self, ticks: int) -> float:
         """Encoder angle [rad] of a position in the servo's own count."""
-        return (self._sign * (ticks - self._homing - CENTRE) + self._base) * self._tick
+        return (self._sign * (ticks - self._homing - self._centre) + self._base) * self._tick
 
     def ticks_of(self, angle: float) -> int:
         """The servo's count of an encoder angle [rad]."""
-        return self._sign * (round(angle / self._tick) - self._base) + CENTRE + self._homing
+        return self._sign * (round(angle / self._tick) - self._base) + self._centre + self._homing
 
     def allowed(self, item: Item, value: int) -> StatusError:
         if item.eeprom and self.torque:
@@ -137,11 +138,14 @@ class VirtualServo(Device):
 
     def _collapse(self) -> None:
         """In position mode only a position within the turn is known."""
-        if self.mode == POSITION:
-            turns = math.floor((round(float(self.motors.angle[self.index]) / self._tick) + CENTRE) / TURN)
-            if turns * TURN != self._base:
-                self._base, self._seen = turns * TURN, -1
-                self._goals_from_registers()
+        if self.mode == POSITION and (whole := self._whole_turns()) != self._base:
+            self._base, self._seen = whole, -1
+            self._goals_from_registers()
+
+    def _whole_turns(self) -> int:
+        """Ticks of the turns that the motor has made."""
+        ticks = round(float(self.motors.angle[self.index]) / self._tick) + self._centre
+        return math.floor(ticks / self._turn) * self._turn
 
     def _new_mode(self) -> None:
         for name in _MODE_RESETS:
@@ -280,8 +284,7 @@ class VirtualServo(Device):
         self.refresh(now_ns)
         if self.get("moving"):
             return StatusError.RESULT
-        angle = float(self.motors.angle[self.index])
-        self._base, self._seen = math.floor((round(angle / self._tick) + CENTRE) / TURN) * TURN, -1
+        self._base, self._seen = self._whole_turns(), -1
         if self.mode in (EXTENDED, CURRENT_POSITION):
             self._default_goals()
         return StatusError.NONE
@@ -291,6 +294,6 @@ class VirtualServo(Device):
         firmware.powered[i] = firmware.halted[i] = False
         firmware.error[i] = 0
         self._watch_ns, self._locked_out = None, False
-        self._base = math.floor((round(float(self.motors.angle[i]) / self._tick) + CENTRE) / TURN) * TURN
+        self._base = self._whole_turns()
         self._configure()
         self._default_goals()

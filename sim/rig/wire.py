@@ -10,7 +10,7 @@ import heapq
 import itertools
 from dataclasses import dataclass, field
 
-FRAME_BITS = 10
+FRAME_BITS = 10  # of a byte on the wire
 BATCH_NS = 500_000  # what the adapter waits for more bytes when a reply follows upon another
 _GAP_NS = 100_000  # silence that ends such a burst
 _BAUD_TOLERANCE = 0.03  # of a UART
@@ -25,7 +25,6 @@ class Transmission:
     data: bytearray
     host: bool
     lost: set[int] = field(default_factory=set)
-    broken: bool = False  # overlapped by another
 
     @property
     def byte_ns(self) -> float:
@@ -91,7 +90,6 @@ class Wire:
 
     def _collide(self, old: Transmission, new: Transmission) -> None:
         self.collisions += 1
-        old.broken = new.broken = True
         device, other = (new, old) if old.host else (old, new)
         for i in range(len(new.data)):
             middle = new.start_ns + (i + 0.5) * new.byte_ns

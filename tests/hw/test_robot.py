@@ -126,6 +126,7 @@ ROLL = "{name: l_sho_roll, servo: xm430-w350, id: 4, direction: 1, zero: 0.0, ra
         ("derate_temperature: 60", "derate_temperature: 75", "75 is not between 0 and limits.temperature (70)"),
         ("derate_voltage: 10.5", "derate_voltage: 9.9", "limits.derate_voltage: 9.9 V is not above limits.voltage"),
         ("stop_buttons: [mode,", "stop_buttons: [mod,", "bus.stop_buttons[0]: expected one of mode, start, user"),
+        ("average: 0.020", "average: -0.020", "imu.average: must not be negative, not -0.02"),
         ("kind: opencr", "kind: openrc", "imu.kind: expected one of opencr, witmotion, bno08x"),
         ("kind: opencr", "kind: bno08x", "imu.kind: a bno08x has a serial port of its own: name it as imu.port"),
         ("signs: [-1, -1, 1]", "signs: [-1, -1, 0]", "imu.signs[2]: must be 1 or -1, not 0"),

@@ -91,6 +91,19 @@ def test_a_robot_beside_others_is_what_it_is_alone(robot: Robot, randomise: bool
     assert not among.truth.fallen.any()
 
 
+def test_the_others_draw_from_streams_of_their_own(robot: Robot) -> None:
+    """Stream 1 of a seed is the task's (`stack.session`): its draws and the second robot's would be the same."""
+    body = SimBackend(robot, seed=3, scene=scene((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    biases = [drawn.gyro_bias.tolist() for drawn in body._worlds.bodies if drawn is not None]
+    same = []
+    for stream in range(3):
+        rng = np.random.default_rng([3, stream])
+        rng.random()
+        same.append(rng.uniform(-robot.imu.gyro_bias, robot.imu.gyro_bias, 3).tolist() in biases)
+    assert same == [True, False, False]
+    assert len({tuple(bias) for bias in biases}) == 3
+
+
 def test_one_that_is_switched_off_falls_alone(robot: Robot) -> None:
     body = SimBackend(robot, seed=0, scene=scene((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     hold(body, robot, 10)

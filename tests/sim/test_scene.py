@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from hw.robot import Robot, load_robot
 from sim.backend import SimBackend
 from sim.model import build
 from sim.render import Frame, render
+from sim.rig.plant import Plant
 from sim.scene import from_plain, plain, robot_bodies
 
 NOTHING = np.zeros((0, 3)), np.zeros((0, 4))
@@ -83,6 +85,31 @@ def test_a_sphere_rolls_to_the_robot_and_touches_it(robot: Robot) -> None:
     assert sensors.read().position.shape == (20,)
 
 
+def test_a_touch_that_is_over_before_the_tick_is_counts(robot: Robot) -> None:
+    """Torn away from a pillar, the robot touches it at the first of a tick's substeps alone."""
+    scene = Scene(np.array([[0.10, 0.0, 0.05]]), np.zeros((0, 4)))
+    body = SimBackend(robot, scene=scene)
+    body.push(np.array([-3.0, 0.0]))
+    seen = []
+    for tick in range(1, 4):
+        body.clock.sleep_until(tick * TICK)
+        seen.append(bool(body.truth.touching[0]))
+    assert (body._worlds._fresh["sensordata"][0, :, -1] == 0).all()
+    assert seen == [True, False, False]
+
+    plant = Plant(robot)
+    plant.furnish(scene)
+    plant.release()
+    assert plant.truth.touching[0]
+    plant.push(np.array([-3.0, 0.0]))
+    seen = []
+    for _ in range(10):
+        plant.step(np.zeros(20), np.zeros(20, bool), 12.0)
+        seen.append((plant.data.sensordata[-1] > 0, bool(plant.truth.touching[0]), bool(plant.touches[0])))
+    assert not seen[4][0]
+    assert [touching for _, *touching in seen[4::5]] == [[True, True], [False, False]]
+
+
 def test_what_is_seen_is_right_relative_to_the_robot_wherever_it_believes_to_be(robot: Robot) -> None:
     scene = Scene(np.array([[1.0, 0.5, 0.05]]), np.zeros((0, 4)), np.array([2.0, 0.0]))
     body = SimBackend(robot, scene=scene)  # truly at the origin, facing x
@@ -98,6 +125,8 @@ def test_a_scene_survives_its_way_to_a_rig() -> None:
     np.testing.assert_array_equal(back.pillars, scene.pillars)
     np.testing.assert_array_equal(back.goal, scene.goal)
     assert back.spheres.shape == (0, 4)
+    with pytest.raises(ValueError, match="has one robot"):  # whoever waits for the others would wait for ever
+        plain(replace(scene, robots=np.zeros((1, 5))))
 
 
 def test_pillars_and_spheres_are_drawn() -> None:

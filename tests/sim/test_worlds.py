@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 import sim.worlds
-from hw.config import CONFIGS, ConfigError
+from hw.config import ConfigError
 from hw.hal import Command, Mode, Observation
-from hw.robot import load_robot
+from hw.robot import Robot, load_robot
 from sim.model import TIMESTEP, build
 from sim.randomise import (
     BACKLASH,
@@ -210,13 +211,17 @@ def test_commands_act_after_the_delay(monkeypatch: pytest.MonkeyPatch, delay: fl
     assert first_torque(make(monkeypatch, command_delay=delay)) == pytest.approx(delay)
 
 
+def with_servos(folder: Path, **changes: Any) -> Robot:
+    """The robot with servos of the user's own."""
+    robot = Path(ROBOT.mjcf).with_suffix(".yaml").read_text().replace("mjcf: op3.xml", f"mjcf: {ROBOT.mjcf}")
+    (folder / "servo.yaml").write_text(yaml.safe_dump(asdict(replace(ROBOT.servos[0], **changes))))
+    (folder / "own.yaml").write_text(robot.replace("xm430-w350", "servo.yaml"))
+    return load_robot(folder / "own.yaml")
+
+
 def test_a_slow_servo_of_the_users_own_is_not_sped_up(tmp_path: Path) -> None:
-    servo = (CONFIGS / "servos" / "xm430-w350.yaml").read_text()
-    servo = servo.replace("command_delay: 0.020", "command_delay: 0.080")
-    (tmp_path / "slow.yaml").write_text(servo.replace("position_latency: 0.004", "position_latency: 0.060"))
-    text = (CONFIGS / "robots" / "op3.yaml").read_text().replace("mjcf: op3.xml", f"mjcf: {ROBOT.mjcf}")
-    (tmp_path / "own.yaml").write_text(text.replace("xm430-w350", "slow.yaml"))
-    worlds = started(Worlds(load_robot(tmp_path / "own.yaml"), 1, threads=1))
+    robot = with_servos(tmp_path, command_delay=0.080, position_latency=0.060)
+    worlds = started(Worlds(robot, 1, threads=1))
     assert first_torque(worlds) == pytest.approx(0.080)
     moved = []
     for _ in range(6):
@@ -332,6 +337,25 @@ def test_randomised_robots_are_drawn_inside_the_ranges() -> None:
     assert STIFFNESS == (5.0, 19.0)
     assert COMMAND_DELAY == (0.008, 0.040)
     assert {body.backlash for body in bodies} == {BACKLASH}
+
+
+def test_another_servo_is_randomised_about_its_own_values(tmp_path: Path) -> None:
+    """The ranges are an XM430's: a small servo of 7.4 V, or a slow one, would be drawn as none that there is."""
+    own = {"stiffness": 4.7, "voltage": 6.0, "command_delay": 0.060, "position_latency": 0.012}
+    robot = with_servos(tmp_path, **own, voltage_range=(5.0, 9.0))
+    theirs, ours = (draw(np.random.default_rng(7), r, 21, True) for r in (ROBOT, robot))
+    factors = {"stiffness": 0.5, "voltage": 0.5, "command_delay": 3.0, "joint_latency": 3.0, "imu_latency": 1.0}
+    for name, factor in factors.items():
+        assert getattr(ours, name) == pytest.approx(factor * getattr(theirs, name)), name
+    worlds = started(Worlds(robot, 20, threads=1, randomise=1.0))
+    delays = np.array([body.command_delay for body in worlds.bodies if body])
+    assert delays.max() > 0.1
+    moved = []
+    for _ in range(8):
+        worlds.step(pan(0.3))
+        moved.append(np.abs(worlds._fresh["actuator_force"][:, :, HEAD]).max(-1) > 0.5)
+    ticks = np.argmax(moved, 0)
+    np.testing.assert_array_equal(ticks, np.floor(np.ceil(delays / TIMESTEP) * TIMESTEP / ROBOT.dt + 1e-6))
 
 
 def test_nominal_robots_are_nominal_but_for_the_imus_bias() -> None:

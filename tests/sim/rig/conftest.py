@@ -24,7 +24,6 @@ def shared_rig(robot: Robot) -> Rig:
 def rig(shared_rig: Rig) -> Rig:
     shared_rig.scenario = Scenario()
     shared_rig.reset(0)
-    shared_rig.accepted.clear()
     return shared_rig
 
 

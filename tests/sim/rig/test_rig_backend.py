@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from hw.dynamixel.backend import DynamixelBackend
-from hw.hal import BackendError, Command, Mode
+from hw.hal import BackendError, Command, Mode, Scene
 from hw.robot import load_robot
 from sim.backend import SimBackend
+from sim.rig import control
 from sim.rig.backend import VirtualBackend
 from sim.rig.control import RigProcess
 
@@ -87,20 +88,31 @@ def test_the_truth_is_asked_for_once_an_instant(monkeypatch: pytest.MonkeyPatch)
     assert [op for op in asked if op in ("truth", "push")] == ["truth", "truth", "push", "truth"]
 
 
+@pytest.mark.parametrize(("ahead", "touching"), [(0.10, True), (0.30, False)])
+def test_whether_it_touches_the_scene_is_told_by_the_rig(ahead: float, touching: bool) -> None:
+    body = VirtualBackend(ROBOT, scene=Scene(np.array([[ahead, 0.0, 0.05]]), np.zeros((0, 4))))
+    body.connect()
+    assert body.truth.touching.tolist() == [touching]
+    body.close()
+
+
 def test_a_seed_draws_the_same_robot_as_in_simulation() -> None:
-    """What a robot at rest shows of its draw: its battery's voltage and its gyro's bias about the vertical."""
+    """What a robot shows of its draw: battery voltage, the gyro's bias about the vertical, how late its head obeys."""
+    turned = ROBOT.home.copy()
+    turned[ROBOT.names.index("head_pan")] = 0.5
     shown = []
     for make in (SimBackend, VirtualBackend):
         for seed in (3, 4):
             body = make(ROBOT, seed=seed, randomise=True)
             sensors, motors = body.connect()
-            start, seen = body.clock.now_ns(), []
-            for tick in range(1, 81):
+            start, seen, head = body.clock.now_ns(), [], []
+            for tick in range(1, 86):
                 body.clock.sleep_until(start + tick * TICK)
                 seen.append(sensors.read())
-                motors.write(HOME)
-            turn = np.mean([o.angular_velocity[2] for o in seen[50:]])
-            shown.append((float(np.nanmedian(seen[-1].voltage)), float(turn)))
+                head.append(body.truth.joints[0, ROBOT.names.index("head_pan")])
+                motors.write(HOME if tick <= 80 else replace(HOME, position=turned))
+            turn = np.mean([o.angular_velocity[2] for o in seen[50:80]])
+            shown.append((float(np.nanmedian(seen[79].voltage)), float(turn), *head[80:]))
             body.close()
     sim, other_sim, virtual, other_virtual = shown
     assert virtual == pytest.approx(sim, abs=0.002)
@@ -147,6 +159,21 @@ def test_ctrl_c_while_it_starts_leaves_no_process(monkeypatch: pytest.MonkeyPatc
         VirtualBackend(ROBOT).connect()
     (process,) = started
     assert process.poll() is not None
+
+
+def test_a_rig_that_hangs_while_it_starts_is_given_up_and_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+    popen = subprocess.Popen
+
+    def hangs(command: list[str], **options: Any) -> Any:
+        started.append(popen(["sleep", "60"], **options))
+        return started[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", hangs)
+    monkeypatch.setattr(control, "_START_SECONDS", 0.2)
+    with pytest.raises(BackendError, match=r"did not start: nothing was heard of it for 0\.2 s"):
+        RigProcess(ROBOT)
+    assert started[0].poll() is not None
 
 
 def test_a_rig_that_died_is_a_bus_error_and_closing_still_ends_it() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import mujoco
 import numpy as np
 import pytest
 from rig_host import BOARD, Host
@@ -12,8 +13,10 @@ from hw.dynamixel import codec
 from hw.dynamixel.tables import table
 from hw.hal import Array, Command, Mode
 from hw.imu.mounting import Mounting
+from hw.legs import Legs
 from hw.robot import Robot
 from sim.rig.board import Board
+from sim.rig.plant import Plant
 from sim.rig.rig import Rig
 from sim.worlds import Worlds
 
@@ -75,6 +78,20 @@ def test_torque_on_everywhere_puts_the_robot_on_its_feet(host: Host) -> None:
     assert plant.truth.fallen[0], "without torque it collapses"
 
 
+def test_a_robot_is_put_with_its_soles_on_the_floor_whatever_its_encoders_say(robot: Robot) -> None:
+    """Its zeros are off: standing by its encoders it would begin above the floor or in it, and tilted."""
+    plant, legs = Plant(robot), Legs(robot)
+    for seed in range(5):
+        plant.reset(seed, randomise=True)
+        plant.release()
+        true = plant.data.qpos[plant._qpos]
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, plant.data.qpos[3:7])
+        corners = legs.soles(legs.pick(true))[1] @ turn.reshape(3, 3).T + plant.data.qpos[:3]
+        assert corners[..., 2].min() == pytest.approx(0.0, abs=1e-4)
+        assert np.ptp(corners[0, :, 2]) < 1e-4, "the first foot is flat"
+
+
 def test_a_limp_joint_of_a_held_robot_keeps_its_pose(host: Host) -> None:
     before = host.rig.plant.joints.copy()
     host.torque_on([PAN])
@@ -95,6 +112,20 @@ def test_velocity_mode_reaches_and_holds_a_speed(host: Host) -> None:
     host.write(PAN, "goal_velocity", 0)
     host.wait(1.0)
     assert abs(host.read(PAN, "present_velocity")) <= 2
+
+
+def test_velocity_mode_speeds_up_as_its_profile_says(host: Host) -> None:
+    """5 units are 1.87 rad/s2. It moves beside servos in position mode, whose profile is another matter."""
+    rad = 0.229 * 2 * math.pi / 60
+    host.write(PAN, "operating_mode", 1)
+    host.write(PAN, "profile_acceleration", 5)
+    host.write(PAN, "torque_enable", 1)
+    host.write(PAN, "goal_velocity", round(2.0 / rad))
+    host.wait(0.5)
+    assert 0.4 < host.read(PAN, "present_velocity") * rad < 1.0, "friction is still to be overcome"
+    assert host.read(PAN, "velocity_trajectory") * rad == pytest.approx(0.94, abs=0.1)
+    host.wait(1.0)
+    assert host.read(PAN, "present_velocity") * rad == pytest.approx(2.0, abs=0.1)
 
 
 def test_pwm_mode_drives_in_proportion_to_the_duty(host: Host) -> None:

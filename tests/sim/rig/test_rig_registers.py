@@ -7,10 +7,12 @@ import math
 import pytest
 from rig_host import BOARD, XM430, Host
 
+import sim.rig.rig
 from hw.dynamixel import codec
 from hw.dynamixel.codec import Reset, StatusError
 from hw.dynamixel.tables import models
 from hw.robot import Robot
+from sim.rig import operations
 from sim.rig.rig import Rig
 from sim.rig.servo import VirtualServo
 
@@ -250,6 +252,24 @@ def test_older_firmware_stays_silent_on_fast_reads(host: Host) -> None:
     ids = [host.rig.servos[0].id, host.rig.servos[1].id]
     assert host.ask(codec.sync_read(ids, 126, 10, fast=True)) == []
     assert len(host.ask(codec.sync_read(ids, 126, 10))) == 2
+
+
+def test_what_was_forgotten_is_told_once(host: Host, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A long walk that nobody asked about must not spoil all that comes after."""
+    ask = operations.find("accepted", host.rig)
+    monkeypatch.setattr(sim.rig.rig, "_REMEMBERED", 3)
+    host.rig.reset(0)
+    host.start()
+    for _ in range(2):
+        for goal in range(5):
+            host.write(1, "goal_position", 2000 + goal)
+        answer = ask()
+        assert ([entry["value"] for entry in answer["accepted"]], answer["forgotten"]) == ([2002, 2003, 2004], 2)
+        assert ask() == {"accepted": [], "forgotten": 0}
+    for goal in range(5):
+        host.write(1, "goal_position", 2000 + goal)
+    host.rig.reset(0)
+    assert ask() == {"accepted": [], "forgotten": 0}
 
 
 @pytest.mark.parametrize("model", [name for name in models() if name != "opencr"])

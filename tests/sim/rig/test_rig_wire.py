@@ -86,6 +86,19 @@ def test_a_silent_servo_costs_a_sync_read_one_answer_and_a_fast_one_the_rest(hos
     assert [block is not None for block in blocks] == [True] * 5 + [False] * 15
 
 
+def test_a_slow_packet_in_two_pieces_is_heard_and_one_that_pauses_is_not(host: Host) -> None:
+    """At 57600 a piece alone takes longer than the silence after which a packet is given up."""
+    servo = host.rig.servos[0]
+    servo.put("baud_rate", 1)
+    host.rig.wire.host_baud = 57600
+    whole = codec.write(servo.id, 65, bytes(100))  # too long for the register: refused, but heard
+    for pause, answers in ((0.0, 1), (0.008, 0)):
+        host.rig.host_sends(whole[:50])
+        host.wait(50 * 10 / 57600 + pause)
+        host.rig.host_sends(whole[50:])
+        assert len(host.parser.feed(host.wait(0.05))) == answers
+
+
 def test_bulk_reads_mix_registers_and_devices(host: Host) -> None:
     parts = [(1, 132, 4), (BOARD, 32, 12), (2, 144, 3)]
     answers = host.ask(codec.bulk_read(parts))
