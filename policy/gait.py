@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.config import CONFIGS, load_yaml
-from hw.hal import Array, ReferenceFrames
+from hw.hal import Array, Reference, ReferenceFrames
 from hw.legs import LegInverse, Legs
 from hw.robot import Robot
 
@@ -49,7 +49,7 @@ def load_gait(name: str = "gait") -> GaitSettings:
     return load_yaml(CONFIGS / "policies" / f"{name}.yaml", GaitSettings)
 
 
-class Gait:
+class Gait(Reference):
     """The walking reference. `command` `(..., 3)` is slewed, so that steps change gradually.
 
     Standing is the same motion with no lift and no sway: `activity` (0 to 1) fades the steps in and out.

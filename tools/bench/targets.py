@@ -98,7 +98,6 @@ class Servos:
         """A rig as delivered, with power."""
         rig = self._rig
         rig.reset(0)
-        rig.accepted.clear()
         rig.wire.host_baud = self._robot.bus.baud
         self._heard = 0
         rig.host_sends(codec.write(BOARD_ID, 24, b"\1"))
