@@ -11,7 +11,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from hw.calibration import calibrated, calibration_path, load_calibration
+from hw.calibration import (
+    Calibration,
+    JointCalibration,
+    calibrated,
+    calibration_path,
+    load_calibration,
+    save_calibration,
+)
 from hw.config import ConfigError
 from hw.hal import Array, BackendError
 from hw.robot import load_robot
@@ -25,6 +32,10 @@ from tools.bringup.turning import describe_turns
 
 ROBOT = load_robot()
 TICK = math.tau / 4096
+
+
+def never(*_: Any, **__: Any) -> Any:
+    raise AssertionError("the robot is measured")
 
 
 def test_it_finds_the_assembly_of_a_rig_on_a_serial_port_and_check_then_uses_it(
@@ -65,6 +76,30 @@ def test_it_finds_the_assembly_of_a_rig_on_a_serial_port_and_check_then_uses_it(
         assert {name for name in after if after[name] != before[name]} <= {"l_knee"}
         assert after["l_knee"].zero == pytest.approx(before["l_knee"].zero, abs=3 * TICK)
 
+        code, answer, err = bringup("calibrate", "--port", str(link), "--keep-directions", "--yes")
+        assert code == 0, err
+        for joint, true in zip(calibrated(ROBOT)[0].joints, truth.joints, strict=True):
+            assert joint.direction == true.direction, f"{joint.name} would be driven the wrong way"
+            assert joint.zero == pytest.approx(true.zero, abs=3 * TICK), joint.name
+
+
+@pytest.mark.parametrize("known", [None, "head_pan"])
+def test_what_was_never_measured_is_not_written_down_as_measured(
+    bringup: Any, configuration: Path, monkeypatch: pytest.MonkeyPatch, known: str | None
+) -> None:
+    """Of one joint alone, the others would be the robot file's, with a date and a pose that say otherwise."""
+    monkeypatch.setattr(calibrate, "open_line", never)
+    path = configuration / "op3.yaml"
+    if known is not None:
+        joint = ROBOT.joints[ROBOT.names.index(known)]
+        one = JointCalibration(joint.id, "xm430-w350", 1, 0.0)
+        save_calibration(Calibration("op3", "2026-01-01", "zero", {known: one}), path)
+    words = ("--port", "/dev/ttyUSB0", "--out", str(path), "--joint", "l_knee")
+    code, answer, _ = bringup("calibrate", *words)
+    assert code == 2
+    assert f"{path}: " in answer["error"]
+    assert "calibrate all joints first, without --joint" in answer["error"]
+
 
 def test_torque_and_registers_that_bend_angles_are_refused(rig: RigProcess, bringup: Any) -> None:
     from test_bringup_scan import write
@@ -98,10 +133,6 @@ def test_a_file_that_cannot_be_written_is_refused_before_anybody_measures(
     bringup: Any, configuration: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Or twenty joints are turned by hand, and what was measured is lost."""
-
-    def never(*_: Any, **__: Any) -> Any:
-        raise AssertionError("the robot is measured")
-
     monkeypatch.setattr(calibrate, "open_line", never)
     (configuration / "file").write_text("")
     out = configuration / "file" / "op3.yaml"
