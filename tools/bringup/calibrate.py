@@ -156,18 +156,22 @@ def directions_of(
     texts = describe_turns(robot, reference, signs)
     found = {}
     for count, i in enumerate(chosen, start=1):
-        start = encoders.still(PATIENCE)
         text = f"[{count}/{len(chosen)}] turn {robot.names[i]} by some 20 degrees, so that {texts[i]}; hold it there"
-        hands.turn(robot.names[i], int(signs[i]), text)
-        angle = turned(encoders, start, i, robot)
+        angle = None
+        while angle is None:
+            start = encoders.still(PATIENCE)
+            hands.turn(robot.names[i], int(signs[i]), text)
+            angle = turned(encoders, start, i, robot)
+            text = f"      it did not stay there: turn {robot.names[i]} again, so that {texts[i]}; hold it there"
         check_range(robot, i, float(reference[i]) + int(signs[i]) * abs(angle))
         hands.back(robot.names[i])
         found[i] = int(signs[i]) * (1 if angle > 0.0 else -1)
     return found
 
 
-def turned(encoders: Encoders, start: Array, i: int, robot: Robot) -> float:
-    """Wait until joint `i` was turned from `start`; by how much [rad] its servo turned.
+def turned(encoders: Encoders, start: Array, i: int, robot: Robot) -> float | None:
+    """Wait until joint `i` was turned from `start` and rests; by how much [rad] its servo turned. None when it was not
+    held there: of a joint that was put straight back, noise would tell the direction.
 
     Raises BackendError when another joint was, which is how swapped IDs show.
     """
@@ -179,7 +183,8 @@ def turned(encoders: Encoders, start: Array, i: int, robot: Robot) -> float:
     for _ in range(ticks):
         moved = short(encoders.read() - start)
         if abs(moved[i]) >= MOVED:
-            return float(short(encoders.still(PATIENCE) - start)[i])
+            angle = float(short(encoders.still(PATIENCE) - start)[i])
+            return angle if angle * moved[i] > 0.0 and abs(angle) >= MOVED / 2 else None
         other = int(np.abs(moved).argmax())
         others = others + 1 if abs(moved[other]) >= MOVED and abs(moved[i]) < MOVED / 4 else 0
         if others * PERIOD_NS >= _OTHER_SECONDS * 1e9:

@@ -26,7 +26,7 @@ from sim.model import build
 from sim.rig.control import LockedClock, RigProcess
 from sim.rig.delivery import Delivery
 from tools.bringup import calibrate
-from tools.bringup.calibrate import MOVED, check_range, turned
+from tools.bringup.calibrate import MOVED, check_range, directions_of, turned
 from tools.bringup.encoders import Encoders
 from tools.bringup.turning import describe_turns
 
@@ -177,6 +177,35 @@ START = np.full(20, np.pi - 0.01)
 def test_a_turn_is_seen_across_the_seam_and_with_other_joints_hanging_loose(by: float) -> None:
     """0.01 rad before the 4095/0 seam: taken as it reads, the joint would have turned by almost a whole turn."""
     assert turned(ByHand(moving(l_knee=by, l_ank_pitch=0.5)), START, KNEE, ROBOT) == pytest.approx(by, abs=0.01)
+
+
+class Hasty:
+    """Hands that put a joint straight back, less some play, and hold it there only when they are asked again."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self._count = 0
+
+    def pose(self, angles: Any, text: str) -> None: ...
+
+    def turn(self, joint: str, sign: int, text: str) -> None:
+        self.asked.append(text)
+        self._count = 0
+
+    def back(self, joint: str) -> None: ...
+
+    def angles(self, count: int) -> Array:
+        self._count += 1
+        straight_back = 0.3 if self._count < 5 else -0.01
+        return np.eye(20)[KNEE] * (0.0, straight_back, 0.3)[len(self.asked)]
+
+
+def test_a_joint_that_is_put_straight_back_is_asked_for_again() -> None:
+    """Its angle at rest is noise, and so would its direction be: the joint would then be driven the wrong way."""
+    hands = Hasty()
+    assert directions_of(ByHand(hands.angles), hands, ROBOT, np.zeros(20), [KNEE]) == {KNEE: 1}
+    assert len(hands.asked) == 2
+    assert "it did not stay there: turn l_knee again" in hands.asked[1]
 
 
 def test_another_joint_than_asked_is_named_with_both_ids() -> None:
