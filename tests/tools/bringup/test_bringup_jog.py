@@ -187,6 +187,28 @@ def test_there_and_back_ends_where_it_began(rate: int, missed: int, by: float) -
     assert np.count_nonzero(np.diff(np.sign(moves[moves != 0.0]))) == 1, "there and back"
 
 
+@pytest.mark.parametrize(("by", "start"), [(0.35, 0.004), (-0.35, -0.004), (0.35, 0.0)])
+def test_there_and_back_ends_where_the_guard_lets_the_joint_go_no_further(by: float, start: float) -> None:
+    """A joint that sagged a little between two reads has less than SPAN left: it must not push at that end for ever."""
+    source, angle, wish, farthest = There(by, 0.02), start, Wish.HOLD, start
+    for tick in range(400):
+        wish = source.wish(tick / 50, angle)
+        if wish is Wish.END:
+            break
+        angle = min(max(angle + wish.value * SPEED / 50, -SPAN), SPAN)
+        farthest = max(farthest, angle, key=abs)
+    assert wish is Wish.END
+    assert abs(farthest) == pytest.approx(SPAN, abs=SPEED / 50)
+    assert angle == pytest.approx(start, abs=SPEED / 50)
+
+
+def test_a_motion_there_and_back_has_an_end_whatever_the_joint_does() -> None:
+    source = There(0.1, 0.02)
+    wishes = [source.wish(tick / 50, 0.001 * (tick % 2)) for tick in range(500)]
+    assert wishes[0] is Wish.UP
+    assert wishes[-1] is Wish.END
+
+
 def test_a_burst_of_keys_moves_no_further_than_one_and_idleness_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """Thirty repeats that a slow line held up and delivered at once must not become a second of motion."""
     from tools.bringup import jogging
