@@ -38,6 +38,7 @@ class Recorder:
         self.error: str | None = None
         self._file, self._name, self._wait = file, name, wait
         self._items: queue.Queue[Item | None] = queue.Queue(BACKLOG)
+        self._closing = False  # the last item, None, was taken
         self._time = 0
         self._thread = threading.Thread(target=self._work, args=(plain(header),), name="recorder", daemon=True)
         self._thread.start()
@@ -98,8 +99,13 @@ class Recorder:
                 self._file.close()
             except OSError as error:  # what was buffered does not fit either
                 self._fail(error.strerror or str(error))
-        while self.error is not None and self._items.get() is not None:
-            pass  # drop what comes, so that nobody waits for room
+        while self.error is not None and not self._closing:
+            self._take()  # drop what comes, so that nobody waits for room
+
+    def _take(self) -> Item | None:
+        item = self._items.get()
+        self._closing = item is None
+        return item
 
     def _write(self, header: dict[str, Any]) -> None:
         stream = _Flushed(self._file)
@@ -121,7 +127,7 @@ class Recorder:
 
         # Larger than a chunk on purpose, with its padding of blanks, so that the header reaches the disk at once.
         writer.add_message(channels["/run"], 0, json.dumps(header).encode().ljust(CHUNK_BYTES), 0, 0)
-        while (item := self._items.get()) is not None:
+        while (item := self._take()) is not None:
             if isinstance(item, TickRecord):
                 for topic, message in messages(item):
                     add(item.observation.time_ns, topic, message)
