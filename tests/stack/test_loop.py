@@ -90,6 +90,8 @@ def test_a_slow_tick_is_skipped_over_and_the_target_gets_no_leap():
     assert 34 in ticks
     assert not {31, 32, 33} & set(ticks)
     assert sum(record.timing.missed for record in records) == 3
+    told = loop._estimator.ticks
+    assert (told[ticks.index(34)], sum(told) - len(told)) == (4, 3), "the estimator knows of the missed ones"
     leaps = np.abs(np.diff([command.position for command in body.sent], axis=0)).max()
     assert leaps <= ROBOT.limits.joint_speed * ROBOT.dt * ROBOT.limits.stale + 1e-9
 
