@@ -122,9 +122,9 @@ class Loop:
         observation = self._coast.update(raw)
         state = self._estimate(wake.tick, observation) if complete(observation) else None
         estimated = time.perf_counter_ns()
+        self._heed(wake.tick)  # first: a signal that asks to stop may have ended a planner, too
         proposal = self._act(wake.tick, observation, state)
         acted = time.perf_counter_ns()
-        self._heed(wake.tick)
         command = self._guard.decide(observation, state, proposal.target)
         guarded = time.perf_counter_ns()
         self._guard.send()

@@ -153,6 +153,27 @@ def test_one_ctrl_c_lowers_and_a_second_cuts_torque_at_once():
     assert any(event.text == TWICE for record in records for event in record.events)
 
 
+def test_a_stop_that_is_due_is_heeded_before_the_policy_is_asked_again():
+    """A SIGTERM to the process group ends the planner as well: a policy that then fails must not keep a standing robot
+    from being lowered."""
+
+    def targets(tick):
+        if interrupt.count:
+            guard.fault("policy", "the planner process was killed by signal 15")
+        return ROBOT.home
+
+    def terminate(record):
+        if record.tick == 30:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    _, guard, interrupt, loop, records = make(targets, listeners=(terminate,))
+    with interrupt:
+        loop.run()
+    assert guard.cause == "interrupt"
+    assert Phase.LOWERING in {record.phase for record in records}
+    assert guard.phase is Phase.DAMPED
+
+
 def test_a_policy_that_hangs_is_broken_off_by_the_second_ctrl_c():
     def targets(tick):
         signal.setitimer(signal.ITIMER_REAL, 0.05)
