@@ -46,14 +46,7 @@ class Recorder:
     @classmethod
     def create(cls, path: Path, header: dict[str, Any], *, wait: bool = False) -> Recorder:
         """Record to a new file. Raises ConfigError if it cannot be made; an existing file is never overwritten."""
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            file = path.open("xb")
-        except FileExistsError:
-            raise ConfigError(f"{path}: exists already, and a log is never overwritten: give another name") from None
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be written ({error.strerror}): choose another place") from None
-        return cls(file, header, wait=wait, name=str(path))
+        return cls(_make(path), header, wait=wait, name=str(path))
 
     def __call__(self, record: TickRecord) -> None:
         self._time = record.observation.time_ns
@@ -136,6 +129,22 @@ class Recorder:
                     add(item[0], topic, message)
         writer.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
+
+
+def check_new(path: Path) -> None:
+    """Raise ConfigError where `Recorder.create` would; leaves no file."""
+    _make(path).close()
+    path.unlink()
+
+
+def _make(path: Path) -> BinaryIO:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path.open("xb")
+    except FileExistsError:
+        raise ConfigError(f"{path}: exists already, and a log is never overwritten: give another name") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror}): choose another place") from None
 
 
 class _Flushed:
