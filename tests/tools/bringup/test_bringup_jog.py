@@ -63,6 +63,8 @@ def test_what_will_happen_is_told_before_anything_moves(
         code, answer, err = bringup("jog", "l_knee", "--by", "0.2", *VIRTUAL)
     assert code == 2
     assert "Torque will come on at all 20 joints" in err
+    # Or nobody can say whether it then moves the wrong way.
+    assert "A positive turn of it, with the robot upright: what it carries goes backward (right-hand rule" in err
     assert "give --start" in answer["error"]
     assert rig.control.accepted() == [], "nobody pressed Enter"
 
