@@ -8,12 +8,14 @@ import time
 from dataclasses import replace
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
 from hw.dynamixel.bus import Bus
 from hw.hal import Observation
 from hw.robot import load_robot
+from sim.model import build
 from sim.rig.control import RigProcess
 from sim.rig.local import LocalLine
 from sim.rig.rig import Rig
@@ -253,6 +255,39 @@ def test_watch_shows_every_servo_and_what_the_bus_lost(rig: RigProcess, bringup:
     assert answer["bus"]["recovered"] > 0
     assert "encoder" in err
     assert torque(rig) == 0
+
+
+def test_watch_shows_the_imu_and_why_there_is_no_sample_of_it(rig: RigProcess, bringup: Any) -> None:
+    """Signs that are wrong must be seen here, and not when the robot falls."""
+    code, answer, err = bringup("watch", "--seconds", "0.5", *VIRTUAL)
+    assert code == 0, err
+    assert np.linalg.norm(answer["imu"]["specific_force"]) == pytest.approx(9.81, abs=0.5)
+    assert answer["imu"]["specific_force"][2] > 9.0
+    assert "IMU: force " in err
+    rig.control.inject("imu_dead")
+    _, _, err = bringup("watch", "--seconds", "2", *VIRTUAL)
+    assert "IMU: no fresh sample (it measures nothing): check its cable" in err
+
+
+@pytest.mark.parametrize(
+    ("axis", "angle", "turning", "force"),
+    [
+        ((0, 0, 1), 0.0, 1.0, (0.0, 0.0, 9.81)),  # level, turned left
+        ((0, 1, 0), 0.5, 0.0, (-4.7, 0.0, 8.61)),  # nose down
+        ((1, 0, 0), -0.5, 0.0, (0.0, -4.7, 8.61)),  # left side down
+    ],
+)
+def test_what_the_page_says_of_the_imu_is_what_physics_does(
+    axis: tuple[float, ...], angle: float, turning: float, force: tuple[float, ...]
+) -> None:
+    """Or signs are "corrected" that were right."""
+    model = build(ROBOT)
+    data = mujoco.MjData(model)
+    mujoco.mju_axisAngle2Quat(data.qpos[3:7], np.array(axis, float), angle)
+    data.qvel[5] = turning
+    mujoco.mj_inverse(model, data)  # the acceleration is none: it is held
+    assert data.sensor("accelerometer").data == pytest.approx(force, abs=0.05)
+    assert data.sensor("gyro").data[2] == pytest.approx(turning)
 
 
 def test_watch_counts_more_reads_than_it_keeps_the_times_of(
