@@ -119,7 +119,7 @@ def _measure(
     encoders = Encoders(line.bus, line.clock, robot, found)
     hands: Hands = Person(report) if line.control is None else VirtualHands(line.control, robot, report)
     angles = dict(zip(robot.names, reference.tolist(), strict=True))
-    where = "every joint at 0, as in the robot's drawing" if args.pose == "zero" else "its home pose, standing"
+    where = "every joint at 0" if args.pose == "zero" else "its home pose, standing"
     hands.pose(angles, f"{robot.name} is limp. Put it into its reference pose, {where}, and hold it still")
     at_reference = encoders.still(PATIENCE)
     directions = np.array([earlier.get(joint.name, joint).direction for joint in robot.joints])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,7 +30,9 @@ from sim.rig.delivery import Delivery
 from tools.bringup import calibrate
 from tools.bringup.calibrate import MOVED, check_range, directions_of, turned
 from tools.bringup.encoders import Encoders
+from tools.bringup.hands import Person
 from tools.bringup.turning import describe_turns
+from tools.output import Report
 
 ROBOT = load_robot()
 TICK = math.tau / 4096
@@ -177,6 +181,20 @@ START = np.full(20, np.pi - 0.01)
 def test_a_turn_is_seen_across_the_seam_and_with_other_joints_hanging_loose(by: float) -> None:
     """0.01 rad before the 4095/0 seam: taken as it reads, the joint would have turned by almost a whole turn."""
     assert turned(ByHand(moving(l_knee=by, l_ank_pitch=0.5)), START, KNEE, ROBOT) == pytest.approx(by, abs=0.01)
+
+
+def test_a_person_is_told_the_angles_of_a_pose_that_is_not_all_zero(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nobody could put a robot into a pose of which the name is all that is said."""
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n\n"))
+    hands = Person(Report(False, sys.stdout))
+    hands.pose(dict(zip(ROBOT.names, ROBOT.home.tolist(), strict=True)), "the home pose")
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert rows[0] == ["joint", "rad", "degrees"]
+    assert ["l_knee", "+0.852", "+49"] in rows
+    hands.pose(dict.fromkeys(ROBOT.names, 0.0), "all at 0")
+    assert capsys.readouterr().out == ""
 
 
 class Hasty:
