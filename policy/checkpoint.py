@@ -145,13 +145,16 @@ def check(path: Path, head: Mapping[str, Any], kind: str, robot: Robot) -> None:
     if head["kind"] != kind:
         raise CheckpointError(f"{path}: holds a {head['kind']} network, and a {kind} network is needed")
     theirs, ours = list(head["joints"]), list(robot.names)
+    # The one network that every run of a robot needs, and that a robot of one's own does not come with.
+    remedy = f"; train it once: servoid train odometry --policy gait --robot FILE --out {path}"
+    remedy = remedy if kind == "odometry" else ""
     if theirs != ours:
         reason = difference(theirs, ours)
-        raise CheckpointError(f"{path}: made for {head['robot']}, its joints do not fit {robot.name}: {reason}")
+        raise CheckpointError(f"{path}: made for {head['robot']}, its joints do not fit {robot.name}: {reason}{remedy}")
     if head["rate"] != robot.rate:
         raise CheckpointError(
             f"{path}: made for {head['rate']} ticks a second, and {robot.name} runs at {robot.rate}; "
-            f"set rate: {head['rate']} in the robot's file or use another checkpoint"
+            f"set rate: {head['rate']} in the robot's file or use another checkpoint{remedy}"
         )
 
 

@@ -69,19 +69,27 @@ class Attitude:
         # A bias that was given counts as a full memory.
         self._seen = np.where(where, 0.0 if bias is None else _BIAS_MEMORY, self._seen)
 
-    def update(self, gyro: Array, specific_force: Array, joint_velocity: Array, leaning: Array | float = 0.0) -> Array:
-        """Go on by one tick; returns the angular velocity without bias `(..., 3)` rad/s. NaN inputs coast.
+    def update(
+        self,
+        gyro: Array,
+        specific_force: Array,
+        joint_velocity: Array,
+        leaning: Array | float = 0.0,
+        ticks: int = 1,
+    ) -> Array:
+        """Go on by `ticks`; returns the angular velocity without bias `(..., 3)` rad/s. NaN inputs coast.
 
         `leaning` `(..., 3)` rad/s is how fast the base turns over standing feet, by the legs.
         """
+        dt = self._dt * ticks
         rate = np.where(np.isfinite(gyro), gyro - self.bias, 0.0)
-        self._learn_bias(gyro, rate, joint_velocity, leaning)
+        self._learn_bias(gyro, rate, joint_velocity, leaning, dt)
         norm = np.linalg.norm(specific_force, axis=-1, keepdims=True)
         good = np.isfinite(norm) & (norm > 1.0)
         measured = np.where(good, specific_force / np.where(good, norm, 1.0), 0.0)
         trust = np.where(good, 1.0 / (1.0 + (np.where(good, norm - _GRAVITY, 0.0) / _TRUST) ** 2), 0.0)
         turn = rate + _CORRECTION * trust * cross(measured, up_vector(self.quaternion))
-        angle = 0.5 * self._dt * turn
+        angle = 0.5 * dt * turn
         step = np.concatenate([np.ones((*self._shape, 1)), angle], -1)
         q = _multiply(self.quaternion, step)
         self.quaternion = q / np.linalg.norm(q, axis=-1, keepdims=True)
@@ -89,15 +97,15 @@ class Attitude:
         self.yaw = self.yaw + (change + np.pi) % (2 * np.pi) - np.pi
         return rate
 
-    def _learn_bias(self, gyro: Array, rate: Array, joint_velocity: Array, leaning: Array | float) -> None:
+    def _learn_bias(self, gyro: Array, rate: Array, joint_velocity: Array, leaning: Array | float, dt: float) -> None:
         """Average the gyro while the robot stands. A soft robot creeps for seconds: what its legs say is no bias."""
         quiet = (np.abs(joint_velocity) < _STILL_JOINTS).all(-1)
         judged = np.where((self._seen < _FIRST)[..., None], gyro, rate)  # a few ticks' mean is no bias to judge by
         quiet &= (np.linalg.norm(judged, axis=-1) < _STILL_RATE) & np.isfinite(gyro).all(-1)
-        self._still = np.where(quiet, self._still + self._dt, 0.0)
+        self._still = np.where(quiet, self._still + dt, 0.0)
         learn = self._still > _STILL_TIME
-        self._seen = np.where(learn, np.minimum(self._seen + self._dt, _BIAS_MEMORY), self._seen)
-        share = np.where(learn, self._dt / np.maximum(self._seen, self._dt), 0.0)[..., None]
+        self._seen = np.where(learn, np.minimum(self._seen + dt, _BIAS_MEMORY), self._seen)
+        share = np.where(learn, dt / np.maximum(self._seen, dt), 0.0)[..., None]
         self.bias = self.bias + share * np.where(np.isfinite(gyro), gyro - leaning - self.bias, 0.0)
 
 

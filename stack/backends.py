@@ -51,6 +51,8 @@ def make_backend(
         raise ConfigError(f"backend '{name}' has one robot, and the task asks for {len(scene.robots) + 1}: give {able}")
     if kind.simulated and port is not None:
         raise ConfigError(f"backend '{name}' has no port: drop --port, or choose --backend dynamixel")
+    if port == "virtual":
+        raise ConfigError("--port virtual belongs to servoid bringup: for a run give --backend virtual, without --port")
     if not kind.simulated and port is None:
         raise ConfigError(f"backend '{name}' needs a port: give --port PATH (`servoid bringup find-port` finds it)")
     if not kind.simulated and randomise:

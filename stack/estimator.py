@@ -55,19 +55,23 @@ class Estimator:
         self._displacement = np.zeros((*self.shape, 3))
         self._heading0 = self._attitude.yaw.copy()
 
-    def update(self, observation: Observation, applied: Array) -> State:
+    def update(self, observation: Observation, applied: Array, ticks: int = 1) -> State:
         """Estimate from one observation. `applied` `(..., n_joints)` rad is what was commanded last.
 
-        A joint that was not read keeps its last value.
+        A joint that was not read keeps its last value. `ticks` passed since the observation before: more than one where
+        some were missed, in which the robot is taken to have moved as it does now, for as long as a sample is no older
+        than `stale`.
         """
+        ticks = min(ticks, self.robot.limits.stale)
+        dt = self.robot.dt * ticks
         q = np.where(np.isfinite(observation.position), observation.position, self._position)
         dq = np.where(np.isfinite(observation.velocity), observation.velocity, self._velocity)
         if self._pending.any():
             self._start(observation, q)
         self._position, self._velocity = q, dq
         position, rotation, origins, axes = self._legs.forward(self._legs.pick(q))
-        leaning = self._leaning(rotation)
-        rate = self._attitude.update(observation.angular_velocity, observation.specific_force, dq, leaning)
+        leaning = self._leaning(rotation, dt)
+        rate = self._attitude.update(observation.angular_velocity, observation.specific_force, dq, leaning, ticks)
         up = up_vector(self._attitude.quaternion)
 
         leg_rate = self._legs.pick(dq)
@@ -87,7 +91,8 @@ class Estimator:
         foot_velocity = np.einsum("...ij,...lj->...li", to_heading, foot_velocity)
         self.leg_velocity = np.einsum("...l,...li->...i", contact, foot_velocity)
         force = np.where(np.isfinite(observation.specific_force), observation.specific_force, 0.0)
-        self.features.push(up, rate, force, q, dq, applied, foot_velocity, contact)
+        for _ in range(ticks):  # the network sees so many ticks back
+            self.features.push(up, rate, force, q, dq, applied, foot_velocity, contact)
         velocity = self.leg_velocity
         if self._odometry is not None:
             velocity = velocity + self._odometry(self.features.window())
@@ -95,7 +100,7 @@ class Estimator:
         yaw = self._attitude.yaw - self._heading0
         c, s = np.cos(yaw), np.sin(yaw)
         step = joined(c * velocity[..., 0] - s * velocity[..., 1], s * velocity[..., 0] + c * velocity[..., 1])
-        self._displacement[..., :2] += step * self.robot.dt
+        self._displacement[..., :2] += step * dt
         self._displacement[..., 2] = -ground[..., 0]
         half = self._heading0 / 2
         return State(
@@ -111,8 +116,9 @@ class Estimator:
             contact=contact,
         )
 
-    def _leaning(self, rotation: Array) -> Array:
-        """How fast the base turns over soles `(..., n_feet, 3, 3)` that stay flat, `(..., 3)` rad/s in the base frame.
+    def _leaning(self, rotation: Array, dt: float) -> Array:
+        """How fast the base turned in `dt` [s] over soles `(..., n_feet, 3, 3)` that stay flat, `(..., 3)` rad/s in the
+        base frame.
 
         From angles, not from the servos' velocities: their resolution is coarser than the creep of a soft robot.
         """
@@ -121,7 +127,7 @@ class Estimator:
         self._soles, self._seen = rotation, np.ones(self.shape, bool)
         turn = np.einsum("...lij,...lkj->...ik", rotation, before) / rotation.shape[-3]
         skew = 0.5 * (turn - np.swapaxes(turn, -1, -2))
-        return -joined(skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]) / self.robot.dt
+        return -joined(skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]) / dt
 
     def _start(self, observation: Observation, q: Array) -> None:
         where = self._pending

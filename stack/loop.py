@@ -63,13 +63,14 @@ class TickRecord:
 
 
 class Estimator(Protocol):
-    """Makes states of observations; `applied` is the last accepted goal, `(n_joints,)` rad."""
+    """Makes states of observations; `applied` is the last accepted goal, `(n_joints,)` rad, and `ticks` is how many
+    have passed since the observation before."""
 
     def reset(self) -> None: ...
 
     def reset_odometry(self) -> None: ...
 
-    def update(self, observation: Observation, applied: Array) -> State: ...
+    def update(self, observation: Observation, applied: Array, ticks: int) -> State: ...
 
 
 class Pilot(Protocol):
@@ -98,6 +99,7 @@ class Loop:
         self._sensors, self._estimator, self._pilot, self._guard = sensors, estimator, pilot, guard
         self._schedule, self._interrupt, self._stops, self._listeners = schedule, interrupt, stops, listeners
         self._coast = Coast()
+        self._estimated: int | None = None  # tick of the newest state
         self._record_ns = 0
 
     def run(self) -> None:
@@ -118,11 +120,11 @@ class Loop:
         read = time.perf_counter_ns()
         self._guard.begin(wake.tick, raw.time_ns)
         observation = self._coast.update(raw)
-        state = self._estimator.update(observation, self._guard.applied) if complete(observation) else None
+        state = self._estimate(wake.tick, observation) if complete(observation) else None
         estimated = time.perf_counter_ns()
+        self._heed(wake.tick)  # first: a signal that asks to stop may have ended a planner, too
         proposal = self._act(wake.tick, observation, state)
         acted = time.perf_counter_ns()
-        self._heed(wake.tick)
         command = self._guard.decide(observation, state, proposal.target)
         guarded = time.perf_counter_ns()
         self._guard.send()
@@ -141,6 +143,11 @@ class Loop:
         for listener in self._listeners:
             listener(record)
         self._record_ns = time.perf_counter_ns() - written
+
+    def _estimate(self, tick: int, observation: Observation) -> State:
+        ticks = 1 if self._estimated is None else tick - self._estimated
+        self._estimated = tick
+        return self._estimator.update(observation, self._guard.applied, ticks)
 
     def _act(self, tick: int, observation: Observation, state: State | None) -> Proposal:
         self._interrupt.breakable = True  # nothing is written here, so a hung policy may be cut off

@@ -38,6 +38,7 @@ class Recorder:
         self.error: str | None = None
         self._file, self._name, self._wait = file, name, wait
         self._items: queue.Queue[Item | None] = queue.Queue(BACKLOG)
+        self._closing = False  # the last item, None, was taken
         self._time = 0
         self._thread = threading.Thread(target=self._work, args=(plain(header),), name="recorder", daemon=True)
         self._thread.start()
@@ -45,14 +46,7 @@ class Recorder:
     @classmethod
     def create(cls, path: Path, header: dict[str, Any], *, wait: bool = False) -> Recorder:
         """Record to a new file. Raises ConfigError if it cannot be made; an existing file is never overwritten."""
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            file = path.open("xb")
-        except FileExistsError:
-            raise ConfigError(f"{path}: exists already, and a log is never overwritten: give another name") from None
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be written ({error.strerror}): choose another place") from None
-        return cls(file, header, wait=wait, name=str(path))
+        return cls(_make(path), header, wait=wait, name=str(path))
 
     def __call__(self, record: TickRecord) -> None:
         self._time = record.observation.time_ns
@@ -98,8 +92,13 @@ class Recorder:
                 self._file.close()
             except OSError as error:  # what was buffered does not fit either
                 self._fail(error.strerror or str(error))
-        while self.error is not None and self._items.get() is not None:
-            pass  # drop what comes, so that nobody waits for room
+        while self.error is not None and not self._closing:
+            self._take()  # drop what comes, so that nobody waits for room
+
+    def _take(self) -> Item | None:
+        item = self._items.get()
+        self._closing = item is None
+        return item
 
     def _write(self, header: dict[str, Any]) -> None:
         stream = _Flushed(self._file)
@@ -121,7 +120,7 @@ class Recorder:
 
         # Larger than a chunk on purpose, with its padding of blanks, so that the header reaches the disk at once.
         writer.add_message(channels["/run"], 0, json.dumps(header).encode().ljust(CHUNK_BYTES), 0, 0)
-        while (item := self._items.get()) is not None:
+        while (item := self._take()) is not None:
             if isinstance(item, TickRecord):
                 for topic, message in messages(item):
                     add(item.observation.time_ns, topic, message)
@@ -130,6 +129,22 @@ class Recorder:
                     add(item[0], topic, message)
         writer.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
+
+
+def check_new(path: Path) -> None:
+    """Raise ConfigError where `Recorder.create` would; leaves no file."""
+    _make(path).close()
+    path.unlink()
+
+
+def _make(path: Path) -> BinaryIO:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path.open("xb")
+    except FileExistsError:
+        raise ConfigError(f"{path}: exists already, and a log is never overwritten: give another name") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror}): choose another place") from None
 
 
 class _Flushed:

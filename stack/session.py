@@ -112,6 +112,11 @@ def run(
         raise ConfigError(
             "nothing moves by itself on a real robot: give start=True (--start), or confirm at the prompt"
         )
+    odometry = load_odometry(robot)
+    if settings.record is not None:
+        from stack.recorder import Recorder, check_new
+
+        check_new(settings.record)
     if script.velocities is not None and hasattr(task, "steer_by"):
         task.steer_by(script.velocities, script.ended)
     scene = start_task(task, settings.seed)
@@ -154,7 +159,7 @@ def run(
         guard = Guard(robot, motors, gain)
         if assembly is not None:
             guard.note("system", assembly)
-        estimator = Estimator(robot, load_odometry(robot))
+        estimator = Estimator(robot, odometry)
         look = None if scene is None or not simulated else cast(Surroundings, body).look
         director = Director(robot, guard, estimator, task, pilot, push, look)
         tally = _Tally()
@@ -177,7 +182,6 @@ def run(
         recorder = None
         if settings.record is not None:
             from stack.provenance import header
-            from stack.recorder import Recorder
 
             recorder = Recorder.create(
                 settings.record,

@@ -67,8 +67,9 @@ class Lifeline:
                     f"the guardian process ended {STARTS} times, the last with code {self._process.returncode}: "
                     "who or what ends it?"
                 )
+            process = self._start()  # first: where it cannot be started, torque off must still be possible
             self._forget()
-            self._process = self._start()
+            self._process = process
             self._say(b"+" if self._on else b"-")
 
     def close(self) -> None:

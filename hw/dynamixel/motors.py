@@ -22,6 +22,7 @@ WATCHDOG = 4  # of 20 ms: a servo that hears nothing for so long stops by itself
 TRIES = 4  # to switch torque, at least, before it is an error
 OFF_SECONDS, ON_SECONDS = 0.25, 0.1  # and for how long: a host or an adapter may be held up meanwhile
 OUTSIDE = 12  # ticks (1 degree) that a joint may be beyond its servo's limits when torque comes on
+AWAY = 68  # ticks (6 degrees) that a joint may have moved since it was read, for its first goal is gone to at once
 _GAINS = struct.Struct("<HHH")  # D, I, P in the order of their registers
 _CHECKED = struct.Struct("<HHH")
 
@@ -38,8 +39,8 @@ class DynamixelMotors:
         present: GroupRead,
         lifeline: Lifeline | None = None,
     ) -> None:
-        """`present` is the group of the control cycle, whose newest positions torque comes on at. `lifeline` is told
-        of torque; without one nothing but the servos' watchdog stops them when this process is killed."""
+        """`present` is the group of the control cycle, at whose positions torque comes on. `lifeline` is told of
+        torque; without one nothing but the servos' watchdog stops them when this process is killed."""
         table = found[0].table
         self._bus, self._found, self._units, self._watch, self._present = bus, found, units, watch, present
         self._lifeline = lifeline
@@ -62,19 +63,19 @@ class DynamixelMotors:
         return self._watch.armed
 
     def write(self, command: Command) -> None:
-        """Send a command. Raises BackendError where torque does not go on or off, naming the joints."""
+        """Send a command. Raises BackendError, naming the joints, where torque does not go on or off, and where a joint
+        was moved between the reading that a first command goes out from and torque."""
         if command.mode is Mode.OFF:
             self.off()
         elif command.mode is Mode.DAMP:
             if self.armed:  # a limp robot is not made stiff to be damped
                 self._send_gains(np.zeros(len(self._ids), dtype=int), damped=True)
         else:
-            gain = self._units.gain(command.gain)
+            gain, goals = self._units.gain(command.gain), self._units.goal(command.position)
             if not self.armed:
-                self._arm(gain)
+                self._arm(gain, goals)
             elif self._lifeline is not None:
                 self._lifeline.check()
-            goals = self._units.goal(command.position)
             if self._gain is None or not np.array_equal(gain, self._gain):
                 self._send_gains(gain)
             self._bus.send(self._goals.packet(goals.tolist()))
@@ -96,28 +97,37 @@ class DynamixelMotors:
             f"{self._names(left)} did not say that torque is off: hold the robot and switch its power off"
         )
 
-    def _arm(self, gain: Array) -> None:
-        """Torque on without a jump: goal at the present position and gains first, all checked before torque."""
+    def _arm(self, gain: Array, wanted: Array) -> None:
+        """Torque on without a jump: goal at the present position, then gains, all checked before torque.
+
+        `wanted` `(n_joints,)` are the goal ticks that will be sent next.
+        """
         everyone = list(range(len(self._ids)))
         if broken := [i for i in everyone if self._watch.fault[i] & 0xFF]:
             reasons = ", ".join(describe(int(self._watch.fault[broken[0]]) & 0xFF))
             raise BackendError(f"{self._names(broken)} reports {reasons}: let it cool, then switch it off and on")
+        if self._lifeline is not None:
+            self._lifeline.hold()  # first, as it may wait for seconds, in which a limp robot moves
+        self.on = True
         goals = self._goals_here()
+        if moved := np.flatnonzero(np.abs(goals - wanted) > AWAY).tolist():
+            raise BackendError(
+                f"{self._names(moved)} moved before torque was on: support the robot, hold it still and start again"
+            )
         self._watch.expect(False)
         self._gain = None
         for _ in self._attempts(ON_SECONDS):
             self._write(self._watchdog.address, everyone, [b"\0"] * len(everyone))  # lifts an expired one, too
             self._write(self._profile, everyone, [bytes(8)] * len(everyone))
-            self._send_gains(gain)
-            self._bus.send(self._goals.packet(goals))
-            unready = self._unprepared(goals, gain)
+            self._bus.send(self._goals.packet(goals.tolist()))
+            unready = self._unprepared(goals)
+            if not unready:  # with torque on already, gains would pull at once to a goal that is not from here
+                self._send_gains(gain)
+                unready = self._unprepared(goals, gain)
             if not unready:
                 break
         else:
             raise BackendError(f"{self._names(unready)} did not take goal and gains: torque stays off")
-        if self._lifeline is not None:
-            self._lifeline.hold()
-        self.on = True
         left = everyone
         for _ in self._attempts(ON_SECONDS):
             self._write(self._torque.address, left, [b"\1"] * len(left))
@@ -139,12 +149,12 @@ class DynamixelMotors:
             yield attempt
             attempt += 1
 
-    def _goals_here(self) -> list[int]:
-        """Goal ticks at the present position, within a turn and the servo's own limits."""
+    def _goals_here(self) -> Array:
+        """Goal ticks `(n_joints,)` at the position of now, within a turn and the servo's own limits."""
         for _ in self._attempts(ON_SECONDS):
+            self._bus.read_group(self._present)
             if all(self._present.fresh):
                 break
-            self._bus.read_group(self._present)
         if lost := [i for i, fresh in enumerate(self._present.fresh) if not fresh]:
             raise BackendError(f"{self._names(lost)} did not say where it is: torque stays off")
         turned = [int.from_bytes((data or b"")[-4:], "little", signed=True) for data in self._present.data]
@@ -154,7 +164,7 @@ class DynamixelMotors:
         outside = np.flatnonzero((here < lower - OUTSIDE) | (here > upper + OUTSIDE))
         if outside.size:
             raise BackendError(f"{self._names(outside.tolist())} is beyond its servo's limits: move it by hand")
-        goals: list[int] = np.clip(here, lower, upper).tolist()
+        goals: Array = np.clip(here, lower, upper)
         return goals
 
     def _send_gains(self, gain: Array, *, damped: bool = False) -> None:
@@ -168,8 +178,8 @@ class DynamixelMotors:
         data = {self._ids[i]: value for i, value in zip(joints, values, strict=True)}
         self._bus.send(codec.sync_write(address, len(values[0]), data))
 
-    def _unprepared(self, goals: list[int], gain: Array) -> list[int]:
-        """Joints whose goal or P gain does not read back."""
+    def _unprepared(self, goals: Array, gain: Array | None = None) -> list[int]:
+        """Joints whose goal, or P gain where it was sent, does not read back."""
         start = self._d_gain.address
         group = GroupRead([(id, start, self._goal.end - start) for id in self._ids])
         self._bus.read_group(group)
@@ -177,7 +187,7 @@ class DynamixelMotors:
         for i, data in enumerate(group.data):
             if (
                 data is None
-                or _CHECKED.unpack_from(data)[2] != gain[i]
+                or (gain is not None and _CHECKED.unpack_from(data)[2] != gain[i])
                 or self._goal.decode(data[self._goal.address - start :]) != goals[i]
             ):
                 left.append(i)

@@ -58,6 +58,11 @@ def test_a_checkpoint_that_does_not_fit_is_refused_with_the_reason(tmp_path: Pat
     with pytest.raises(CheckpointError, match=reason) as error:
         checkpoint.check(tmp_path / "net.safetensors", head(), "test", change(ROBOT))
     assert "net.safetensors" in str(error.value)
+    assert "train" not in str(error.value)
+    with pytest.raises(CheckpointError, match=reason) as error:
+        checkpoint.check(tmp_path / "odometry.safetensors", head() | {"kind": "odometry"}, "odometry", change(ROBOT))
+    command = f"servoid train odometry --policy gait --robot FILE --out {tmp_path}/odometry.safetensors"
+    assert str(error.value).endswith(f"; train it once: {command}"), "every run of the robot needs it"
 
 
 def test_another_kind_is_refused_and_another_name_of_the_robot_is_not() -> None:

@@ -97,13 +97,15 @@ class StillEstimator:
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self.resets = 0
+        self.ticks: list[int] = []  # that each update was told
 
     def reset(self) -> None: ...
 
     def reset_odometry(self) -> None:
         self.resets += 1
 
-    def update(self, observation: Observation, applied: Array) -> State:
+    def update(self, observation: Observation, applied: Array, ticks: int = 1) -> State:
+        self.ticks.append(ticks)
         return State(
             time_ns=observation.time_ns,
             orientation=observation.orientation,

@@ -108,6 +108,15 @@ def test_what_was_not_read_coasts() -> None:
     assert attitude.yaw == pytest.approx(yaw + 0.01, abs=1e-6)
 
 
+def test_a_turn_goes_on_in_ticks_that_were_missed() -> None:
+    whole, gaps, turn = started(), started(), np.array([0.0, 0.0, 0.5])
+    for _ in range(30):
+        whole.update(turn, LEVEL, MOVING)
+    for ticks in (1, 3) * 7 + (2,):
+        gaps.update(turn, LEVEL, MOVING, ticks=ticks)
+    assert gaps.yaw == pytest.approx(whole.yaw, rel=1e-3)
+
+
 def test_worlds_are_independent_and_reset_alone() -> None:
     many, rng = Attitude(DT, (3,)), np.random.default_rng(2)
     singles = [Attitude(DT) for _ in range(3)]

@@ -130,6 +130,29 @@ def test_a_joint_that_was_not_read_keeps_its_last_value(walk) -> None:
         assert np.isfinite(getattr(state, f.name)).all(), f.name
 
 
+def test_a_walk_goes_on_in_ticks_that_were_missed(walk) -> None:
+    """On a machine that misses some, the robot would believe to be slower and to turn less than it does."""
+    observations, applied, states, bias = walk
+    estimator, state, rng, last = Estimator(ROBOT, load_odometry(ROBOT), (3,)), states[0], np.random.default_rng(3), -1
+    estimator.reset(bias=bias)
+    seen = [0, *np.cumsum(rng.choice([1, 2, 3], 250, p=[0.85, 0.075, 0.075]))]
+    for tick in [tick for tick in seen if tick < 199] + [199]:
+        state = estimator.update(observations[tick], applied[tick], tick - last)
+        last = tick
+    off = np.linalg.norm((state.displacement - states[-1].displacement)[:2, :2], axis=-1)
+    assert off.max() < 0.05
+    np.testing.assert_allclose(state.yaw, states[-1].yaw, atol=0.1)
+
+
+def test_a_long_gap_is_no_leap(walk) -> None:
+    observations, applied, _, _ = walk
+    one, two = Estimator(ROBOT, None, (3,)), Estimator(ROBOT, None, (3,))
+    for estimator, ticks in ((one, ROBOT.limits.stale), (two, 1000)):
+        estimator.update(observations[0], applied[0])
+        estimator.update(observations[1], applied[1], ticks)
+    np.testing.assert_array_equal(one._displacement, two._displacement)
+
+
 def test_standing_it_neither_moves_nor_sinks() -> None:
     fleet = Fleet(ROBOT, 2, None, seed=5, threads=1)
     fleet.reset(np.ones(2, bool))

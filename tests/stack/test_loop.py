@@ -90,6 +90,8 @@ def test_a_slow_tick_is_skipped_over_and_the_target_gets_no_leap():
     assert 34 in ticks
     assert not {31, 32, 33} & set(ticks)
     assert sum(record.timing.missed for record in records) == 3
+    told = loop._estimator.ticks
+    assert (told[ticks.index(34)], sum(told) - len(told)) == (4, 3), "the estimator knows of the missed ones"
     leaps = np.abs(np.diff([command.position for command in body.sent], axis=0)).max()
     assert leaps <= ROBOT.limits.joint_speed * ROBOT.dt * ROBOT.limits.stale + 1e-9
 
@@ -149,6 +151,27 @@ def test_one_ctrl_c_lowers_and_a_second_cuts_torque_at_once():
     assert modes(body).count(Mode.DAMP) == 1
     assert guard.cause == "interrupt"
     assert any(event.text == TWICE for record in records for event in record.events)
+
+
+def test_a_stop_that_is_due_is_heeded_before_the_policy_is_asked_again():
+    """A SIGTERM to the process group ends the planner as well: a policy that then fails must not keep a standing robot
+    from being lowered."""
+
+    def targets(tick):
+        if interrupt.count:
+            guard.fault("policy", "the planner process was killed by signal 15")
+        return ROBOT.home
+
+    def terminate(record):
+        if record.tick == 30:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    _, guard, interrupt, loop, records = make(targets, listeners=(terminate,))
+    with interrupt:
+        loop.run()
+    assert guard.cause == "interrupt"
+    assert Phase.LOWERING in {record.phase for record in records}
+    assert guard.phase is Phase.DAMPED
 
 
 def test_a_policy_that_hangs_is_broken_off_by_the_second_ctrl_c():

@@ -162,6 +162,20 @@ def test_a_full_disk_is_one_error_with_the_remedy_and_holds_nobody_up(tmp_path, 
         assert len(read_log(tmp_path / "a.mcap").ticks("/observation")) > 5
 
 
+def test_a_disk_that_fills_at_the_very_end_holds_nobody_up():
+    """The last chunk is written when the recording is closed: nobody is to wait for items after that."""
+    disk = FullDisk(10**9)
+    recorder = Recorder(disk, HEADER, name="run.mcap")
+    recorder(tick_record(0, np.random.default_rng(0)))
+    deadline = time.monotonic() + 10
+    while not recorder._items.empty() and time.monotonic() < deadline:  # then the header is written
+        time.sleep(0.01)
+    disk.room, began = 0, time.monotonic()
+    recorder.close({})
+    assert time.monotonic() - began < 1.0
+    assert "No space left on device" in recorder.error
+
+
 def test_a_disk_that_hangs_does_not_hold_up_a_real_loop(monkeypatch):
     monkeypatch.setattr("stack.recorder.PATIENCE", 0.2)
     monkeypatch.setattr("stack.recorder.BACKLOG", 5)

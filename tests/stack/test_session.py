@@ -14,6 +14,7 @@ from fake_body import FakeBody, spoiled, tilted
 from hw.config import ConfigError
 from hw.hal import BackendError, Mode, Plan
 from hw.robot import load_robot
+from policy.checkpoint import CheckpointError
 from stack.flightlog import read_log
 from stack.safety import Phase
 from stack.session import Script, Settings, run
@@ -203,6 +204,29 @@ def test_a_real_robot_asks_before_anything_is_sent():
 def test_what_is_unknown_is_refused_with_the_remedy(settings, message):
     with pytest.raises(ConfigError, match=message):
         run(settings, policy=None if "policy" in message or settings.policy == "gate" else Still())
+
+
+def never_connected():
+    body = FakeBody(ROBOT)
+    body.connect = lambda: pytest.fail("the robot was asked")
+    return body
+
+
+def test_a_log_that_cannot_be_made_is_refused_before_the_robot_is_asked(tmp_path):
+    (tmp_path / "run.mcap").write_text("precious")
+    for path, why in ((tmp_path / "run.mcap", "exists already"), (tmp_path / "run.mcap" / "b" / "a", "cannot be")):
+        with pytest.raises(ConfigError, match=why):
+            stand(never_connected(), settings={"record": path, "start": True})
+    assert (tmp_path / "run.mcap").read_text() == "precious"
+
+
+def test_odometry_that_does_not_fit_is_refused_before_the_robot_is_asked(monkeypatch):
+    def unfit(robot):
+        raise CheckpointError("made for another robot")
+
+    monkeypatch.setattr("stack.session.load_odometry", unfit)
+    with pytest.raises(CheckpointError):
+        stand(never_connected(), settings={"start": True})
 
 
 def test_pushes_are_refused_where_the_body_cannot_be_pushed():

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hw.config import ConfigError, nearest
 from hw.hal import Array, BackendError
@@ -23,7 +23,7 @@ from tools.output import Report, reporting
 from tools.prompt import confirm
 
 if TYPE_CHECKING:
-    from hw.calibration import Calibration
+    from hw.calibration import Calibration, JointCalibration
     from hw.dynamixel.survey import Found
     from tools.bringup.encoders import Encoders
     from tools.bringup.hands import Hands
@@ -41,9 +41,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pose", choices=("zero", "home"), default="zero", help="reference pose: all joints at 0 (default), or home"
     )
     parser.add_argument(
-        "--joint", action="append", default=[], metavar="JOINT", help="this joint only; may be given again"
+        "--joint",
+        action="append",
+        default=[],
+        metavar="JOINT",
+        help="this joint only, of a robot that was calibrated; may be given again",
     )
-    parser.add_argument("--keep-directions", action="store_true", help="measure zeros only")
+    parser.add_argument(
+        "--keep-directions",
+        action="store_true",
+        help="measure zeros only: directions are those of the earlier calibration, without one the robot file's",
+    )
     parser.add_argument("--out", type=Path, metavar="FILE", help="write there instead of into the configuration folder")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of a virtual rig's assembly (default: 0)")
     parser.add_argument("--yes", action="store_true", help="write without asking")
@@ -57,7 +65,7 @@ def main(args: argparse.Namespace) -> int:
         virtual = is_virtual(args)
         path = args.out or (None if virtual else calibration_path(robot))
         chosen = _chosen(args.joint, robot)
-        earlier = _earlier(path, robot, chosen)
+        earlier = _earlier(path, robot, chosen, args.keep_directions)
         if path is not None:
             check_writable(path)
         reference = _reference(args.pose, robot)
@@ -67,7 +75,7 @@ def main(args: argparse.Namespace) -> int:
 
             delivery = Delivery(assembly="random")
         with open_line(args, robot, delivery=delivery, seed=args.seed) as line:
-            zeros, directions = _measure(line, robot, reference, chosen, args, report)
+            zeros, directions = _measure(line, robot, reference, chosen, earlier, args, report)
         result = _calibration(robot, zeros, directions, chosen, earlier, args.pose)
         _show(robot, result, report)
         apply(robot, result, "what was measured")  # refuses what no servo could be driven with
@@ -85,7 +93,13 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _measure(
-    line: Line, robot: Robot, reference: Array, chosen: list[int], args: argparse.Namespace, report: Report
+    line: Line,
+    robot: Robot,
+    reference: Array,
+    chosen: list[int],
+    earlier: Mapping[str, JointCalibration],
+    args: argparse.Namespace,
+    report: Report,
 ) -> tuple[Array, Array]:
     """Zeros [rad] and directions `(n_joints,)`."""
     import numpy as np
@@ -105,10 +119,10 @@ def _measure(
     encoders = Encoders(line.bus, line.clock, robot, found)
     hands: Hands = Person(report) if line.control is None else VirtualHands(line.control, robot, report)
     angles = dict(zip(robot.names, reference.tolist(), strict=True))
-    where = "every joint at 0, as in the robot's drawing" if args.pose == "zero" else "its home pose, standing"
+    where = "every joint at 0" if args.pose == "zero" else "its home pose, standing"
     hands.pose(angles, f"{robot.name} is limp. Put it into its reference pose, {where}, and hold it still")
     at_reference = encoders.still(PATIENCE)
-    directions = np.array([joint.direction for joint in robot.joints])
+    directions = np.array([earlier.get(joint.name, joint).direction for joint in robot.joints])
     if not args.keep_directions:
         for i, sign in directions_of(encoders, hands, robot, reference, chosen).items():
             directions[i] = sign
@@ -142,18 +156,22 @@ def directions_of(
     texts = describe_turns(robot, reference, signs)
     found = {}
     for count, i in enumerate(chosen, start=1):
-        start = encoders.still(PATIENCE)
         text = f"[{count}/{len(chosen)}] turn {robot.names[i]} by some 20 degrees, so that {texts[i]}; hold it there"
-        hands.turn(robot.names[i], int(signs[i]), text)
-        angle = turned(encoders, start, i, robot)
+        angle = None
+        while angle is None:
+            start = encoders.still(PATIENCE)
+            hands.turn(robot.names[i], int(signs[i]), text)
+            angle = turned(encoders, start, i, robot)
+            text = f"      it did not stay there: turn {robot.names[i]} again, so that {texts[i]}; hold it there"
         check_range(robot, i, float(reference[i]) + int(signs[i]) * abs(angle))
         hands.back(robot.names[i])
         found[i] = int(signs[i]) * (1 if angle > 0.0 else -1)
     return found
 
 
-def turned(encoders: Encoders, start: Array, i: int, robot: Robot) -> float:
-    """Wait until joint `i` was turned from `start`; by how much [rad] its servo turned.
+def turned(encoders: Encoders, start: Array, i: int, robot: Robot) -> float | None:
+    """Wait until joint `i` was turned from `start` and rests; by how much [rad] its servo turned. None when it was not
+    held there: of a joint that was put straight back, noise would tell the direction.
 
     Raises BackendError when another joint was, which is how swapped IDs show.
     """
@@ -165,7 +183,8 @@ def turned(encoders: Encoders, start: Array, i: int, robot: Robot) -> float:
     for _ in range(ticks):
         moved = short(encoders.read() - start)
         if abs(moved[i]) >= MOVED:
-            return float(short(encoders.still(PATIENCE) - start)[i])
+            angle = float(short(encoders.still(PATIENCE) - start)[i])
+            return angle if angle * moved[i] > 0.0 and abs(angle) >= MOVED / 2 else None
         other = int(np.abs(moved).argmax())
         others = others + 1 if abs(moved[other]) >= MOVED and abs(moved[i]) < MOVED / 4 else 0
         if others * PERIOD_NS >= _OTHER_SECONDS * 1e9:
@@ -217,30 +236,42 @@ def check_writable(path: Path) -> None:
         ) from error
 
 
-def _earlier(path: Path | None, robot: Robot, chosen: list[int]) -> Calibration | None:
-    """The calibration that joints which are not measured now are taken from; read before anybody moves anything."""
-    if len(chosen) == len(robot.joints) or path is None or not path.exists():
-        return None
+def _earlier(path: Path | None, robot: Robot, chosen: list[int], keep: bool) -> Mapping[str, JointCalibration]:
+    """What was measured before, by joint: of those that are not measured now and, to `keep` directions, of all.
+
+    Read before anybody moves anything. Raises ConfigError where a joint that is needed was never measured: what the
+    robot's file says of it must not be written down as measured.
+    """
+    whole = len(chosen) == len(robot.joints)
+    if path is None or (whole and not (keep and path.exists())):
+        return {}
     from hw.calibration import load_calibration
 
-    return load_calibration(path)
+    if not path.exists():
+        raise ConfigError(f"{path}: no such calibration yet: calibrate all joints first, without --joint")
+    earlier = load_calibration(path).joints
+    if lacking := [name for i, name in enumerate(robot.names) if name not in earlier and (keep or i not in chosen)]:
+        raise ConfigError(
+            f"{path}: nothing about {lacking[0]}: calibrate all joints first, without --joint and --keep-directions"
+        )
+    return earlier
 
 
 def _calibration(
-    robot: Robot, zeros: Array, directions: Array, chosen: list[int], earlier: Calibration | None, pose: str
+    robot: Robot,
+    zeros: Array,
+    directions: Array,
+    chosen: list[int],
+    earlier: Mapping[str, JointCalibration],
+    pose: str,
 ) -> Calibration:
     from hw.calibration import Calibration, JointCalibration
 
     joints = {}
-    known: Mapping[str, Any] = {} if earlier is None else earlier.joints
     for i, (joint, servo) in enumerate(zip(robot.joints, robot.servos, strict=True)):
-        direction, zero = joint.direction, joint.zero
-        if i in chosen:
-            direction, zero = int(directions[i]), round(float(zeros[i]), 5)
-        elif joint.name in known:
-            joints[joint.name] = known[joint.name]
-            continue
-        joints[joint.name] = JointCalibration(joint.id, servo.name, direction, zero)
+        measured = JointCalibration(joint.id, servo.name, int(directions[i]), round(float(zeros[i]), 5))
+        described = JointCalibration(joint.id, servo.name, joint.direction, joint.zero)  # which is not kept anywhere
+        joints[joint.name] = measured if i in chosen else earlier.get(joint.name, described)
     return Calibration(robot.name, datetime.now().astimezone().isoformat(timespec="seconds"), pose, joints)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Protocol
 
@@ -36,6 +37,9 @@ class Person:
         self._report = report
 
     def pose(self, angles: Mapping[str, float], text: str) -> None:
+        if any(angles.values()):
+            rows = [(name, f"{angle:+.3f}", f"{math.degrees(angle):+.0f}") for name, angle in angles.items()]
+            self._report.table(("joint", "rad", "degrees"), rows)
         confirm(text, "calibrate at a terminal, with the robot in your hands")
 
     def turn(self, joint: str, sign: int, text: str) -> None:

@@ -133,12 +133,17 @@ def _pose(sensors: Sensors, clock: Any, robot: Robot) -> Array:
 def _announce(
     report: Report, robot: Robot, i: int, here: Array, ends: tuple[float, float], args: argparse.Namespace
 ) -> None:
+    import numpy as np
+
     from tools.bringup.jogging import SPEED
+    from tools.bringup.turning import describe_turns
 
     joint = robot.joints[i]
     report.line(
         f"{joint.name} (ID {joint.id}) is at {here[i]:+.3f} rad; its range is {joint.range[0]:g} to {joint.range[1]:g}."
     )
+    turn = describe_turns(robot, here, np.ones(len(here)))[i]
+    report.line(f"A positive turn of it, with the robot upright: {turn}.")
     report.line(f"Torque will come on at all {len(robot.joints)} joints, each where it is. Nothing moves by that.")
     if args.by is None:
         report.line(

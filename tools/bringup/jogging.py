@@ -29,6 +29,7 @@ IDLE_SECONDS = 60.0  # without a key until torque goes off: a held robot gets wa
 WAIT_SECONDS = 1.0  # for a first sample of everything
 SETTLE_SECONDS = 0.3  # between torque and the first motion
 PAUSE_SECONDS = 1.0  # at the far end of a motion that was asked for on the command line
+SPARE_SECONDS = 2.0  # that such a motion may take beyond its way and the pause
 
 
 class Wish(Enum):
@@ -107,25 +108,37 @@ class JogPilot:
 
 
 class There:
-    """Goes by an angle [rad], in ticks of `dt` [s], waits there, comes back, and ends."""
+    """Goes by an angle [rad], in ticks of `dt` [s], waits there, comes back, and ends. Where the guard lets the joint
+    go no further, it has arrived; however it goes, it ends."""
 
     def __init__(self, by: float, dt: float) -> None:
         self._by, self._near = by, SPEED * dt / 2  # half a tick's way
+        self._longest = 2.0 * abs(by) / SPEED + PAUSE_SECONDS + SPARE_SECONDS  # s
         self._start: float | None = None
         self._arrived: float | None = None
+        self._before: float | None = None  # the angle when it was told to move last
 
     def wish(self, seconds: float, angle: float) -> Wish:
         if self._start is None:
             self._start = angle
-        back = self._arrived is not None and seconds - self._arrived >= PAUSE_SECONDS
-        goal, way = (self._start, -self._by) if back else (self._start + self._by, self._by)
-        if math.copysign(1.0, way) * (goal - angle) > self._near:  # never turning round: it would swing about the goal
-            return Wish.UP if way > 0.0 else Wish.DOWN
-        if back:
+        if seconds >= self._longest:
             return Wish.END
         if self._arrived is None:
+            if (wish := self._toward(self._start + self._by, angle, self._by)) is not Wish.HOLD:
+                return wish
             self._arrived = seconds
-        return Wish.HOLD
+        if seconds - self._arrived < PAUSE_SECONDS:
+            return Wish.HOLD
+        wish = self._toward(self._start, angle, -self._by)
+        return Wish.END if wish is Wish.HOLD else wish
+
+    def _toward(self, goal: float, angle: float, way: float) -> Wish:
+        """The way to a goal; HOLD once there. Never turning round: it would swing about the goal."""
+        there = math.copysign(1.0, way) * (goal - angle) <= self._near or angle == self._before
+        self._before = None if there else angle
+        if there:
+            return Wish.HOLD
+        return Wish.UP if way > 0.0 else Wish.DOWN
 
 
 class Keys:

@@ -1,4 +1,4 @@
-"""Watch the robot: angles, temperatures, voltages, loads and errors of every servo, and how well the bus does.
+"""Watch the robot: angles, temperatures, voltages, loads and errors of every servo, the IMU, and how well the bus does.
 
 Only reads: torque stays as it is. Until Ctrl-C, or for `--seconds`.
 """
@@ -9,18 +9,19 @@ import argparse
 import dataclasses
 import sys
 from collections import deque
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
 from hw.robot import Robot
 from tools import exit_codes
-from tools.bringup.line import Line, add_line_arguments, assembled, open_line
+from tools.bringup.line import Line, add_line_arguments, assembled, is_virtual, open_line
 from tools.output import Report, reporting
 from tools.run import positive
 
 if TYPE_CHECKING:
     from hw.dynamixel.bus import Counters
     from hw.hal import Observation
+    from hw.imu.serial_imu import SerialImu
 
 RATE = 20  # reads a second
 SHOW_SECONDS = 0.5  # between tables on a terminal
@@ -36,8 +37,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         robot = assembled(args, report)
-        with open_line(args, robot, patient=False) as line:
-            watched = Watched(line, robot)
+        with open_line(args, robot, patient=False) as line, ExitStack() as stack:
+            imu = None
+            if robot.imu.kind != "opencr" and not is_virtual(args):  # a virtual rig has it on its board
+                from hw.imu.serial_imu import SerialImu
+
+                imu = SerialImu(robot.imu, robot.rate, clock=line.clock)
+                stack.callback(imu.close)
+            watched = Watched(line, robot, imu)
             live = sys.stdout.isatty() and not args.json
             with suppress(KeyboardInterrupt):  # the usual way to end it
                 watched.run(args.seconds, report if live else None)
@@ -48,9 +55,9 @@ def main(args: argparse.Namespace) -> int:
 
 
 class Watched:
-    """The robot on a line, read again and again."""
+    """The robot on a line, read again and again. `imu` is one on a port of its own."""
 
-    def __init__(self, line: Line, robot: Robot) -> None:
+    def __init__(self, line: Line, robot: Robot, imu: SerialImu | None = None) -> None:
         """Raises BackendError when a servo or the board does not answer."""
         from hw.dynamixel.bus import LONGEST_RETURN_DELAY
         from hw.dynamixel.sensors import DynamixelSensors, present
@@ -66,7 +73,7 @@ class Watched:
         found = find_servos(bus, robot)
         bus.return_delay = max(servo.get("return_delay_time") for servo in found) * 2e-6
         units = Units(robot, [servo.table for servo in found])
-        self._sensors = DynamixelSensors(bus, robot, units, Watch(bus, found, units), present(found))
+        self._sensors = DynamixelSensors(bus, robot, units, Watch(bus, found, units), present(found), imu)
         self._bus, self._robot, self._coast = bus, robot, Coast()
         self._clock = line.clock if isinstance(line.clock, WallClock) else RealTime(line.clock)
         self._before = dataclasses.replace(bus.counters)
@@ -105,17 +112,38 @@ class Watched:
         head = ("joint", "ID", "angle", "supply", "lowest", "heat", "hottest", "effort", "state")
         shown = [(*row[:2], *map(_text, row[2:8], _UNITS), row[8]) for row in rows]
         report.table(head, shown)
+        report.line(self._imu())
         bus = self._statistics()
         report.line(
             f"bus: {bus['reads']} reads, median {bus['read_ms_p50']:.2f} ms, p99 {bus['read_ms_p99']:.2f} ms; "
             f"{bus['lost']} answers lost, {bus['recovered']} of them recovered, {bus['bad_crc']} damaged, "
             f"{bus['refused']} refused, {bus['conflicts']} conflicts"
         )
-        self._drawn = len(rows) + 2
+        self._drawn = len(rows) + 3
 
     def summary(self) -> dict[str, Any]:
         """The newest values and the bus's statistics, as JSON values."""
-        return {"servos": [] if self._newest is None else self._rows(), "bus": self._statistics()}
+        o = self._newest
+        if o is None:
+            return {"servos": [], "imu": None, "bus": self._statistics()}
+        imu = {"specific_force": o.specific_force, "angular_velocity": o.angular_velocity, "age": float(o.imu_age)}
+        return {"servos": self._rows(), "imu": imu, "bus": self._statistics()}
+
+    def _imu(self) -> str:
+        import numpy as np
+
+        from hw.faults import IMU, describe
+
+        o = self._newest
+        assert o is not None
+        if not o.imu_age <= _SILENT:
+            why = ", ".join(describe(int(np.bitwise_or.reduce(o.fault)) & IMU)) or "it sends nothing"
+            return f"IMU: no fresh sample ({why}): check its cable"
+        force, turning = (
+            " ".join(f"{value:+.{digits}f}" for value in vector.tolist())
+            for vector, digits in ((o.specific_force, 1), (o.angular_velocity, 2))
+        )
+        return f"IMU: force {force} m/s2, turning {turning} rad/s"
 
     def _rows(self) -> list[dict[str, Any]]:
         from hw.faults import ROBOT, describe

@@ -183,7 +183,7 @@ def test_a_port_must_be_named() -> None:
 
 
 def test_torque_comes_on_where_the_servo_is(robot: Robot) -> None:
-    """Goal, gains and profile first, and the goal is the present position whatever the command says."""
+    """Profile, goal and gains first, and the goal is the present position whatever the command says."""
     knee = robot.joint("l_knee")
     knee.put("present_position", 4096 + 2600)  # turned by hand while limp: it will say 2600 once torque is on
     sensors, motors = robot.backend().connect()
@@ -192,12 +192,72 @@ def test_torque_comes_on_where_the_servo_is(robot: Robot) -> None:
     names = [name for name, _ in knee.writes]
     on = knee.writes.index(("torque_enable", 1))
     assert names[:on] == [
-        *("bus_watchdog", "profile_acceleration", "profile_velocity"),
-        *("position_d_gain", "position_i_gain", "position_p_gain", "goal_position"),
+        *("bus_watchdog", "profile_acceleration", "profile_velocity", "goal_position"),
+        *("position_d_gain", "position_i_gain", "position_p_gain"),
     ]
     assert ("goal_position", 2600) in knee.writes[:on]
     assert ("position_p_gain", 400) in knee.writes[:on]
     assert knee.writes[on + 1 :] == [("bus_watchdog", 4), ("goal_position", 2048 + round(0.8524 / 2 / np.pi * 4096))]
+
+
+def test_a_servo_that_has_torque_gets_no_gain_before_its_goal(robot: Robot) -> None:
+    """Left damped by a program that ended, with a goal from then: gains alone would fling the knee there. Nor may the
+    packet with the goal get lost."""
+    knee = robot.joint("l_knee")
+    for name, value in (("torque_enable", 1), ("position_p_gain", 0), ("goal_position", 3000)):
+        knee.put(name, value)
+    here = knee.get("present_position")
+    pulled, deaf = [], [1]
+
+    def watch(packet: codec.Packet) -> None:
+        robot.live()
+        goals = packet.instruction == Instruction.SYNC_WRITE and packet.params[:2] == b"\x74\x00"
+        knee.answers = not (goals and deaf[0] > 0)
+        deaf[0] -= goals
+        if knee.get("torque_enable") and knee.get("position_p_gain"):
+            pulled.append(knee.get("goal_position") - here)
+
+    robot.line.before_answer = watch
+    sensors, motors = robot.backend().connect()
+    sensors.read()
+    motors.write(active())
+    assert deaf[0] < 0
+    assert knee.get("position_p_gain") == 800
+    assert pulled
+    assert max(map(abs, pulled)) < 20
+
+
+class Slow:
+    """A guardian that has to be waited for, while somebody moves the knee."""
+
+    def __init__(self, knee: Memory, by: int) -> None:
+        self._knee, self._by = knee, by
+
+    def hold(self) -> None:
+        self._knee.put("present_position", self._knee.get("present_position") + self._by)
+
+    def check(self) -> None: ...
+
+    def let_go(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+@pytest.mark.parametrize("by", [40, 300])
+def test_a_robot_that_is_moved_while_the_guardian_starts_does_not_leap(robot: Robot, by: int) -> None:
+    """Neither to where it was when the wait began, nor to a first goal that was made of that."""
+    knee = robot.joint("l_knee")
+    sensors, motors = robot.backend().connect()
+    motors._lifeline = Slow(knee, by)  # type: ignore[assignment]
+    sensors.read()
+    if by < 100:
+        motors.write(active())
+        first = next(value for name, value in knee.writes if name == "goal_position")
+        assert first == knee.get("present_position")
+    else:
+        with pytest.raises(BackendError, match=r"l_knee \(ID 14\) moved before torque was on: .* start again"):
+            motors.write(active())
+        assert robot.moved() == []
 
 
 def test_a_joint_that_cannot_be_reached_stays_limp(robot: Robot) -> None:

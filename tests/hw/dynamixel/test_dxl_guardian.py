@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import signal
@@ -234,6 +235,24 @@ def test_a_guardian_that_cannot_live_keeps_torque_off(line: Lifeline, monkeypatc
     monkeypatch.setattr(guardian, "__file__", "/nonexistent/guardian.py")
     with pytest.raises(BackendError, match="torque stays off"):
         line.hold()
+
+
+def test_a_guardian_that_cannot_be_replaced_does_not_keep_torque_on(
+    line: Lifeline, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Out of processes or file descriptors in the middle of a run: a clear error, and then torque off as ever."""
+    line.hold()
+    os.kill(line.pid, signal.SIGKILL)
+    line._process.wait(5.0)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(subprocess, "Popen", full)
+    with pytest.raises(BackendError, match="the guardian process cannot be started"):
+        line.check()
+    line.let_go()
+    line.close()
 
 
 CONTROLLER = """

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from hw.calibration import calibrated, calibration_path, load_calibration
+from hw.calibration import (
+    Calibration,
+    JointCalibration,
+    calibrated,
+    calibration_path,
+    load_calibration,
+    save_calibration,
+)
 from hw.config import ConfigError
 from hw.hal import Array, BackendError
 from hw.robot import load_robot
@@ -19,12 +28,18 @@ from sim.model import build
 from sim.rig.control import LockedClock, RigProcess
 from sim.rig.delivery import Delivery
 from tools.bringup import calibrate
-from tools.bringup.calibrate import MOVED, check_range, turned
+from tools.bringup.calibrate import MOVED, check_range, directions_of, turned
 from tools.bringup.encoders import Encoders
+from tools.bringup.hands import Person
 from tools.bringup.turning import describe_turns
+from tools.output import Report
 
 ROBOT = load_robot()
 TICK = math.tau / 4096
+
+
+def never(*_: Any, **__: Any) -> Any:
+    raise AssertionError("the robot is measured")
 
 
 def test_it_finds_the_assembly_of_a_rig_on_a_serial_port_and_check_then_uses_it(
@@ -65,6 +80,30 @@ def test_it_finds_the_assembly_of_a_rig_on_a_serial_port_and_check_then_uses_it(
         assert {name for name in after if after[name] != before[name]} <= {"l_knee"}
         assert after["l_knee"].zero == pytest.approx(before["l_knee"].zero, abs=3 * TICK)
 
+        code, answer, err = bringup("calibrate", "--port", str(link), "--keep-directions", "--yes")
+        assert code == 0, err
+        for joint, true in zip(calibrated(ROBOT)[0].joints, truth.joints, strict=True):
+            assert joint.direction == true.direction, f"{joint.name} would be driven the wrong way"
+            assert joint.zero == pytest.approx(true.zero, abs=3 * TICK), joint.name
+
+
+@pytest.mark.parametrize("known", [None, "head_pan"])
+def test_what_was_never_measured_is_not_written_down_as_measured(
+    bringup: Any, configuration: Path, monkeypatch: pytest.MonkeyPatch, known: str | None
+) -> None:
+    """Of one joint alone, the others would be the robot file's, with a date and a pose that say otherwise."""
+    monkeypatch.setattr(calibrate, "open_line", never)
+    path = configuration / "op3.yaml"
+    if known is not None:
+        joint = ROBOT.joints[ROBOT.names.index(known)]
+        one = JointCalibration(joint.id, "xm430-w350", 1, 0.0)
+        save_calibration(Calibration("op3", "2026-01-01", "zero", {known: one}), path)
+    words = ("--port", "/dev/ttyUSB0", "--out", str(path), "--joint", "l_knee")
+    code, answer, _ = bringup("calibrate", *words)
+    assert code == 2
+    assert f"{path}: " in answer["error"]
+    assert "calibrate all joints first, without --joint" in answer["error"]
+
 
 def test_torque_and_registers_that_bend_angles_are_refused(rig: RigProcess, bringup: Any) -> None:
     from test_bringup_scan import write
@@ -98,10 +137,6 @@ def test_a_file_that_cannot_be_written_is_refused_before_anybody_measures(
     bringup: Any, configuration: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Or twenty joints are turned by hand, and what was measured is lost."""
-
-    def never(*_: Any, **__: Any) -> Any:
-        raise AssertionError("the robot is measured")
-
     monkeypatch.setattr(calibrate, "open_line", never)
     (configuration / "file").write_text("")
     out = configuration / "file" / "op3.yaml"
@@ -146,6 +181,49 @@ START = np.full(20, np.pi - 0.01)
 def test_a_turn_is_seen_across_the_seam_and_with_other_joints_hanging_loose(by: float) -> None:
     """0.01 rad before the 4095/0 seam: taken as it reads, the joint would have turned by almost a whole turn."""
     assert turned(ByHand(moving(l_knee=by, l_ank_pitch=0.5)), START, KNEE, ROBOT) == pytest.approx(by, abs=0.01)
+
+
+def test_a_person_is_told_the_angles_of_a_pose_that_is_not_all_zero(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nobody could put a robot into a pose of which the name is all that is said."""
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n\n"))
+    hands = Person(Report(False, sys.stdout))
+    hands.pose(dict(zip(ROBOT.names, ROBOT.home.tolist(), strict=True)), "the home pose")
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert rows[0] == ["joint", "rad", "degrees"]
+    assert ["l_knee", "+0.852", "+49"] in rows
+    hands.pose(dict.fromkeys(ROBOT.names, 0.0), "all at 0")
+    assert capsys.readouterr().out == ""
+
+
+class Hasty:
+    """Hands that put a joint straight back, less some play, and hold it there only when they are asked again."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self._count = 0
+
+    def pose(self, angles: Any, text: str) -> None: ...
+
+    def turn(self, joint: str, sign: int, text: str) -> None:
+        self.asked.append(text)
+        self._count = 0
+
+    def back(self, joint: str) -> None: ...
+
+    def angles(self, count: int) -> Array:
+        self._count += 1
+        straight_back = 0.3 if self._count < 5 else -0.01
+        return np.eye(20)[KNEE] * (0.0, straight_back, 0.3)[len(self.asked)]
+
+
+def test_a_joint_that_is_put_straight_back_is_asked_for_again() -> None:
+    """Its angle at rest is noise, and so would its direction be: the joint would then be driven the wrong way."""
+    hands = Hasty()
+    assert directions_of(ByHand(hands.angles), hands, ROBOT, np.zeros(20), [KNEE]) == {KNEE: 1}
+    assert len(hands.asked) == 2
+    assert "it did not stay there: turn l_knee again" in hands.asked[1]
 
 
 def test_another_joint_than_asked_is_named_with_both_ids() -> None:

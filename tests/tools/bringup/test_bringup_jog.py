@@ -8,12 +8,14 @@ import time
 from dataclasses import replace
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
 from hw.dynamixel.bus import Bus
 from hw.hal import Observation
 from hw.robot import load_robot
+from sim.model import build
 from sim.rig.control import RigProcess
 from sim.rig.local import LocalLine
 from sim.rig.rig import Rig
@@ -63,6 +65,8 @@ def test_what_will_happen_is_told_before_anything_moves(
         code, answer, err = bringup("jog", "l_knee", "--by", "0.2", *VIRTUAL)
     assert code == 2
     assert "Torque will come on at all 20 joints" in err
+    # Or nobody can say whether it then moves the wrong way.
+    assert "A positive turn of it, with the robot upright: what it carries goes backward (right-hand rule" in err
     assert "give --start" in answer["error"]
     assert rig.control.accepted() == [], "nobody pressed Enter"
 
@@ -187,6 +191,28 @@ def test_there_and_back_ends_where_it_began(rate: int, missed: int, by: float) -
     assert np.count_nonzero(np.diff(np.sign(moves[moves != 0.0]))) == 1, "there and back"
 
 
+@pytest.mark.parametrize(("by", "start"), [(0.35, 0.004), (-0.35, -0.004), (0.35, 0.0)])
+def test_there_and_back_ends_where_the_guard_lets_the_joint_go_no_further(by: float, start: float) -> None:
+    """A joint that sagged a little between two reads has less than SPAN left: it must not push at that end for ever."""
+    source, angle, wish, farthest = There(by, 0.02), start, Wish.HOLD, start
+    for tick in range(400):
+        wish = source.wish(tick / 50, angle)
+        if wish is Wish.END:
+            break
+        angle = min(max(angle + wish.value * SPEED / 50, -SPAN), SPAN)
+        farthest = max(farthest, angle, key=abs)
+    assert wish is Wish.END
+    assert abs(farthest) == pytest.approx(SPAN, abs=SPEED / 50)
+    assert angle == pytest.approx(start, abs=SPEED / 50)
+
+
+def test_a_motion_there_and_back_has_an_end_whatever_the_joint_does() -> None:
+    source = There(0.1, 0.02)
+    wishes = [source.wish(tick / 50, 0.001 * (tick % 2)) for tick in range(500)]
+    assert wishes[0] is Wish.UP
+    assert wishes[-1] is Wish.END
+
+
 def test_a_burst_of_keys_moves_no_further_than_one_and_idleness_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """Thirty repeats that a slow line held up and delivered at once must not become a second of motion."""
     from tools.bringup import jogging
@@ -229,6 +255,39 @@ def test_watch_shows_every_servo_and_what_the_bus_lost(rig: RigProcess, bringup:
     assert answer["bus"]["recovered"] > 0
     assert "encoder" in err
     assert torque(rig) == 0
+
+
+def test_watch_shows_the_imu_and_why_there_is_no_sample_of_it(rig: RigProcess, bringup: Any) -> None:
+    """Signs that are wrong must be seen here, and not when the robot falls."""
+    code, answer, err = bringup("watch", "--seconds", "0.5", *VIRTUAL)
+    assert code == 0, err
+    assert np.linalg.norm(answer["imu"]["specific_force"]) == pytest.approx(9.81, abs=0.5)
+    assert answer["imu"]["specific_force"][2] > 9.0
+    assert "IMU: force " in err
+    rig.control.inject("imu_dead")
+    _, _, err = bringup("watch", "--seconds", "2", *VIRTUAL)
+    assert "IMU: no fresh sample (it measures nothing): check its cable" in err
+
+
+@pytest.mark.parametrize(
+    ("axis", "angle", "turning", "force"),
+    [
+        ((0, 0, 1), 0.0, 1.0, (0.0, 0.0, 9.81)),  # level, turned left
+        ((0, 1, 0), 0.5, 0.0, (-4.7, 0.0, 8.61)),  # nose down
+        ((1, 0, 0), -0.5, 0.0, (0.0, -4.7, 8.61)),  # left side down
+    ],
+)
+def test_what_the_page_says_of_the_imu_is_what_physics_does(
+    axis: tuple[float, ...], angle: float, turning: float, force: tuple[float, ...]
+) -> None:
+    """Or signs are "corrected" that were right."""
+    model = build(ROBOT)
+    data = mujoco.MjData(model)
+    mujoco.mju_axisAngle2Quat(data.qpos[3:7], np.array(axis, float), angle)
+    data.qvel[5] = turning
+    mujoco.mj_inverse(model, data)  # the acceleration is none: it is held
+    assert data.sensor("accelerometer").data == pytest.approx(force, abs=0.05)
+    assert data.sensor("gyro").data[2] == pytest.approx(turning)
 
 
 def test_watch_counts_more_reads_than_it_keeps_the_times_of(
