@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from stack.session import Settings
     from tools.witness import Witness
 
-_ENDED = ("succeeded", "failed", "timed_out")  # outcomes of runs whose task ended by itself
+ENDED = ("succeeded", "failed", "timed_out")  # outcomes of runs whose task ended by itself
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -129,8 +129,9 @@ def episode(job: Settings) -> dict[str, Any]:
 def judge(job: Settings) -> Judged:
     """One run, with everything that the truth shows of it.
 
-    One that the guard broke off is no success, however far it came. Raises KeyboardInterrupt where the run was told to
-    end, by a Ctrl-C that it took for itself: that is no episode, and there shall be none after it.
+    One that the guard broke off is no success, however far it came, and one that never began has no metrics but those
+    that count what was left undone. Raises KeyboardInterrupt where the run was told to end, by a Ctrl-C that it took
+    for itself: that is no episode, and there shall be none after it.
     """
     from hw.robot import load_robot
     from stack.session import prepare, run
@@ -142,13 +143,17 @@ def judge(job: Settings) -> Judged:
     if result.interrupted:
         raise KeyboardInterrupt
     trace = witness.trace()
+    began, undone = len(trace.yaw) > 0, getattr(task, "counts_undone", ())
+    metrics = task.metrics(trace) if began or undone else {}
+    fell = trace.fallen or result.outcome == "fell"
     row = {
         "seed": job.seed,
         "outcome": result.outcome,
-        "success": result.outcome in _ENDED and bool(task.success(trace)),
-        "fell": trace.fallen or result.outcome == "fell",
+        "success": result.outcome in ENDED and bool(task.success(trace)),
+        "fell": fell,
+        "broken_off": not fell and result.outcome not in ENDED,
         "seconds": result.seconds,
-        "metrics": task.metrics(trace) if len(trace.yaw) else {},
+        "metrics": {name: value for name, value in metrics.items() if began or name in undone},
         "odometry_error_m": witness.odometry_error(result.trace),
     }
     return Judged(row, task, trace, witness)
@@ -183,6 +188,7 @@ def summarise(args: argparse.Namespace, rows: list[dict[str, Any]], wall_seconds
         "success_rate": successes / n,
         "success_ci95": wilson(successes, n),
         "fall_rate": sum(row["fell"] for row in rows) / n,
+        "broken_off_rate": sum(row["broken_off"] for row in rows) / n,
         "mean_seconds": float(np.mean([row["seconds"] for row in rows])),
         "metrics": metrics,
         "wall_seconds": wall_seconds,

@@ -100,7 +100,7 @@ def test_success_is_by_the_truth_and_only_of_whole_runs(
     monkeypatch.setattr(Witness, "trace", lambda self: trace(fallen))
     monkeypatch.setattr(Witness, "odometry_error", lambda self, estimate: 0.01)
     row = rollout.episode(Settings(task="walk", policy="gait"))
-    assert (row["success"], row["fell"]) == (success, fell)
+    assert (row["success"], row["fell"], row["broken_off"]) == (success, fell, outcome == "stopped")
 
 
 def test_a_run_that_is_told_to_end_is_no_episode_even_where_its_task_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,16 +120,16 @@ def test_a_run_that_is_told_to_end_is_no_episode_even_where_its_task_was_done(mo
 
 def test_a_run_that_never_began_is_counted_and_not_a_crash(monkeypatch: pytest.MonkeyPatch) -> None:
     """A randomised robot may fall while it stands up, before the task's first tick."""
-    for task in ("walk", "goal", "stand"):
+    for task in ("walk", "goal", "stand", "text"):
         result = SimpleNamespace(outcome="stopped", seconds=0.0, trace=trace(False), interrupted=False)
         monkeypatch.setattr("stack.session.run", lambda *a, result=result, **k: result)
         row = rollout.episode(Settings(task=task, policy="gait"))
-        assert not row["success"]
-        assert row["metrics"] == {}
-        good = {**row, "success": True, "metrics": {"distance_m": 2.0}, "odometry_error_m": 0.02, "seconds": 4.0}
+        assert (row["success"], row["fell"], row["broken_off"]) == (False, False, True)
+        assert row["metrics"] == ({"followed_share": 0.0} if task == "text" else {})
+        good = {**row, "success": True, "broken_off": False, "metrics": {"distance_m": 2.0}, "odometry_error_m": 0.02, "seconds": 4.0}
         summary = rollout.summarise(options(), [row, good], 1.0)
-        assert summary["metrics"] == {"distance_m": 2.0, "odometry_error_m": 0.02}
-        assert summary["success_rate"] == 0.5
+        assert summary["metrics"] == {**row["metrics"], "distance_m": 2.0, "odometry_error_m": 0.02}
+        assert (summary["success_rate"], summary["broken_off_rate"]) == (0.5, 0.5)
         assert summary["failed_seeds"] == [row["seed"]]
 
 

@@ -46,6 +46,16 @@ def test_less_is_better_where_it_is() -> None:
     assert one(FALLS, Measured(records(100, 83)))["reached"] is False
 
 
+def test_a_robot_that_cannot_go_on_has_not_stayed_up() -> None:
+    """Else a guard that stops every run, or a robot that never comes up, would be one that never falls."""
+    some = [{**record, "fell": False, "outcome": "stopped"} for record in records(10, 0)]
+    for row in ROWS:
+        if row.metric.of == "fell":
+            line = one(row, Measured(some))
+            assert (line["value"], line["reached"] is True) == (1.0, False), row.name
+            assert "broken off" in row.title
+
+
 def test_episodes_without_the_figure_do_not_count_and_are_told() -> None:
     some = records(5, 5)
     some[0]["metrics"] = {}
