@@ -74,7 +74,7 @@ class Text(BaseTask):
         return {"followed_share": self._followed(trace)}
 
     def _followed(self, trace: Trace) -> float:
-        """Share of the sentences that the mean measured motion followed; NaN where the task's time is too short to tell.
+        """Share of the sentences that the mean measured motion followed; NaN where the task is too short to tell.
 
         A sentence that got no gait cycle was not followed, but where the run ended by its time.
         """

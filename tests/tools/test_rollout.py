@@ -126,7 +126,14 @@ def test_a_run_that_never_began_is_counted_and_not_a_crash(monkeypatch: pytest.M
         row = rollout.episode(Settings(task=task, policy="gait"))
         assert (row["success"], row["fell"], row["broken_off"]) == (False, False, True)
         assert row["metrics"] == ({"followed_share": 0.0} if task == "text" else {})
-        good = {**row, "success": True, "broken_off": False, "metrics": {"distance_m": 2.0}, "odometry_error_m": 0.02, "seconds": 4.0}
+        good = {
+            **row,
+            "success": True,
+            "broken_off": False,
+            "metrics": {"distance_m": 2.0},
+            "odometry_error_m": 0.02,
+            "seconds": 4.0,
+        }
         summary = rollout.summarise(options(), [row, good], 1.0)
         assert summary["metrics"] == {**row["metrics"], "distance_m": 2.0, "odometry_error_m": 0.02}
         assert (summary["success_rate"], summary["broken_off_rate"]) == (0.5, 0.5)

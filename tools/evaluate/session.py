@@ -70,12 +70,12 @@ def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[st
     measured: dict[str, Measured] = {}
     prepared: dict[str, str | ConfigError] = {}  # key of the work of a run, or why there is none
     for row in rows:
-        training = pilots.training(row.run)
-        if training is not None:
-            measured[row.name] = Measured(training=training)
-            continue
         if repr(row.run) not in prepared:
             try:
+                training = pilots.training(row.run)
+                if training is not None:
+                    measured[row.name] = Measured(training=training)
+                    continue
                 work = _prepare(row.run, pilots, options)
                 prepared[repr(row.run)] = work.cache.path.name
                 works.setdefault(work.cache.path.name, work)

@@ -84,8 +84,8 @@ _MAIN: tuple[Row, ...] = (
 
 _BESIDE: tuple[Row, ...] = (
     Row(
-        "cloc/perturb-expert", CLOC, "Walk + perturb: fell or broken off, the expert", Run("perturb", policy="expert"), FALLS,
-        note="beside the policy",
+        "cloc/perturb-expert", CLOC, "Walk + perturb: fell or broken off, the expert",
+        Run("perturb", policy="expert"), FALLS, note="beside the policy",
     ),
     Row(
         "cloc/forest-seconds", CLOC, "Forest: time", _FOREST,

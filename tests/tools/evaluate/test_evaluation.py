@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from tools.evaluate.cache import EpisodeCache, key
 from tools.evaluate.code import digest
 from tools.evaluate.episode import Done, Job
 from tools.evaluate.pilots import Pilots, spec
-from tools.evaluate.rows import Metric, Network, Row, Run
+from tools.evaluate.rows import Metric, Row, Run
 from tools.evaluate.session import Options, evaluate
 
 NEAR = Row("t/near", "T", "Near", Run("goal-near", episodes=4), Metric("success", share=True))
@@ -104,32 +103,6 @@ def test_quick_cuts_the_longest_episodes_and_does_not_mistake_them_for_whole_one
     assert [job.settings.seconds for job in done] == [61.0, None, 5.0]
 
 
-def test_a_changed_checkpoint_setting_or_task_changes_what_episodes_depend_on(tmp_path: Path) -> None:
-    checkpoint = tmp_path / "mine.safetensors"
-    shutil.copy(resolve("diffusion"), checkpoint)
-
-    def made_of(run: Run) -> str:
-        return key(spec(run, Pilots(str(checkpoint), tmp_path), "op3", 0, None, None))
-
-    run = Run("goal-near")
-    before = made_of(run)
-    assert made_of(Run("goal-near", episodes=7)) == before  # more of the same
-    others = [
-        made_of(Run("goal-near", set={"radius": "0.09"})),
-        made_of(Run("goal-near", plan={"replan": "8"})),
-        made_of(Run("goal-near", randomise=True)),
-        made_of(Run("goal-near", backend="virtual")),
-        made_of(Run("goal-near", policy="expert")),
-        made_of(Run("goal-far")),
-    ]
-    elsewhere = tmp_path / "elsewhere" / "other.safetensors"
-    elsewhere.parent.mkdir()
-    shutil.copy(checkpoint, elsewhere)
-    assert key(spec(run, Pilots(str(elsewhere), tmp_path), "op3", 0, None, None)) == before  # the same bytes
-    checkpoint.write_bytes(checkpoint.read_bytes()[:-4] + b"\0\0\0\1")
-    assert len({before, *others, made_of(run)}) == 8
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -203,35 +176,6 @@ def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done
     assert len(measured["t/far"].records) == 2
 
 
-def test_a_network_of_latents_wants_the_latents_first(tmp_path: Path) -> None:
-    run, pilots = Run("survive", network=Network("z", "--mask causal", latents=True)), Pilots("diffusion", tmp_path)
-    latents, command = tmp_path / "networks" / "latents" / "latent.safetensors", pilots.training(run)
-    last = f"`servoid train diffusion --data runs/walks --out {tmp_path}/networks/z --mask causal --latent {latents}`"
-    assert command == f"`servoid train latent --data runs/walks --out {latents.parent}`, then {last}"
-    latents.parent.mkdir(parents=True)
-    latents.touch()
-    assert pilots.training(run) == last
-
-
-def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path, done: list[Job]) -> None:
-    run = Run("goal-near", episodes=1, network=Network("full", "--width 128 --horizon 24"))
-    row = Row("t/full", "T", "Full", run, Metric("success", share=True))
-    chosen = Options(tmp_path, policy="diffusion", workers=1)
-    measured = evaluate([row], chosen, quiet)["t/full"]
-    command = f"servoid train diffusion --data runs/walks --out {tmp_path}/networks/full --width 128 --horizon 24"
-    assert measured.training == f"`{command}`"
-    assert not measured.records
-    path = tmp_path / "networks" / "full" / "best.safetensors"
-    path.parent.mkdir(parents=True)
-    shutil.copy(resolve("diffusion"), path)
-    assert len(evaluate([row], chosen, quiet)["t/full"].records) == 1
-    assert str(path.resolve()) in Path(done[0].settings.policy).read_text()
-    other = replace(row, run=replace(run, network=Network("full", "--width 128 --horizon 24 --near-actions 16")))
-    refused = evaluate([other], chosen, quiet)["t/full"].refused
-    assert refused is not None
-    assert "trained with --near-actions 8, and this row is of 16" in refused
-
-
 def test_no_time_at_all_tells_what_was_done(tmp_path: Path, done: list[Job]) -> None:
     evaluate([NEAR], options(tmp_path, episodes=1), quiet)
     measured = evaluate([NEAR, FAR], options(tmp_path, minutes=0), quiet)
@@ -251,19 +195,6 @@ def test_where_nothing_could_be_run_the_table_is_written_all_the_same(tmp_path: 
     out = tmp_path / "new"
     assert main(["evaluate", "papers", "--rows", "cloc/attention-full", "--out", str(out)]) == 0
     assert "needs training" in (out / "papers.md").read_text()
-
-
-def test_variants_of_the_planner_are_files_that_the_policy_is_made_from(tmp_path: Path) -> None:
-    from policy.diffusion.settings import load_settings
-
-    pilots = Pilots("diffusion", tmp_path)
-    assert pilots.name(Run("goal")) == "diffusion"
-    assert pilots.name(Run("goal", policy="expert")) == "expert"
-    written = load_settings(pilots.name(Run("goal", plan={"replan": "8", "guidance.clip": "3"})))
-    assert (written.replan, written.guidance.clip) == (8, 3.0)
-    assert written.steps == load_settings().steps
-    with pytest.raises(ConfigError, match="replann"):
-        pilots.name(Run("goal", plan={"replann": "8"}))
 
 
 def test_an_episode_that_ctrl_c_ended_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
