@@ -146,8 +146,9 @@ def _check_training(path: Path, network: Network) -> None:
     asked = vars(parser.parse_args(["--data", "", "--out", "", *shlex.split(network.train)]))
     header = read_header(path)
     given = {**header.get("config", {}), **header.get("training", {})}
+    whatever = {*_WHATEVER, "minutes"} if asked["steps"] else _WHATEVER  # then they say when to evaluate, and no more
     for name, value in given.items():
-        if name in asked and name not in _WHATEVER and asked[name] != value:
+        if name in asked and name not in whatever and asked[name] != value:
             option = "--" + name.replace("_", "-")
             raise ConfigError(f"{path}: trained with {option} {value}, and this row is of {asked[name]}: train it anew")
 

@@ -78,6 +78,19 @@ def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path
         pilots.name(other)
 
 
+def test_of_a_network_that_was_trained_by_steps_the_minutes_do_not_matter(tmp_path: Path) -> None:
+    run = Run("goal-near", network=Network("full", "--width 128 --horizon 24 --steps 9"))
+    head, tensors = read(resolve("diffusion"))
+    for steps in (9, 8):
+        folder = tmp_path / str(steps) / "networks" / "full"
+        newest(folder, 1.0)
+        training = {**head["training"], "steps": steps, "minutes": 5.0}
+        write(folder / "best.safetensors", tensors, {**head, "training": training})
+    assert Pilots("diffusion", tmp_path / "9").name(run)
+    with pytest.raises(ConfigError, match="trained with --steps 8, and this row is of 9"):
+        Pilots("diffusion", tmp_path / "8").name(run)
+
+
 @pytest.mark.parametrize(
     ("share", "told"),
     [
