@@ -27,7 +27,7 @@ _WHATEVER = ("evaluate_every", "seed")  # of training: what does not make anothe
 
 
 class Pilots:
-    """Makes the policies that runs name. Variants of the planner become files of settings in `folder`/policies."""
+    """Makes the policies that runs name. Settings of the planner become files in `folder`/policies, as they are now."""
 
     def __init__(self, policy: str, folder: Path) -> None:
         """`policy` is the evaluated one, named as in `servoid run`. Raises ConfigError for an unknown one."""
@@ -60,12 +60,9 @@ class Pilots:
 
     def name(self, run: Run) -> str:
         """The policy of a run, as `servoid run --policy` takes it. Raises ConfigError for settings that do not fit."""
-        if run.policy == EXPERT:
-            return EXPERT
-        if not run.plan and run.network is None:
-            return self._policy
         settings = self.settings(run)
-        assert settings is not None  # `settings` refuses variants of other policies
+        if settings is None:
+            return EXPERT if run.policy == EXPERT else self._policy
         values = asdict(settings)
         path = self._folder / "policies" / f"{run.task}-{key(values)}.yaml"
         try:

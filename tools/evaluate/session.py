@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from hw.config import ConfigError
 from tools.crew import each
 from tools.evaluate.cache import EpisodeCache, key
+from tools.evaluate.code import read_anew
 from tools.evaluate.episode import Job, do, episode_seed
 from tools.evaluate.pilots import Pilots, spec
 from tools.evaluate.rows import Row, Run
@@ -43,7 +44,7 @@ class _Work:
 
     run: Run
     settings: Settings
-    pilot: Mapping[str, Any]  # fingerprint of the policy
+    pilot: tuple[Mapping[str, Any], str | None]  # fingerprint of the policy, and the hash of its file of settings
     episodes: int
     cache: EpisodeCache
     rows: list[str] = field(default_factory=list)
@@ -60,11 +61,10 @@ def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[st
     evaluation that is stopped has a bit of everything. A row that cannot be done says why; the others go on. Raises
     ConfigError for a robot or policy that there is not, or where nothing can be written.
     """
-    from hw.robot import load_robot
     from policy.checkpoint import git_commit
 
     begun = time.monotonic()
-    load_robot(options.robot)
+    read = read_anew(options.robot)
     pilots = Pilots(options.policy, options.out)
     works: dict[str, _Work] = {}
     measured: dict[str, Measured] = {}
@@ -99,10 +99,10 @@ def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[st
         if done.refused is not None:
             work.refused = done.refused
         else:
-            if pilots.fingerprint(work.run) != work.pilot:
+            if _pilot(pilots, work.run, work.settings.policy) != work.pilot or read_anew(options.robot) != read:
                 raise ConfigError(
-                    f"the policy of {', '.join(work.rows)} changed while its episodes ran: what was done is kept;"
-                    " give the same command again when its files stay as they are"
+                    f"the policy of {', '.join(work.rows)}, the robot or a file in configs/ changed while episodes ran:"
+                    " what was done is kept; give the same command again when the files stay as they are"
                 )
             work.cache.add(done.job.episode, {**done.record, "commit": commit})
     for work in runs:
@@ -137,7 +137,15 @@ def _prepare(run: Run, pilots: Pilots, options: Options) -> _Work:
         set=chosen,
     )
     cache = EpisodeCache(options.out / "episodes", kept, options.fresh)
-    return _Work(run, settings, kept["policy"], options.episodes or run.episodes, cache)
+    pilot = _pilot(pilots, run, settings.policy)
+    return _Work(run, settings, pilot, options.episodes or run.episodes, cache)
+
+
+def _pilot(pilots: Pilots, run: Run, policy: str) -> tuple[Mapping[str, Any], str | None]:
+    """What the policy of a run is made of, to be compared."""
+    from stack.provenance import sha256
+
+    return pilots.fingerprint(run), sha256(Path(policy))
 
 
 def _jobs(runs: Sequence[_Work], seed: int) -> Iterator[Job]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from hw.config import ConfigError
+from hw.config import CONFIGS, ConfigError
 from policy.checkpoint import resolve
 from tools import rollout
 from tools.cli import main
@@ -152,18 +152,48 @@ def test_episodes_are_not_those_that_settings_are_tried_on(tmp_path: Path, done:
     assert not set(seeds["goal-near"]) & {rollout.episode_seed(0, episode) for episode in range(100)}
 
 
-def test_a_policy_that_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint = tmp_path / "mine.safetensors"
+def test_what_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each episode reads checkpoint, settings and robot anew; it would be kept under what they were before."""
+    checkpoint, robot = tmp_path / "mine.safetensors", tmp_path / "robots" / "mine.yaml"
     shutil.copy(resolve("diffusion"), checkpoint)
+    shutil.copytree(CONFIGS, tmp_path / "configs")
+    shutil.copytree(CONFIGS / "robots", tmp_path / "robots")
+    shutil.copy(CONFIGS / "robots" / "op3.yaml", robot)
+    changes = [
+        lambda job: checkpoint.write_bytes(checkpoint.read_bytes()[:-4] + b"\0\0\0\1"),
+        lambda job: robot.write_text(robot.read_text().replace("name: op3", "name: mine")),
+        lambda job: (tmp_path / "configs" / "tasks" / "goal-near.yaml").open("a").write("# another\n"),
+        lambda job: Path(job.settings.policy).write_text("steps: 3\n"),
+    ]
+    monkeypatch.setattr("hw.config.CONFIGS", tmp_path / "configs")
+    for number, change in enumerate(changes):
+
+        def do(job: Job, change: Any = change) -> Done:
+            change(job)
+            return Done(job, {"success": True})
+
+        monkeypatch.setattr(session, "do", do)
+        out = tmp_path / str(number)
+        with pytest.raises(ConfigError, match="changed while"):
+            evaluate([NEAR], Options(out, policy=str(checkpoint), robot=str(robot), workers=1), quiet)
+        assert not any('"episode"' in path.read_text() for path in (out / "episodes").glob("*.jsonl"))
+
+
+def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from policy.diffusion.settings import load_settings
+
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("checkpoint: diffusion\nreplan: 6\n")
+    ran = []
 
     def do(job: Job) -> Done:
-        checkpoint.write_bytes(checkpoint.read_bytes()[:-4] + b"\0\0\0\1")
+        ran.append(load_settings(job.settings.policy).replan)
+        mine.write_text("checkpoint: diffusion\nreplan: 8\n")
         return Done(job, {"success": True})
 
     monkeypatch.setattr(session, "do", do)
-    with pytest.raises(ConfigError, match="changed while"):
-        evaluate([NEAR], Options(tmp_path, policy=str(checkpoint), workers=1), quiet)
-    assert not any('"episode"' in path.read_text() for path in (tmp_path / "episodes").glob("*.jsonl"))
+    evaluate([NEAR], Options(tmp_path, policy=str(mine), workers=1), quiet)
+    assert ran == [6, 6, 6, 6]
 
 
 def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done: list[Job]) -> None:

@@ -116,7 +116,7 @@ def test_variants_of_the_planner_are_files_that_the_policy_is_made_from(tmp_path
     from policy.diffusion.settings import load_settings
 
     pilots = Pilots("diffusion", tmp_path)
-    assert pilots.name(Run("goal")) == "diffusion"
+    assert load_settings(pilots.name(Run("goal"))).replan == load_settings().replan
     assert pilots.name(Run("goal", policy="expert")) == "expert"
     written = load_settings(pilots.name(Run("goal", plan={"replan": "8", "guidance.clip": "3"})))
     assert (written.replan, written.guidance.clip) == (8, 3.0)
