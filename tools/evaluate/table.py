@@ -96,6 +96,10 @@ _MAIN: tuple[Row, ...] = (
 
 _BESIDE: tuple[Row, ...] = (
     Row(
+        "uniphys/length-distance", UNIPHYS, "Episode length, unconditional: distance walked", _MAIN[0].run,
+        Metric("metrics.distance_m", "m"), note="a robot that stands lasts long too",
+    ),
+    Row(
         "cloc/perturb-expert", CLOC, "Walk + perturb: fell or broken off, the expert",
         Run("perturb", policy="expert"), FALLS, note="beside the policy",
     ),
