@@ -175,6 +175,18 @@ def test_velocity_is_followed_over_the_ground() -> None:
     assert task.metrics(turned)["velocity_error_mps"] > 0.03
 
 
+def test_velocities_that_a_fall_left_undone_count_as_not_walked() -> None:
+    """Else the sooner a robot falls, the fewer velocities it is measured by."""
+    task = load_task("velocity", {"speed": "0.2", "seconds": "17.4"}, DT)
+    run = drive(task, 17.4)
+    half = replace(run, velocity=run.velocity[:435], yaw=run.yaw[:435])  # the first of two
+    for fallen in (True, False):  # be it by a fall or by the guard
+        assert task.metrics(replace(half, fallen=fallen))["velocity_error_mps"] == pytest.approx(0.1, abs=0.003)
+    never = replace(run, velocity=run.velocity[:0], yaw=run.yaw[:0], displacement=run.displacement[:0])
+    assert task.metrics(never)["velocity_error_mps"] == pytest.approx(0.2)
+    assert not task.success(never)
+
+
 # --- path
 
 

@@ -53,6 +53,9 @@ class Metric:
     share: bool = False  # true or false, instead of a number
     cut_short: bool = False  # of a share: true as well where the guard broke the run off, or it never began
     lower: bool = False  # whether less is better
+    # How an episode counts that fell or was stopped: until then, with what it left undone, or (like all that did not
+    # succeed) not at all.
+    unfinished: Literal["until then", "whole", "left out"] = "until then"
     resolution: float = 0.0  # of the unit: what is finer is rounding of the simulation, and nothing to compare
 
     def values(self, records: Sequence[Mapping[str, Any]]) -> list[float]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from tools.evaluate.rows import Beside, Row
+from tools.evaluate.rows import Beside, Row, cut_short
 from tools.intervals import bootstrap, wilson
 
 
@@ -82,8 +82,16 @@ def _note(row: Row, measured: Measured, counted: int) -> str:
     if not measured.records and measured.training is None and measured.refused is None:
         parts.append("not measured: no time was left")
     elif counted < len(measured.records):
-        parts.append(f"{len(measured.records) - counted} more episodes ended before there was anything to measure")
+        why = (
+            "did not succeed"
+            if row.metric.unfinished == "left out"
+            else "had ended before there was anything to measure"
+        )
+        parts.append(f"{len(measured.records) - counted} {why}")
     stopped = sum(record.get("outcome") == "stopped" for record in measured.records)
-    if stopped:
+    if row.metric.unfinished == "until then" and not row.metric.share:
+        early = sum(cut_short(record) and bool(row.metric.values([record])) for record in measured.records)
+        parts.append(f"{early} fell or were stopped, and count until then" if early else "")
+    elif stopped:
         parts.append(f"{stopped} stopped by the guard, not for a fall")
     return "; ".join(part for part in parts if part)

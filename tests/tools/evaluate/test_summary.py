@@ -64,7 +64,31 @@ def test_episodes_without_the_figure_do_not_count_and_are_told() -> None:
     some[2]["metrics"]["error_m"] = None  # as it comes back from a file
     line = one(ERROR, Measured(some))
     assert (line["episodes"], line["value"]) == (2, pytest.approx(0.04))
-    assert "3 more episodes" in line["note"]
+    assert "3 had ended before there was anything to measure" in line["note"]
+
+
+def test_a_figure_of_what_came_before_a_fall_says_so() -> None:
+    some = records(5, 3)
+    some[0]["outcome"] = "stopped"
+    some[4]["metrics"] = {}  # it fell before there was anything to measure
+    assert "2 fell or were stopped, and count until then" in one(ERROR, Measured(some))["note"]
+    assert "until then" not in one(ERROR, Measured(records(5, 5)))["note"]
+    whole = replace(ERROR, metric=replace(ERROR.metric, unfinished="whole"))
+    for row in (SHARE, FALLS, whole):
+        assert "until then" not in one(row, Measured(some))["note"], row.name
+    rows = {row.name: row.metric for row in ROWS}
+    whole = {name for name, metric in rows.items() if metric.unfinished == "whole"}
+    assert {"uniphys/length", "uniphys/velocity", "text/followed"} <= whole
+    assert not any(name.startswith("motion/") for name in whole)
+
+
+def test_times_of_those_that_succeeded_say_how_many_did_not() -> None:
+    (row,) = (row for row in ROWS if row.metric.of.startswith("metrics.seconds_to"))
+    some = [
+        {**record, "metrics": {"seconds_to_goal": 9.0 if record["success"] else math.nan}} for record in records(5, 3)
+    ]
+    line = one(row, Measured(some))
+    assert (line["episodes"], line["note"]) == (3, "of those that succeeded; 2 did not succeed")
 
 
 def test_a_figure_may_be_another_rows_value() -> None:
