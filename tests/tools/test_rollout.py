@@ -68,15 +68,6 @@ def test_an_episode_can_be_run_again_by_its_seed() -> None:
     np.testing.assert_array_equal(plain.trace.displacement, again.trace.displacement)
 
 
-@pytest.mark.parametrize(
-    ("successes", "n", "low", "high"),
-    # R: binom.confint(x, n, methods = "wilson")
-    [(0, 10, 0.0, 0.2775), (10, 10, 0.7225, 1.0), (5, 10, 0.2366, 0.7634), (190, 200, 0.9104, 0.9726)],
-)
-def test_wilson_interval(successes: int, n: int, low: float, high: float) -> None:
-    assert rollout.wilson(successes, n) == pytest.approx([low, high], abs=5e-4)
-
-
 def trace(fallen: bool) -> Trace:
     rows = np.zeros((200, 3))
     return Trace(0.02, rows, np.zeros(200), rows, np.zeros(200), rows, fallen)

@@ -13,7 +13,6 @@ from tools.evaluate.rows import Beside, Metric, Row, Run, select
 from tools.evaluate.summary import Measured, table
 from tools.evaluate.table import ROWS
 from tools.evaluate.write import as_csv, cells, markdown, number
-from tools.intervals import bootstrap
 from tools.parser import Parser
 
 SHARE = Row("a/share", "A", "Share", Run("goal"), Metric("success", share=True), 0.95, figure=0.9)
@@ -88,7 +87,10 @@ def test_times_of_those_that_succeeded_say_how_many_did_not() -> None:
         {**record, "metrics": {"seconds_to_goal": 9.0 if record["success"] else math.nan}} for record in records(5, 3)
     ]
     line = one(row, Measured(some))
-    assert (line["episodes"], line["note"]) == (3, "of those that succeeded; 2 did not succeed")
+    assert (line["episodes"], line["note"]) == (
+        3,
+        "of those that succeeded; 2 did not succeed; no interval: fewer than 4 episodes",
+    )
 
 
 def test_a_figure_may_be_another_rows_value() -> None:
@@ -124,13 +126,15 @@ def test_an_episode_that_the_guard_broke_off_is_told() -> None:
     assert "1 stopped by the guard" in one(SHARE, Measured(some))["note"]
 
 
-def test_bootstrap_covers_the_mean_and_is_the_same_each_time() -> None:
-    values = [float(x) for x in range(100)]
-    low, high = bootstrap(values) or (0.0, 0.0)
-    assert low == pytest.approx(49.5 - 1.96 * 28.9 / 10, abs=0.5)  # the normal interval, which this many values follow
-    assert high == pytest.approx(49.5 + 1.96 * 28.9 / 10, abs=0.5)
-    assert bootstrap(values) == [low, high]
-    assert bootstrap([1.0]) is None
+def test_a_mean_without_an_interval_says_why() -> None:
+    lengths = Row("a/length", "A", "Length", Run("goal"), Metric("ticks"))
+    assert "no interval: fewer than 4 episodes" in one(lengths, Measured(records(3, 3)))["note"]
+    same = one(lengths, Measured([{**record, "ticks": 3000} for record in records(6, 6)]))
+    assert (same["value"], same["ci95"]) == (3000.0, None)
+    assert "no interval: all values are equal" in same["note"]
+    assert (
+        "no interval" not in one(lengths, Measured(records(4, 4)))["note"] + one(SHARE, Measured(records(1, 1)))["note"]
+    )
 
 
 def test_markdown_and_csv_hold_what_the_table_does() -> None:
