@@ -1,7 +1,8 @@
 """Run a task many times in simulation and judge it by the truth.
 
 Every episode is a `servoid run` of its own, with its own random stream: results do not depend on the number of workers,
-and any episode can be repeated with `servoid run TASK --seed S`.
+and any episode can be repeated with `servoid run TASK --seed S`. An episode that cannot be done ends the rollout with
+its error, after the figures of those that were.
 """
 
 from __future__ import annotations
@@ -9,12 +10,14 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hw.config import ConfigError
 from hw.hal import Backend, Task, Trace, Truth
 from tools.crew import each
+from tools.exit_codes import exit_code, explain
 from tools.intervals import wilson
 from tools.output import add_json_argument, reporting
 from tools.parser import add_set_argument, settings
@@ -53,11 +56,22 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError(f"backend '{args.backend}' has no truth to judge by: use a simulated one, or `servoid run`")
     with reporting(args.json) as report:
         begun = time.monotonic()
-        values = settings(args)
-        rows = run_all(args, values, report)
-        summary = summarise(args, rows, time.monotonic() - begun)
+        rows: dict[int, dict[str, Any]] = {}
+        failure: Exception | None = None
+        try:
+            for episode, row in run_all(args, settings(args)):
+                rows[episode] = row
+        except Exception as error:
+            if not rows:
+                raise
+            failure = error  # raised below, when what was done is told
+        summary = summarise(args, [rows[episode] for episode in sorted(rows)], time.monotonic() - begun)
+        if failure is not None:
+            summary |= {"error": explain(failure), "exit_code": exit_code(failure)}
         report.table(["figure", "value"], [[key, _text(value)] for key, value in summary.items()])
         report.result(summary)
+        if failure is not None:
+            raise failure
     return 0
 
 
@@ -68,8 +82,11 @@ def episode_seed(seed: int, episode: int) -> int:
     return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
 
 
-def run_all(args: argparse.Namespace, values: dict[str, str], report: Any) -> list[dict[str, Any]]:
-    """All episodes' rows, in order, on `--workers` processes. Bad settings are refused before any starts."""
+def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[int, dict[str, Any]]]:
+    """All episodes with their rows, as they are done by `--workers` processes. Bad settings are refused before any.
+
+    Raises what the first episode raises that cannot be done; the others are given up then.
+    """
     from tqdm import tqdm
 
     from stack.session import Settings
@@ -91,11 +108,8 @@ def run_all(args: argparse.Namespace, values: dict[str, str], report: Any) -> li
     workers = min(args.workers or os.cpu_count() or 1, len(jobs))
     if workers > 1:
         episode_check(jobs[0])
-    rows: list[dict[str, Any]] = [{}] * len(jobs)
     done = each(_numbered, enumerate(jobs), workers)
-    for i, row in tqdm(done, total=len(jobs), unit="episode", mininterval=2.0):
-        rows[i] = row
-    return rows
+    yield from tqdm(done, total=len(jobs), unit="episode", mininterval=2.0)
 
 
 def _numbered(job: tuple[int, Settings]) -> tuple[int, dict[str, Any]]:

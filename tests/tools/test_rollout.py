@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from hw.config import ConfigError
-from hw.hal import Trace
+from hw.hal import BackendError, Trace
 from hw.robot import load_robot
 from sim.backend import SimBackend
 from stack.loop import TickRecord
 from stack.safety import Phase
 from stack.session import Settings, run
 from tools import rollout
+from tools.cli import main
 from tools.witness import Witness
 
 WORDS = ["walk", "--policy", "gait", "--seconds", "3", "--episodes", "2", "--seed", "3"]
@@ -71,6 +72,34 @@ def test_an_episode_can_be_run_again_by_its_seed() -> None:
 def trace(fallen: bool) -> Trace:
     rows = np.zeros((200, 3))
     return Trace(0.02, rows, np.zeros(200), rows, np.zeros(200), rows, fallen)
+
+
+def test_an_episode_that_cannot_be_done_does_not_take_the_others_with_it(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    done = []
+
+    def episode(job: Settings) -> dict:
+        if len(done) == 2:
+            raise BackendError("the rig did not answer")
+        done.append(job.seed)
+        return {
+            "seed": job.seed, "success": True, "fell": False, "broken_off": False, "seconds": 3.0, "metrics": {},
+            "odometry_error_m": 0.01,
+        }  # fmt: skip
+
+    monkeypatch.setattr(rollout, "episode", episode)
+    words = [*WORDS, "--json", "--workers", "1", "--episodes"]
+    assert main(["rollout", *words, "5"]) == 3
+    out, err = capfd.readouterr()
+    (line,) = out.splitlines()
+    result = json.loads(line)
+    assert (result["episodes"], result["success_rate"]) == (2, 1.0)
+    assert (result["error"], result["exit_code"]) == ("the rig did not answer", 3)
+    assert "the rig did not answer" in err
+    assert main(["rollout", *words, "5"]) == 3  # and where none was done, the error alone
+    (line,) = capfd.readouterr().out.splitlines()
+    assert json.loads(line) == {"error": "the rig did not answer", "exit_code": 3}
 
 
 @pytest.mark.parametrize(

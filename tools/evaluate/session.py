@@ -17,6 +17,7 @@ from tools.evaluate.episode import Job, do, episode_seed
 from tools.evaluate.pilots import Pilots, spec
 from tools.evaluate.rows import Row, Run
 from tools.evaluate.summary import Measured
+from tools.exit_codes import explain
 
 if TYPE_CHECKING:
     from stack.session import Settings
@@ -68,7 +69,7 @@ def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[st
     pilots = Pilots(options.policy, options.out)
     works: dict[str, _Work] = {}
     measured: dict[str, Measured] = {}
-    prepared: dict[str, str | ConfigError] = {}  # key of the work of a run, or why there is none
+    prepared: dict[str, str | Exception] = {}  # key of the work of a run, or why there is none
     for row in rows:
         if repr(row.run) not in prepared:
             try:
@@ -79,11 +80,11 @@ def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[st
                 work = _prepare(row.run, pilots, options)
                 prepared[repr(row.run)] = work.cache.path.name
                 works.setdefault(work.cache.path.name, work)
-            except ConfigError as error:
+            except Exception as error:  # clips are recorded there: whatever ends that does not end the other rows
                 prepared[repr(row.run)] = error
         found = prepared[repr(row.run)]
-        if isinstance(found, ConfigError):
-            measured[row.name] = Measured(refused=str(found))
+        if isinstance(found, Exception):
+            measured[row.name] = Measured(refused=explain(found))
         else:
             works[found].rows.append(row.name)
     runs, commit = list(works.values()), git_commit()

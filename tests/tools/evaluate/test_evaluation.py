@@ -10,7 +10,9 @@ from typing import Any
 import pytest
 
 from hw.config import CONFIGS, ConfigError
+from hw.hal import BackendError
 from policy.checkpoint import resolve
+from stack.session import Settings
 from tools import rollout
 from tools.cli import main
 from tools.evaluate import clips, session
@@ -204,6 +206,21 @@ def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done
     assert sum(job.settings.task == "stand" for job in done) == 1
     assert "for diffusion models" in (measured["t/variant"].refused or "")
     assert len(measured["t/far"].records) == 2
+
+
+@pytest.mark.parametrize("error", [BackendError("the rig did not answer"), ZeroDivisionError("no floor")])
+def test_an_error_of_one_run_does_not_stop_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def record(settings: Settings) -> dict[str, Any]:
+        if settings.task == "goal-far":
+            raise error
+        return {"success": True}
+
+    monkeypatch.setattr("tools.evaluate.episode.record", record)
+    measured = evaluate([FAR, NEAR], options(tmp_path), quiet)
+    assert str(error) in (measured["t/far"].refused or "")
+    assert len(measured["t/near"].records) == 4
 
 
 def test_no_time_at_all_tells_what_was_done(tmp_path: Path, done: list[Job]) -> None:
