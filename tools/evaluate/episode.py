@@ -61,7 +61,7 @@ def record(settings: Settings) -> dict[str, Any]:
     judged = judge(settings)
     trace, task = judged.trace, judged.task
     limit = round(task.seconds / trace.dt)
-    goal = getattr(task, "goal", None)
+    goal = getattr(task, "goal", None) if trace.goal is None else trace.goal[-1]
     return {
         **judged.row,
         "ticks": min(judged.witness.upright, limit),
