@@ -20,7 +20,7 @@ from tools.crew import each
 from tools.exit_codes import exit_code, explain
 from tools.intervals import wilson
 from tools.output import add_json_argument, reporting
-from tools.parser import add_set_argument, settings
+from tools.parser import add_set_argument, check_seed, settings
 
 if TYPE_CHECKING:
     from stack.session import Settings
@@ -46,15 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    if args.episodes < 1:
-        raise ConfigError(f"--episodes: {args.episodes} is not a number of episodes; give 1 or more")
-    if args.workers < 0:
-        raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
-    from stack.backends import backend_kind
-
-    if not backend_kind(args.backend).simulated:
-        raise ConfigError(f"backend '{args.backend}' has no truth to judge by: use a simulated one, or `servoid run`")
     with reporting(args.json) as report:
+        _check(args)
         begun = time.monotonic()
         rows: dict[int, dict[str, Any]] = {}
         failure: Exception | None = None
@@ -73,6 +66,18 @@ def main(args: argparse.Namespace) -> int:
         if failure is not None:
             raise failure
     return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    from stack.backends import backend_kind
+
+    if args.episodes < 1:
+        raise ConfigError(f"--episodes: {args.episodes} is not a number of episodes; give 1 or more")
+    if args.workers < 0:
+        raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
+    check_seed(args.seed)
+    if not backend_kind(args.backend).simulated:
+        raise ConfigError(f"backend '{args.backend}' has no truth to judge by: use a simulated one, or `servoid run`")
 
 
 def episode_seed(seed: int, episode: int) -> int:

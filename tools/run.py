@@ -17,7 +17,7 @@ from typing import Any
 from hw.config import ConfigError
 from tools import exit_codes
 from tools.output import Report, add_json_argument, reporting
-from tools.parser import add_set_argument, settings
+from tools.parser import add_set_argument, check_seed, settings
 from tools.prompt import confirm
 
 EXIT_CODES = {
@@ -63,6 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
+        check_seed(args.seed)
         if args.video is not None:
             _prepare_video(args.video)
         from stack.interrupt import Interrupt
@@ -82,7 +83,7 @@ def main(args: argparse.Namespace) -> int:
             policy=args.policy,
             randomise=args.randomise,
             seconds=args.seconds,
-            seed=_seed(args.seed),
+            seed=args.seed,
             set=settings(args),
             start=args.start,
             record=args.record or _default_log(args.task),
@@ -115,12 +116,6 @@ def positive(text: str) -> float:
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
     return value
-
-
-def _seed(seed: int) -> int:
-    if seed < 0:
-        raise ConfigError(f"--seed {seed}: give a number from 0 on")
-    return seed
 
 
 def _default_log(task: str) -> Path:
