@@ -131,6 +131,12 @@ def _prepare_video(path: Path) -> None:
         raise ConfigError(f"--video {path}: give a name that ends in .mp4")
     if path.exists():
         raise ConfigError(f"--video {path}: exists already: give another name")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        path.unlink()
+    except OSError as error:
+        raise ConfigError(f"--video {path}: cannot be written ({error.strerror}): give another name") from None
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
 
@@ -140,20 +146,22 @@ def _film(report: Report, log: Path, path: Path) -> dict[str, Path]:
     from stack.flightlog import read_log
     from tools.video import VideoError, make_video
 
-    made = {}
-    flight = read_log(log)
+    made: dict[str, Path] = {}
+    failures = (VideoError, ConfigError, OSError, ValueError)  # a full disk, say, or no encoder
     try:
-        make_video(flight, path)
+        make_video(read_log(log), path)
         made["video"] = path
-    except VideoError as error:
+    except failures as error:
         report.line(f"no video: {error}")
     try:
         from tools.plot import plot_path
 
-        plot_path(flight, path.with_suffix(".png"))
+        plot_path(read_log(log), path.with_suffix(".png"))
         made["plot"] = path.with_suffix(".png")
     except ModuleNotFoundError as error:
         report.line(f"no plot: {exit_codes.explain(error)}")
+    except failures as error:
+        report.line(f"no plot: {error}")
     return made
 
 
