@@ -139,9 +139,15 @@ def _write(
     encoder: Mapping[str, Any] | None,
     report: Report,
 ) -> None:
-    """Markdown, CSV and the paths. Raises ConfigError."""
+    """Markdown, CSV and the paths, where anything was measured: an empty page would replace one that is not.
+
+    Raises ConfigError.
+    """
     from stack.policies import policy_fingerprint
 
+    if not any(result.records for result in measured.values()):
+        report.line(f"nothing was measured: no page is written in {options.out}")
+        return
     commits = sorted({str(record["commit"]) for result in measured.values() for record in result.records})
     facts = [
         f"policy: {options.policy}, checkpoint {policy_fingerprint(options.policy)['checkpoint_sha256']}",

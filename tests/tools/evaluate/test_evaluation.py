@@ -238,10 +238,18 @@ def test_no_time_at_all_records_no_clips_and_forgets_nothing(tmp_path: Path, cap
     assert "--fresh" in capsys.readouterr().err
 
 
-def test_where_nothing_could_be_run_the_table_is_written_all_the_same(tmp_path: Path) -> None:
-    out = tmp_path / "new"
-    assert main(["evaluate", "papers", "--rows", "cloc/attention-full", "--out", str(out)]) == 0
-    assert "needs training" in (out / "papers.md").read_text()
+def test_where_nothing_was_measured_the_page_that_is_there_stays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["evaluate", "papers", "--policy", "gait", "--out", str(tmp_path), "--rows"]
+    assert main([*words, "cloc/attention-full"]) == 0
+    out = capsys.readouterr().out
+    assert "needs training" in out
+    assert "nothing was measured" in out
+    assert not (tmp_path / "papers.md").exists()
+    (tmp_path / "papers.md").write_text("of an evaluation before")
+    assert main([*words, "uniphys/goal-near", "--minutes", "0"]) == 0
+    assert (tmp_path / "papers.md").read_text() == "of an evaluation before"
 
 
 def test_an_episode_that_ctrl_c_ended_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
