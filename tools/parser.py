@@ -49,7 +49,11 @@ def check_seed(seed: int) -> None:
 def add_set_argument(parser: argparse.ArgumentParser) -> None:
     """`--set key=value`, any number of times; read it with `settings(args)`."""
     parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting of the task (servoid tasks)"
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="change a setting of the task (servoid tasks); gain=G scales the servos' position gain",
     )
 
 
