@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import types
 import typing
+from collections.abc import Iterable
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,23 +15,23 @@ from hw.config import ConfigError, nearest, parse_number
 T = TypeVar("T")
 
 
-def override(base: T, settings: dict[str, str], where: str = "--set") -> T:
+def override(base: T, settings: dict[str, str], where: str = "--set", beside: Iterable[str] = ()) -> T:
     """The dataclass instance `base` with some fields read from text, as typed on a command line.
 
     A field of a field is named with a dot. A pair of numbers is written `low:high`, or as one number for both; a list
-    of points as `x,y:x,y`.
+    of points as `x,y:x,y`. `beside` are names that are read elsewhere, and may be meant by one that is unknown here.
     Raises ConfigError naming the setting for an unknown key or a value that does not parse.
     """
     for key, text in settings.items():
-        base = _set(base, key, key, text, where)
+        base = _set(base, key, key, text, where, beside)
     return base
 
 
-def _set(base: Any, key: str, full: str, text: str, where: str) -> Any:
+def _set(base: Any, key: str, full: str, text: str, where: str, beside: Iterable[str] = ()) -> Any:
     hints = typing.get_type_hints(type(base))
     name, _, rest = key.partition(".")
     if name not in hints:
-        raise ConfigError(f"{where} {full}={text}: unknown setting '{name}': {nearest(name, hints)}")
+        raise ConfigError(f"{where} {full}={text}: unknown setting '{name}': {nearest(name, (*hints, *beside))}")
     if rest:
         inner = getattr(base, name)
         if not is_dataclass(inner):

@@ -5,22 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from hw.config import ConfigError, nearest
 from hw.hal import Policy, Task
 from hw.robot import Robot
 
+if TYPE_CHECKING:
+    from policy.diffusion.settings import DiffusionSettings
+
 Maker = Callable[[str, Robot, Task, bool], Policy]
 
 
 def _diffusion(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
-    from policy.diffusion.settings import load_settings
     from stack.diffusion_policy import diffusion_policy
 
-    trained = source.endswith(".safetensors")
-    settings = replace(load_settings(), checkpoint=source) if trained else load_settings(source)
     cost = task.cost if getattr(task, "guides", True) else None
-    return diffusion_policy(robot, settings, cost, process=realtime)
+    return diffusion_policy(robot, _planner(source), cost, process=realtime)
+
+
+def _planner(source: str) -> DiffusionSettings:
+    """Settings of a diffusion policy. Raises ConfigError."""
+    from policy.diffusion.settings import load_settings
+
+    trained = source.endswith(".safetensors")
+    return replace(load_settings(), checkpoint=source) if trained else load_settings(source)
 
 
 def _expert(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
@@ -55,19 +64,22 @@ def make_policy(name: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     return _maker(name)(name, robot, task, realtime)
 
 
-def policy_fingerprint(name: str) -> dict[str, str | None]:
-    """Name of a policy and the hash of its checkpoint, where it has one, for the flight log."""
+def policy_fingerprint(name: str) -> dict[str, Any]:
+    """Name of a policy and what it is made of, for the flight log: its checkpoint and that of odometry by their hashes,
+    settings of the planner or of the gait. None for what it has not. Raises ConfigError."""
     from policy.checkpoint import resolve
-    from stack.provenance import sha256
+    from policy.gait import load_gait
+    from stack.provenance import described, sha256
 
-    checkpoint = None
-    if name == "expert" or name.endswith(".safetensors"):
-        checkpoint = resolve(name)
-    elif name != "gait":
-        from policy.diffusion.settings import load_settings
-
-        checkpoint = resolve(load_settings(name).checkpoint)
-    return {"name": name, "checkpoint_sha256": None if checkpoint is None else sha256(checkpoint)}
+    planner = _planner(name) if _maker(name) is _diffusion else None
+    checkpoint = None if name == "gait" else resolve(name if planner is None else planner.checkpoint)
+    return {
+        "name": name,
+        "checkpoint_sha256": None if checkpoint is None else sha256(checkpoint),
+        "odometry_sha256": sha256(resolve("odometry")),
+        "planner": None if planner is None else described(planner),
+        "gait": described(load_gait()) if planner is None else None,
+    }
 
 
 def _maker(name: str) -> Maker:

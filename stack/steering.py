@@ -103,7 +103,7 @@ class Keyboard:
     """The keys of a terminal. What was pressed stays wished for, until space."""
 
     def __init__(self, fd: int | None = None) -> None:
-        """`fd` is the terminal, standard input by default. Raises ConfigError where it is none."""
+        """`fd` is the terminal, standard input by default. Tells the keys. Raises ConfigError where it is none."""
         self._fd = sys.stdin.fileno() if fd is None else fd
         if not os.isatty(self._fd):
             raise ConfigError("the keyboard can only be read in a terminal: start the command in one, or use a gamepad")
@@ -111,6 +111,7 @@ class Keyboard:
         atexit.register(self.close)  # however the program ends: a terminal that does not echo is a nuisance
         tty.setcbreak(self._fd)  # Ctrl-C still interrupts
         self._way, self._ends = np.zeros(3), False
+        print(KEYS_HELP, file=sys.stderr, flush=True)
 
     def read(self) -> Wish:
         while select.select([self._fd], [], [], 0.0)[0]:

@@ -11,17 +11,21 @@ import numpy as np
 
 from stack.loop import TickRecord
 from stack.safety import Phase
+from tools.output import Screen
 
 WINDOW = 250  # ticks that the timing is taken over
 INTERVAL = {True: 0.1, False: 1.0}  # s between updates: of the wall on a terminal, of the robot elsewhere
 
 
 class LiveLine:
-    """Call it with each tick. On a terminal the line is rewritten in place, elsewhere a new one comes each second."""
+    """Call it with each tick. On a terminal the line is rewritten in place, elsewhere a new one comes each second.
+
+    It never waits, and a stream that cannot be written to does not end the run.
+    """
 
     def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-        self._tty = stream.isatty()
+        self._screen = Screen(stream)
+        self._tty = self._screen.tty
         self._busy: deque[float] = deque(maxlen=WINDOW)
         self._shown = -math.inf
         self._start_ns: int | None = None
@@ -63,13 +67,10 @@ class LiveLine:
     def close(self) -> None:
         """Leave the last line standing."""
         if self._tty and self._width:
-            self._stream.write("\n")
-            self._stream.flush()
+            self._screen.write("\n")
 
     def _show(self, text: str) -> None:
-        if self._tty:
-            self._stream.write("\r" + text.ljust(self._width))
+        if not self._tty:
+            self._screen.write(text + "\n")
+        elif self._screen.write("\r" + text.ljust(self._width)):
             self._width = len(text)
-        else:
-            self._stream.write(text + "\n")
-        self._stream.flush()

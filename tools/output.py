@@ -13,6 +13,7 @@ import io
 import json
 import math
 import os
+import select
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -47,6 +48,40 @@ class Report:
         self.has_result = True
         if self.as_json:
             print(to_json(values), file=self._stdout, flush=True)
+
+
+class Screen:
+    """A stream that nobody waits for, for the line that is rewritten while a control loop runs.
+
+    What it does not take at once is left out: a terminal that Ctrl-S stopped, or an ssh connection that hangs. When a
+    write fails, because the reader is gone, nothing is written any more.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.tty = stream.isatty()
+        self._stream: TextIO | None = stream
+
+    def write(self, text: str) -> bool:
+        """Write a line at most, to be seen at once; whether it was."""
+        if self._stream is None or not _takes(self._stream):
+            return False
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except OSError:  # the robot goes on without it
+            self._stream = None
+        return self._stream is not None
+
+
+def _takes(stream: TextIO) -> bool:
+    """Whether a stream takes a line without waiting. A terminal or a pipe that takes anything has room for one."""
+    try:
+        descriptor = stream.fileno()
+    except (AttributeError, OSError):  # in memory
+        return True
+    poll = select.poll()
+    poll.register(descriptor, select.POLLOUT)
+    return any(events & select.POLLOUT for _, events in poll.poll(0))
 
 
 @contextlib.contextmanager

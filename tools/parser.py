@@ -40,10 +40,20 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     return f"; did you mean '{close[0]}'?" if close else ""
 
 
+def check_seed(seed: int) -> None:
+    """Raise ConfigError for a `--seed` that no generator takes."""
+    if seed < 0:
+        raise ConfigError(f"--seed {seed}: give a number from 0 on")
+
+
 def add_set_argument(parser: argparse.ArgumentParser) -> None:
     """`--set key=value`, any number of times; read it with `settings(args)`."""
     parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting of the task (servoid tasks)"
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="change a setting of the task (servoid tasks); gain=G scales the servos' position gain",
     )
 
 

@@ -86,7 +86,7 @@ def replay(log: FlightLog) -> tuple[int, Difference | None]:
 
     velocities = log.column("/instruction", "velocity").reshape(-1, 3)
     ended = any(event["kind"] == "task" and event["text"] == DONE for event in log.messages["/event"])
-    result = run(settings, on_tick=compare, script=Script(tuple(stops), plans if plans else None, velocities, ended))
+    result = run(settings, on_tick=compare, script=Script(tuple(stops), plans, velocities, ended))
     for event in result.events:  # of their own ticks, as in the log: what befalls other robots comes between two
         repeated[event.tick]["/event"].append(plain(event_message(event)))
     for number in sorted(recorded.keys() | (repeated.keys() if log.complete else set())):
@@ -97,21 +97,45 @@ def replay(log: FlightLog) -> tuple[int, Difference | None]:
 
 
 def changes(log: FlightLog) -> list[str]:
-    """What is not as it was when the log was written: robot, servos, model, network, packages, source."""
+    """What is not as it was when the log was written: robot, policy, task, packages, source; as far as the log says."""
     from hw.robot import load_robot
+    from policy.checkpoint import git_commit
     from stack.policies import policy_fingerprint
     from stack.provenance import fingerprint, versions
 
-    now = fingerprint(load_robot(_settings(log).robot))
-    now |= {"policy": policy_fingerprint(_settings(log).policy), "versions": versions()}
+    settings = _settings(log)
+    policy, header = policy_fingerprint(settings.policy), {**log.header, **_part("policy", log.header["policy"])}
+    now = fingerprint(load_robot(settings.robot)) | _part("policy", policy)
+    now |= {"task": _task(settings), "versions": versions(), "git_commit": git_commit()}
     names = {
         "robot": "the robot's file",
         "servos": "a servo's file",
         "mjcf_sha256": "the robot's model",
-        "policy": "the policy's checkpoint",
+        "policy.name": "the policy",
+        "policy.checkpoint_sha256": "the policy's checkpoint",
+        "policy.odometry_sha256": "the odometry's checkpoint",
+        "policy.planner": "the planner's settings",
+        "policy.gait": "the gait's settings",
+        "task": "the task's settings",
         "versions": "installed packages",
+        "git_commit": "the source",
     }
-    return [text for key, text in names.items() if log.header.get(key) != now[key]]
+    return [text for key, text in names.items() if key in header and header[key] != now[key]]
+
+
+def _part(name: str, values: dict[str, Any]) -> dict[str, Any]:
+    return {f"{name}.{key}": value for key, value in values.items()}
+
+
+def _task(settings: Settings) -> dict[str, Any]:
+    """The task as a log's header has it, by the settings' file of today."""
+    from stack.provenance import described
+    from stack.tasks import load_settings
+
+    chosen = {key: value for key, value in settings.set.items() if key != "gain"}  # which is the servos'
+    if settings.seconds is not None:
+        chosen["seconds"] = repr(settings.seconds)
+    return {"name": settings.task} | described(load_settings(settings.task, chosen))
 
 
 def _settings(log: FlightLog) -> Settings:

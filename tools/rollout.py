@@ -1,7 +1,8 @@
 """Run a task many times in simulation and judge it by the truth.
 
 Every episode is a `servoid run` of its own, with its own random stream: results do not depend on the number of workers,
-and any episode can be repeated with `servoid run TASK --seed S`.
+and any episode can be repeated with `servoid run TASK --seed S`. An episode that cannot be done ends the rollout with
+its error, after the figures of those that were.
 """
 
 from __future__ import annotations
@@ -9,21 +10,23 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hw.config import ConfigError
 from hw.hal import Backend, Task, Trace, Truth
 from tools.crew import each
+from tools.exit_codes import exit_code, explain
 from tools.intervals import wilson
 from tools.output import add_json_argument, reporting
-from tools.parser import add_set_argument, settings
+from tools.parser import add_set_argument, check_seed, settings
 
 if TYPE_CHECKING:
     from stack.session import Settings
     from tools.witness import Witness
 
-_ENDED = ("succeeded", "failed", "timed_out")  # outcomes of runs whose task ended by itself
+ENDED = ("succeeded", "failed", "timed_out")  # outcomes of runs whose task ended by itself
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,22 +46,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        _check(args)
+        begun = time.monotonic()
+        rows: dict[int, dict[str, Any]] = {}
+        failure: Exception | None = None
+        try:
+            for episode, row in run_all(args, settings(args)):
+                rows[episode] = row
+        except Exception as error:
+            if not rows:
+                raise
+            failure = error  # raised below, when what was done is told
+        summary = summarise(args, [rows[episode] for episode in sorted(rows)], time.monotonic() - begun)
+        if failure is not None:
+            summary |= {"error": explain(failure), "exit_code": exit_code(failure)}
+        report.table(["figure", "value"], [[key, _text(value)] for key, value in summary.items()])
+        report.result(summary)
+        if failure is not None:
+            raise failure
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    from stack.backends import backend_kind
+
     if args.episodes < 1:
         raise ConfigError(f"--episodes: {args.episodes} is not a number of episodes; give 1 or more")
     if args.workers < 0:
         raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
-    from stack.backends import backend_kind
-
+    check_seed(args.seed)
     if not backend_kind(args.backend).simulated:
         raise ConfigError(f"backend '{args.backend}' has no truth to judge by: use a simulated one, or `servoid run`")
-    with reporting(args.json) as report:
-        begun = time.monotonic()
-        values = settings(args)
-        rows = run_all(args, values, report)
-        summary = summarise(args, rows, time.monotonic() - begun)
-        report.table(["figure", "value"], [[key, _text(value)] for key, value in summary.items()])
-        report.result(summary)
-    return 0
 
 
 def episode_seed(seed: int, episode: int) -> int:
@@ -68,8 +87,11 @@ def episode_seed(seed: int, episode: int) -> int:
     return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
 
 
-def run_all(args: argparse.Namespace, values: dict[str, str], report: Any) -> list[dict[str, Any]]:
-    """All episodes' rows, in order, on `--workers` processes. Bad settings are refused before any starts."""
+def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[int, dict[str, Any]]]:
+    """All episodes with their rows, as they are done by `--workers` processes. Bad settings are refused before any.
+
+    Raises what the first episode raises that cannot be done; the others are given up then.
+    """
     from tqdm import tqdm
 
     from stack.session import Settings
@@ -91,11 +113,8 @@ def run_all(args: argparse.Namespace, values: dict[str, str], report: Any) -> li
     workers = min(args.workers or os.cpu_count() or 1, len(jobs))
     if workers > 1:
         episode_check(jobs[0])
-    rows: list[dict[str, Any]] = [{}] * len(jobs)
     done = each(_numbered, enumerate(jobs), workers)
-    for i, row in tqdm(done, total=len(jobs), unit="episode", mininterval=2.0):
-        rows[i] = row
-    return rows
+    yield from tqdm(done, total=len(jobs), unit="episode", mininterval=2.0)
 
 
 def _numbered(job: tuple[int, Settings]) -> tuple[int, dict[str, Any]]:
@@ -129,8 +148,9 @@ def episode(job: Settings) -> dict[str, Any]:
 def judge(job: Settings) -> Judged:
     """One run, with everything that the truth shows of it.
 
-    One that the guard broke off is no success, however far it came. Raises KeyboardInterrupt where the run was told to
-    end, by a Ctrl-C that it took for itself: that is no episode, and there shall be none after it.
+    One that the guard broke off is no success, however far it came, and one that never began has no metrics but those
+    that count what was left undone. Raises KeyboardInterrupt where the run was told to end, by a Ctrl-C that it took
+    for itself: that is no episode, and there shall be none after it.
     """
     from hw.robot import load_robot
     from stack.session import prepare, run
@@ -142,13 +162,17 @@ def judge(job: Settings) -> Judged:
     if result.interrupted:
         raise KeyboardInterrupt
     trace = witness.trace()
+    began, undone = len(trace.yaw) > 0, getattr(task, "counts_undone", ())
+    metrics = task.metrics(trace) if began or undone else {}
+    fell = trace.fallen or result.outcome == "fell"
     row = {
         "seed": job.seed,
         "outcome": result.outcome,
-        "success": result.outcome in _ENDED and bool(task.success(trace)),
-        "fell": trace.fallen or result.outcome == "fell",
+        "success": result.outcome in ENDED and bool(task.success(trace)),
+        "fell": fell,
+        "broken_off": not fell and result.outcome not in ENDED,
         "seconds": result.seconds,
-        "metrics": task.metrics(trace) if len(trace.yaw) else {},
+        "metrics": {name: value for name, value in metrics.items() if began or name in undone},
         "odometry_error_m": witness.odometry_error(result.trace),
     }
     return Judged(row, task, trace, witness)
@@ -183,6 +207,7 @@ def summarise(args: argparse.Namespace, rows: list[dict[str, Any]], wall_seconds
         "success_rate": successes / n,
         "success_ci95": wilson(successes, n),
         "fall_rate": sum(row["fell"] for row in rows) / n,
+        "broken_off_rate": sum(row["broken_off"] for row in rows) / n,
         "mean_seconds": float(np.mean([row["seconds"] for row in rows])),
         "metrics": metrics,
         "wall_seconds": wall_seconds,

@@ -17,7 +17,7 @@ from typing import Any
 from hw.config import ConfigError
 from tools import exit_codes
 from tools.output import Report, add_json_argument, reporting
-from tools.parser import add_set_argument, settings
+from tools.parser import add_set_argument, check_seed, settings
 from tools.prompt import confirm
 
 EXIT_CODES = {
@@ -63,6 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
+        check_seed(args.seed)
         if args.video is not None:
             _prepare_video(args.video)
         from stack.interrupt import Interrupt
@@ -82,7 +83,7 @@ def main(args: argparse.Namespace) -> int:
             policy=args.policy,
             randomise=args.randomise,
             seconds=args.seconds,
-            seed=_seed(args.seed),
+            seed=args.seed,
             set=settings(args),
             start=args.start,
             record=args.record or _default_log(args.task),
@@ -117,12 +118,6 @@ def positive(text: str) -> float:
     return value
 
 
-def _seed(seed: int) -> int:
-    if seed < 0:
-        raise ConfigError(f"--seed {seed}: give a number from 0 on")
-    return seed
-
-
 def _default_log(task: str) -> Path:
     """A name that is free: runs/DATE-TASK.mcap, numbered when two runs start in one second."""
     stem = f"{datetime.now():%Y%m%d-%H%M%S}-{task}"
@@ -136,6 +131,12 @@ def _prepare_video(path: Path) -> None:
         raise ConfigError(f"--video {path}: give a name that ends in .mp4")
     if path.exists():
         raise ConfigError(f"--video {path}: exists already: give another name")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        path.unlink()
+    except OSError as error:
+        raise ConfigError(f"--video {path}: cannot be written ({error.strerror}): give another name") from None
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
 
@@ -145,20 +146,22 @@ def _film(report: Report, log: Path, path: Path) -> dict[str, Path]:
     from stack.flightlog import read_log
     from tools.video import VideoError, make_video
 
-    made = {}
-    flight = read_log(log)
+    made: dict[str, Path] = {}
+    failures = (VideoError, ConfigError, OSError, ValueError)  # a full disk, say, or no encoder
     try:
-        make_video(flight, path)
+        make_video(read_log(log), path)
         made["video"] = path
-    except VideoError as error:
+    except failures as error:
         report.line(f"no video: {error}")
     try:
         from tools.plot import plot_path
 
-        plot_path(flight, path.with_suffix(".png"))
+        plot_path(read_log(log), path.with_suffix(".png"))
         made["plot"] = path.with_suffix(".png")
     except ModuleNotFoundError as error:
         report.line(f"no plot: {exit_codes.explain(error)}")
+    except failures as error:
+        report.line(f"no plot: {error}")
     return made
 
 

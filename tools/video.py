@@ -48,8 +48,8 @@ def make_video(log: FlightLog, path: Path, width: int = 640, height: int = 480) 
         if robots is not None:
             frame = replace(frame, robots=robots[now])
         frames.append(frame)
-    path.parent.mkdir(parents=True, exist_ok=True)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with av.open(str(path), "w") as container:
             stream = container.add_stream("libx264", rate=FPS, options={"preset": "ultrafast", "crf": "23"})
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"

@@ -11,6 +11,7 @@ from hw.config import ConfigError
 from sim.rig.delivery import add_delivery_arguments
 from tools import exit_codes
 from tools.output import add_json_argument, reporting
+from tools.parser import check_seed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,11 +34,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     from sim.rig.server import build
 
-    if args.control is None and args.link is not None:
-        args.control = args.link.with_name(args.link.name + ".control")
-    if args.clock == "locked" and args.control is None:
-        raise ConfigError("--clock locked needs a control socket: give --link or --control")
     with reporting(args.json) as report:
+        check_seed(args.seed)
+        if args.control is None and args.link is not None:
+            args.control = args.link.with_name(args.link.name + ".control")
+        if args.clock == "locked" and args.control is None:
+            raise ConfigError("--clock locked needs a control socket: give --link or --control")
         try:
             server = build(args)
         except OSError as error:

@@ -1,4 +1,7 @@
-"""Watches a simulated run by the truth, in the frame that the robot's odometry started in."""
+"""Watches a simulated run by the truth, in the frame that the robot's odometry started in.
+
+With other robots it is the frame of the scene, in which their goals are.
+"""
 
 from __future__ import annotations
 
@@ -53,24 +56,35 @@ class Witness:
             none = np.zeros((0, 3))
             return Trace(self._dt, none, np.zeros(0), none, np.zeros(0), none, self._fallen)
         position, yaw, velocity, rate, command = (np.array(column) for column in zip(*self._rows, strict=True))
-        yaw = np.unwrap(yaw)
-        origin = position[0] * [1.0, 1.0, 0.0]
+        yaw, (origin, heading) = np.unwrap(yaw), self._frame()
+        goal = None if self._stage is None else self._stage.scene.goal
+        if goal is not None:  # where it lies, which is where the robot sees it
+            goal = np.tile(_turned(np.array([*goal, 0.0]) - origin, heading)[:2], (len(yaw), 1))
         return Trace(
             dt=self._dt,
-            displacement=_turned(position - origin, yaw[0]),
-            yaw=yaw - yaw[0],
+            displacement=_turned(position - origin, heading),
+            yaw=yaw - heading,
             velocity=velocity,
             yaw_rate=rate,
             command=command,
             fallen=self._fallen,
             joints=np.array(self._joints),
-            obstacles=_turned(np.array(self._obstacles) - origin, yaw[0]) if self._obstacles else None,
-            robots=_turned(np.array(self._robots) - [*origin[:2], yaw[0]], yaw[0]) if self._others() else None,
+            goal=goal,
+            obstacles=_turned(np.array(self._obstacles) - origin, heading) if self._obstacles else None,
+            robots=_turned(np.array(self._robots) - [*origin[:2], heading], heading) if self._others() else None,
             touched=self._touched if self._obstacles else None,
         )
 
     def _others(self) -> bool:
         return bool(self._robots) and len(self._robots[0]) > 0
+
+    def _frame(self) -> tuple[Array, float]:
+        """Origin `(3,)` m of the trace's frame in the world, and its heading [rad]."""
+        return (np.zeros(3), 0.0) if self._others() else self._start()
+
+    def _start(self) -> tuple[Array, float]:
+        """The place on the ground `(3,)` m where the task began, and the heading there [rad]."""
+        return self._rows[0][0] * [1.0, 1.0, 0.0], self._rows[0][1]
 
     def poses(self) -> Poses:
         """All poses before the robot had fallen."""
@@ -88,7 +102,8 @@ class Witness:
         """Distance [m] between where the robot ended and where it believed to be; NaN if the task never began."""
         if not self._rows:
             return float("nan")
-        end = self.trace().displacement[-1, :2]
+        origin, heading = self._start()
+        end = _turned(self._rows[-1][0] - origin, heading)[:2]
         return float(np.linalg.norm(end - estimate.displacement[-1, :2]))
 
 

@@ -15,6 +15,7 @@ class SurviveSettings(WalkSettings):
     told: Annotated[
         float, "s at the start in which a sentence says how to walk: left alone at rest, a robot may rest on"
     ] = 3.0
+    tolerance: Annotated[float | None, "m/s of mean error; none: not falling is enough"] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

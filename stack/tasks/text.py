@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
@@ -34,6 +34,7 @@ class Text(BaseTask):
     name = "text"
     description = "do what a sentence says; it changes every few seconds"
     settings_type = TextSettings
+    counts_undone: ClassVar[tuple[str, ...]] = ("followed_share",)  # metrics that hold of a run that never began too
 
     def __init__(self, settings: TextSettings, dt: float) -> None:
         """Raises ConfigError for a sentence that names no motion."""
@@ -78,11 +79,12 @@ class Text(BaseTask):
         return {"followed_share": self._followed(trace)}
 
     def _followed(self, trace: Trace) -> float:
-        """Share of the sentences that the mean measured motion followed; NaN for a run cut too short to tell.
+        """Share of the sentences that the mean measured motion followed; NaN where the task is too short to tell.
 
-        A sentence that a fall left no gait cycle for was not followed.
+        A sentence that got no gait cycle was not followed, but where the run ended by its time.
         """
         every, cycle = round(self.settings.every / self.dt), round(self.settings.cycle / self.dt)
+        in_time = not trace.fallen and len(trace.yaw) >= round(self.seconds / self.dt)
         verdicts = []
         for number, motion in enumerate(self._motions):
             first = number * every + round(self.settings.settle / self.dt)
@@ -91,6 +93,6 @@ class Text(BaseTask):
                 rows = slice(first, first + cycles * cycle)
                 twist = np.array([*trace.velocity[rows, :2].mean(0), trace.yaw_rate[rows].mean()])
                 verdicts.append(followed(motion, twist))
-            elif trace.fallen:
+            elif not in_time:
                 verdicts.append(False)
         return float(np.mean(verdicts)) if verdicts else float("nan")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -41,6 +41,9 @@ class Velocity(BaseTask):
     name = "velocity"
     description = "walk with a velocity over the ground that changes in steps"
     settings_type = VelocitySettings
+    counts_undone: ClassVar[tuple[str, ...]] = (
+        "velocity_error_mps",
+    )  # metrics that hold of a run that never began too
 
     def reset(self, rng: np.random.Generator) -> None:
         """Draw all velocities of the episode; the first points ahead."""
@@ -75,12 +78,18 @@ class Velocity(BaseTask):
         return min(tick // max(round(self.settings.every / self.dt), 1), len(self._velocity) - 1)
 
     def _error(self, trace: Trace) -> float:
-        """Mean |measured - asked| planar velocity over the ground [m/s], over whole gait cycles of what counts."""
+        """Mean |measured - asked| planar velocity over the ground [m/s], over whole gait cycles of what counts.
+
+        Cycles that the run did not come to count as if the robot had stood: else the sooner it falls, the better.
+        """
         every, cycle = max(round(self.settings.every / self.dt), 1), max(round(self.settings.cycle / self.dt), 1)
-        bounds = [*range(0, len(trace.yaw), every), len(trace.yaw)]
+        ticks = round(self.seconds / self.dt)
         errors = []
-        for start, end in itertools.pairwise(bounds):
+        for start, end in itertools.pairwise([*range(0, ticks, every), ticks]):
             for first in range(start + round(self.settings.settle / self.dt), end - cycle + 1, cycle):
+                if first + cycle > len(trace.yaw):
+                    errors.append(np.linalg.norm(self._velocity[self._segment(start)]))
+                    continue
                 rows = slice(first, first + cycle)
                 cos, sin = np.cos(trace.yaw[rows]), np.sin(trace.yaw[rows])
                 forward, left = trace.velocity[rows, 0], trace.velocity[rows, 1]

@@ -24,10 +24,13 @@ class WalkSettings(Settings):
     push: Annotated[Range, "m/s of velocity change of each push, one value or low:high"] = (0.0, 0.0)
     push_every: Annotated[float, "s between pushes"] = 1.0
     cycle: Annotated[float, "s, length of a gait cycle, over which the measured velocity is averaged"] = 0.48
+    tolerance: Annotated[float | None, "m/s of mean error that count as followed; none: not falling is enough"] = 0.1
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_positive(self, "every", "push_every", "cycle")
+        if self.tolerance is not None:
+            require_positive(self, "tolerance")
         require_ranges(self, *_COMPONENTS, "push")
         if self.push[0] < 0.0:
             raise ValueError("push: must not be negative; its direction is random")
@@ -67,7 +70,10 @@ class Walk(BaseTask):
         return self._pushes[number - 1].copy()
 
     def success(self, trace: Trace) -> bool:
-        return not trace.fallen and len(trace.displacement) > 0
+        """Never fallen, and the velocity followed, as far as the run was long enough for a gait cycle that counts."""
+        error, tolerance = measures.velocity_error(trace, self.settings.cycle), self.settings.tolerance
+        followed = tolerance is None or not error > tolerance
+        return followed and not trace.fallen and len(trace.displacement) > 0
 
     def metrics(self, trace: Trace) -> dict[str, float]:
         return {

@@ -175,6 +175,18 @@ def test_velocity_is_followed_over_the_ground() -> None:
     assert task.metrics(turned)["velocity_error_mps"] > 0.03
 
 
+def test_velocities_that_a_fall_left_undone_count_as_not_walked() -> None:
+    """Else the sooner a robot falls, the fewer velocities it is measured by."""
+    task = load_task("velocity", {"speed": "0.2", "seconds": "17.4"}, DT)
+    run = drive(task, 17.4)
+    half = replace(run, velocity=run.velocity[:435], yaw=run.yaw[:435])  # the first of two
+    for fallen in (True, False):  # be it by a fall or by the guard
+        assert task.metrics(replace(half, fallen=fallen))["velocity_error_mps"] == pytest.approx(0.1, abs=0.003)
+    never = replace(run, velocity=run.velocity[:0], yaw=run.yaw[:0], displacement=run.displacement[:0])
+    assert task.metrics(never)["velocity_error_mps"] == pytest.approx(0.2)
+    assert not task.success(never)
+
+
 # --- path
 
 
@@ -277,19 +289,25 @@ def test_text_is_judged_by_the_measured_motion() -> None:
     failed = replace(run, velocity=wrong[0], yaw_rate=wrong[1])
     assert task.metrics(failed)["followed_share"] == pytest.approx(5 / 6)
     assert not task.success(failed)
-    assert np.isnan(task.metrics(replace(run, yaw=run.yaw[:50]))["followed_share"])
 
 
-def test_text_counts_what_a_fall_left_undone_as_not_followed() -> None:
-    """Else a robot that does one sentence and then falls would have done everything that it was told."""
+def test_text_counts_what_was_left_undone_as_not_followed() -> None:
+    """Else a robot that does one sentence, and then falls or is stopped, would have done all that it was told."""
     task = load_task("text", {}, DT)
     run = drive(task, 30.0, seed=2)
-    first = replace(run, velocity=run.velocity[:300], yaw=run.yaw[:300], yaw_rate=run.yaw_rate[:300])
-    assert task.metrics(first)["followed_share"] == 1.0  # cut short by a person, say
-    fell = replace(first, fallen=True)
-    assert task.metrics(fell)["followed_share"] == pytest.approx(1 / 6)
-    assert not task.success(fell)
-    assert task.metrics(replace(run, yaw=run.yaw[:50], fallen=True))["followed_share"] == 0.0
+    first = replace(run, velocity=run.velocity[:260], yaw=run.yaw[:260], yaw_rate=run.yaw_rate[:260])
+    for cut in (first, replace(first, fallen=True)):
+        assert task.metrics(cut)["followed_share"] == pytest.approx(1 / 6)
+        assert not task.success(cut)
+    for ticks in (0, 50):
+        assert task.metrics(replace(run, yaw=run.yaw[:ticks]))["followed_share"] == 0.0
+
+
+def test_text_leaves_out_a_sentence_that_the_time_was_too_short_for() -> None:
+    task = load_task("text", {"seconds": "12"}, DT)
+    assert task.metrics(drive(task, 12.0, seed=2))["followed_share"] == 1.0  # of two; 2 s of a third tell nothing
+    task = load_task("text", {"seconds": "2"}, DT)
+    assert np.isnan(task.metrics(drive(task, 2.0, seed=2))["followed_share"])
 
 
 def test_text_takes_a_sentence_and_refuses_an_empty_or_foreign_one() -> None:

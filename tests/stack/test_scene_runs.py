@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,6 +53,46 @@ def test_a_goal_behind_a_pillar_is_reached_around_it(tmp_path: Path) -> None:
     assert log.messages["/instruction"][0]["source"] == "scene"
     assert log.header["scene"]["pillars"] == [[0.4, 0.0, 0.05]]
     assert replay.replay(log)[1] is None
+
+
+TURNED = np.array([np.cos(0.1), 0.0, 0.0, np.sin(0.1)])  # quaternion of a base at a yaw of 0.2
+
+
+@pytest.mark.parametrize("name", ["goal-far", "forest"])
+def test_the_goal_is_judged_where_it_is_seen_wherever_the_task_began(name: str) -> None:
+    """A robot that turned while it stood up sees the goal where the scene has it."""
+    task, body = prepare(Settings(name, seconds=10.0, seed=1))
+    truth: Any = body.truth  # type: ignore[attr-defined]
+    witness = Witness(truth, 0.02, body.stage)  # type: ignore[attr-defined]
+    record: Any = SimpleNamespace(proposal=SimpleNamespace(instruction=SimpleNamespace(velocity=np.zeros(3))))
+    goal = body.stage.scene.goal  # type: ignore[attr-defined]
+    truth.qpos[0, :2], truth.qpos[0, 3:7] = (0.03, -0.02), TURNED
+    witness(record)
+    truth.qpos[0, :2] = goal
+    witness(record)
+    trace = witness.trace()
+    assert task.success(trace)
+    np.testing.assert_allclose(trace.displacement[-1, :2], trace.goal[-1], atol=1e-12)
+    assert np.linalg.norm(trace.goal[-1] - goal) > 0.1 * np.linalg.norm(goal)
+    truth.qpos[0, :2] = trace.goal[-1]  # where it would lie if the robot had not turned
+    witness(record)
+    assert not task.success(witness.trace())
+
+
+def test_goals_of_several_robots_are_judged_where_they_are_seen() -> None:
+    task, body = prepare(Settings("cross", seconds=10.0, seed=1))
+    truth: Any = body.truth  # type: ignore[attr-defined]
+    witness = Witness(truth, 0.02, body.stage)  # type: ignore[attr-defined]
+    record: Any = SimpleNamespace(proposal=SimpleNamespace(instruction=SimpleNamespace(velocity=np.zeros(3))))
+    scene = body.stage.scene  # type: ignore[attr-defined]
+    truth.qpos[0, 3:7] = TURNED
+    witness(record)
+    truth.qpos[:, :2] = np.vstack([scene.goal, scene.robots[:, 3:]])
+    witness(record)
+    trace = witness.trace()
+    assert task.metrics(trace)["arrived"] == 3.0
+    estimate = replace(trace, displacement=np.array([[2.2 * np.cos(0.2), -2.2 * np.sin(0.2), 0.0]]))
+    assert witness.odometry_error(estimate) == pytest.approx(0.0, abs=1e-6)  # in the frame of its odometry
 
 
 def test_a_backend_without_the_scene_is_refused() -> None:

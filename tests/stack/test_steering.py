@@ -62,6 +62,12 @@ def test_keys_add_up_and_space_stops(terminal: tuple[Keyboard, Callable[[str], N
     assert keyboard.read().ends
 
 
+def test_who_steers_by_keys_is_told_which(
+    capsys: pytest.CaptureFixture[str], terminal: tuple[Keyboard, Callable[[str], None], int]
+) -> None:
+    assert "x ends" in capsys.readouterr().err
+
+
 def test_the_terminal_is_left_as_it_was(terminal: tuple[Keyboard, Callable[[str], None], int]) -> None:
     import termios
 

@@ -82,6 +82,8 @@ def test_unknown_task_and_setting_offer_the_nearest() -> None:
         load_task("gaol")
     with pytest.raises(ConfigError, match="unknown setting 'radus': did you mean 'radius'"):
         load_task("goal", {"radus": "1"})
+    with pytest.raises(ConfigError, match="unknown setting 'gian': did you mean 'gain'"):
+        load_task("walk", {"gian": "0.5"})  # of the run, which no task has
     with pytest.raises(ConfigError, match=r"--set push=hard: expected a number"):
         load_task("walk", {"push": "hard"})
     with pytest.raises(ConfigError, match=r"--set vx=0\.3:0\.1: vx: upside down"):
@@ -169,10 +171,23 @@ def test_top_speed_is_that_of_two_seconds() -> None:
 
 def test_walk_fails_by_falling() -> None:
     task = load_task("walk", {}, DT)
-    run = trace(np.full((1500, 2), [0.1, 0.0]))
+    run = trace(np.full((1500, 2), [0.1, 0.0]), np.full((1500, 3), [0.1, 0.0, 0.0]))
     assert task.success(run)
     assert not task.success(replace(run, fallen=True))
     assert task.metrics(run)["distance_m"] == pytest.approx(3.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("name", "asked", "slow"), [("walk", 0.3, 0.25), ("perturb", 0.2, 0.1)])
+def test_walking_is_not_standing_still(name: str, asked: float, slow: float) -> None:
+    task, command = load_task(name, {}, DT), np.full((1500, 3), [asked, 0.0, 0.0])
+    assert task.success(trace(np.full((1500, 2), [slow, 0.0]), command))
+    still = trace(np.zeros((1500, 2)), command)
+    assert not task.success(still)
+    assert task.success(replace(still, command=np.zeros((1500, 3))))  # nothing else was asked
+    assert load_task("survive", {}, DT).success(still)  # nothing is asked there
+    assert load_task(name, {"tolerance": "none"}, DT).success(still)
+    short = trace(np.zeros((50, 2)), command[:50])
+    assert task.success(short)  # no cycle of it counts
 
 
 # --- stand

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from tools.bench.controller import Controller
+from tools.bench.kill import _last, summarise
 from tools.cli import main
 
 TRIES = 3  # in real time a machine that is busy enough has the guard stop any run, Ctrl-C or not
@@ -59,6 +60,19 @@ def test_a_controller_that_is_killed_leaves_no_torque_and_a_log(capfd: pytest.Ca
     assert values["logs_read"] == 3
     assert 30.0 < values["median_ms"] <= values["worst_ms"] < 1000.0
     assert 60.0 < values["unguarded_worst_ms"] < 300.0
+
+
+def test_servos_that_never_went_off_are_counted_and_have_a_bound() -> None:
+    """The worst time would else be none at all, as if nothing was the matter."""
+    rows = [
+        {"guarded": True, "damped": True, "off": True, "ms": 60.0, "walking": True, "log": True},
+        {"guarded": True, "damped": False, "off": False, "ms": _last({0: 40.0}, 2), "walking": True, "log": True},
+        {"guarded": False, "stopped": False, "ms": _last({}, 2), "walking": True, "log": True},
+    ]
+    values = summarise(rows, 0)
+    assert (values["never_off"], values["worst_ms"]) == (1, 1000.0)
+    assert (values["unguarded_never_stopped"], values["unguarded_worst_ms"]) == (1, 1000.0)
+    assert _last({0: 40.0, 1: 60.02}, 2) == 60.0
 
 
 def test_ctrl_c_ends_with_torque_off_that_all_servos_acknowledged(capfd: pytest.CaptureFixture[str]) -> None:

@@ -142,6 +142,40 @@ def test_json_is_the_only_thing_on_stdout() -> None:
     assert {"line", "print", "library", "child"} <= set(result.stderr.split())
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "rollout walk --episodes 0",
+        "rollout walk --workers -1",
+        "rollout walk --seed -1",
+        "rollout walk --backend dynamixel",
+        "run walk --seed -1",
+        "evaluate papers --minutes -1",
+        "evaluate papers --seed -1",
+        "evaluate papers --rows nothing/*",
+        "virtual --clock locked",
+        "virtual --seed -1",
+        "bench bus --cycles 0",
+        "bench bus --baud 9600",
+        "bench faults --seeds 0",
+        "bench faults --fault nothing",
+        "bench fuzz --streams 0",
+        "bench fuzz --seed -1",
+        "bench interrupt --times 0",
+        "bench kill --kills -1",
+        "bench soak --share 2",
+        "bench soak --seed -1",
+    ],
+)
+def test_a_bad_argument_is_answered_in_json_too(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A script that reads the answer would else find nothing, and a seed below zero was an internal error."""
+    assert cli.main([*words.split(), "--json"]) == 2
+    (line,) = capsys.readouterr().out.splitlines()
+    answer = json.loads(line)
+    assert answer["exit_code"] == 2
+    assert "internal" not in answer["error"]
+
+
 def test_json_is_standard_json() -> None:
     import numpy as np
 

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from hw.config import ConfigError
-from hw.hal import Trace
+from hw.hal import BackendError, Trace
 from hw.robot import load_robot
 from sim.backend import SimBackend
 from stack.loop import TickRecord
 from stack.safety import Phase
 from stack.session import Settings, run
 from tools import rollout
+from tools.cli import main
 from tools.witness import Witness
 
 WORDS = ["walk", "--policy", "gait", "--seconds", "3", "--episodes", "2", "--seed", "3"]
@@ -68,18 +69,37 @@ def test_an_episode_can_be_run_again_by_its_seed() -> None:
     np.testing.assert_array_equal(plain.trace.displacement, again.trace.displacement)
 
 
-@pytest.mark.parametrize(
-    ("successes", "n", "low", "high"),
-    # R: binom.confint(x, n, methods = "wilson")
-    [(0, 10, 0.0, 0.2775), (10, 10, 0.7225, 1.0), (5, 10, 0.2366, 0.7634), (190, 200, 0.9104, 0.9726)],
-)
-def test_wilson_interval(successes: int, n: int, low: float, high: float) -> None:
-    assert rollout.wilson(successes, n) == pytest.approx([low, high], abs=5e-4)
-
-
 def trace(fallen: bool) -> Trace:
     rows = np.zeros((200, 3))
     return Trace(0.02, rows, np.zeros(200), rows, np.zeros(200), rows, fallen)
+
+
+def test_an_episode_that_cannot_be_done_does_not_take_the_others_with_it(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    done = []
+
+    def episode(job: Settings) -> dict:
+        if len(done) == 2:
+            raise BackendError("the rig did not answer")
+        done.append(job.seed)
+        return {
+            "seed": job.seed, "success": True, "fell": False, "broken_off": False, "seconds": 3.0, "metrics": {},
+            "odometry_error_m": 0.01,
+        }  # fmt: skip
+
+    monkeypatch.setattr(rollout, "episode", episode)
+    words = [*WORDS, "--json", "--workers", "1", "--episodes"]
+    assert main(["rollout", *words, "5"]) == 3
+    out, err = capfd.readouterr()
+    (line,) = out.splitlines()
+    result = json.loads(line)
+    assert (result["episodes"], result["success_rate"]) == (2, 1.0)
+    assert (result["error"], result["exit_code"]) == ("the rig did not answer", 3)
+    assert "the rig did not answer" in err
+    assert main(["rollout", *words, "5"]) == 3  # and where none was done, the error alone
+    (line,) = capfd.readouterr().out.splitlines()
+    assert json.loads(line) == {"error": "the rig did not answer", "exit_code": 3}
 
 
 @pytest.mark.parametrize(
@@ -100,7 +120,7 @@ def test_success_is_by_the_truth_and_only_of_whole_runs(
     monkeypatch.setattr(Witness, "trace", lambda self: trace(fallen))
     monkeypatch.setattr(Witness, "odometry_error", lambda self, estimate: 0.01)
     row = rollout.episode(Settings(task="walk", policy="gait"))
-    assert (row["success"], row["fell"]) == (success, fell)
+    assert (row["success"], row["fell"], row["broken_off"]) == (success, fell, outcome == "stopped")
 
 
 def test_a_run_that_is_told_to_end_is_no_episode_even_where_its_task_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,16 +140,23 @@ def test_a_run_that_is_told_to_end_is_no_episode_even_where_its_task_was_done(mo
 
 def test_a_run_that_never_began_is_counted_and_not_a_crash(monkeypatch: pytest.MonkeyPatch) -> None:
     """A randomised robot may fall while it stands up, before the task's first tick."""
-    for task in ("walk", "goal", "stand"):
+    for task in ("walk", "goal", "stand", "text"):
         result = SimpleNamespace(outcome="stopped", seconds=0.0, trace=trace(False), interrupted=False)
         monkeypatch.setattr("stack.session.run", lambda *a, result=result, **k: result)
         row = rollout.episode(Settings(task=task, policy="gait"))
-        assert not row["success"]
-        assert row["metrics"] == {}
-        good = {**row, "success": True, "metrics": {"distance_m": 2.0}, "odometry_error_m": 0.02, "seconds": 4.0}
+        assert (row["success"], row["fell"], row["broken_off"]) == (False, False, True)
+        assert row["metrics"] == ({"followed_share": 0.0} if task == "text" else {})
+        good = {
+            **row,
+            "success": True,
+            "broken_off": False,
+            "metrics": {"distance_m": 2.0},
+            "odometry_error_m": 0.02,
+            "seconds": 4.0,
+        }
         summary = rollout.summarise(options(), [row, good], 1.0)
-        assert summary["metrics"] == {"distance_m": 2.0, "odometry_error_m": 0.02}
-        assert summary["success_rate"] == 0.5
+        assert summary["metrics"] == {**row["metrics"], "distance_m": 2.0, "odometry_error_m": 0.02}
+        assert (summary["success_rate"], summary["broken_off_rate"]) == (0.5, 0.5)
         assert summary["failed_seeds"] == [row["seed"]]
 
 

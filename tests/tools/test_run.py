@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import resource
@@ -13,8 +14,10 @@ import time
 import numpy as np
 import pytest
 
+from hw.config import ConfigError
 from stack.flightlog import read_log
 from tools.cli import main
+from tools.video import VideoError
 
 RUN = ["run", "walk", "--policy", "gait", "--seconds", "2", "--set", "vx=0.1"]
 
@@ -115,7 +118,6 @@ def test_replay_is_identical_and_says_where_a_changed_log_differs(capsys):
 def test_what_only_a_program_can_repeat_is_refused(capsys):
     assert main([*RUN, "--record", "a.mcap"]) == 0
 
-    from hw.config import ConfigError
     from tools import replay
 
     for key, value, message in (
@@ -193,17 +195,45 @@ def test_a_disk_that_fills_up_ends_the_run_safe(tmp_path):
     assert len(log.ticks("/observation")) > 10
 
 
-def test_without_a_way_to_draw_the_run_still_succeeds(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    "error",
+    [
+        VideoError("cannot draw on this machine: try MUJOCO_GL=osmesa"),
+        ConfigError("a.mcap: cannot be read"),
+        OSError(errno.ENOSPC, "No space left on device"),
+        ValueError("no such encoder"),
+    ],
+)
+def test_without_a_way_to_draw_the_run_still_succeeds(error, tmp_path, monkeypatch, capsys):
     from tools import video
 
     def broken(*_):
-        raise video.VideoError("cannot draw on this machine: try MUJOCO_GL=osmesa")
+        raise error
 
     monkeypatch.setattr(video, "make_video", broken)
     assert main([*RUN, "--video", "a.mp4"]) == 0
     out = capsys.readouterr().out
-    assert "no video: cannot draw" in out
+    assert f"no video: {error}" in out
+    assert "goal met" in out
     assert (tmp_path / "a.png").exists()
+
+
+def test_a_picture_that_cannot_be_written_leaves_the_result_alone(tmp_path, monkeypatch, capsys):
+    from tools import video
+
+    monkeypatch.setattr(video, "make_video", lambda *_: None)
+    (tmp_path / "a.png").mkdir()
+    assert main([*RUN, "--video", "a.mp4", "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert values["outcome"] == "succeeded"
+    assert "plot" not in values
+
+
+def test_a_film_that_cannot_be_written_is_refused_before_anything_moves(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert main([*RUN, "--video", "file/a.mp4"]) == 2
+    assert "--video file/a.mp4: cannot be written" in capsys.readouterr().err
+    assert not list(tmp_path.glob("runs/*"))
 
 
 def test_gl_that_does_not_work_is_explained(tmp_path):

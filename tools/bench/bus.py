@@ -39,13 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    if args.cycles < 1:
-        raise ConfigError(f"--cycles {args.cycles}: give a number from 1 on")
-    bauds = tuple(args.baud or BAUDS)
-    for baud in bauds:
-        if baud not in BAUDS:
-            raise ConfigError(f"--baud {baud}: the official SDK goes at {', '.join(map(str, BAUDS))} here")
     with reporting(args.json) as report:
+        if args.cycles < 1:
+            raise ConfigError(f"--cycles {args.cycles}: give a number from 1 on")
+        bauds = tuple(args.baud or BAUDS)
+        for baud in bauds:
+            if baud not in BAUDS:
+                raise ConfigError(f"--baud {baud}: the official SDK goes at {', '.join(map(str, BAUDS))} here")
         rows = measure(report, bauds, args.cycles)
         report.table(COLUMNS, [[_cell(row[key]) for key in COLUMNS] for row in rows])
         report.result({"cycles": args.cycles, "servos": SERVOS, "rows": rows})

@@ -40,13 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     from sim.rig.faults import KINDS
 
-    if args.seeds < 1 or args.first < 0 or args.workers < 0:
-        raise ConfigError("--seeds takes 1 or more, --first and --workers 0 or more")
-    kinds = tuple(args.fault or (QUICK if args.quick else KINDS))
-    for kind in kinds:
-        if kind not in KINDS:
-            raise ConfigError(f"--fault {kind}: {nearest(kind, KINDS)}")
     with reporting(args.json) as report:
+        if args.seeds < 1 or args.first < 0 or args.workers < 0:
+            raise ConfigError("--seeds takes 1 or more, --first and --workers 0 or more")
+        kinds = tuple(args.fault or (QUICK if args.quick else KINDS))
+        for kind in kinds:
+            if kind not in KINDS:
+                raise ConfigError(f"--fault {kind}: {nearest(kind, KINDS)}")
         begun = time.monotonic()
         verdicts = campaign(report, kinds, range(args.first, args.first + args.seeds), args)
         result = summarise(verdicts)

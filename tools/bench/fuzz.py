@@ -21,6 +21,7 @@ from typing import Any
 from hw.config import ConfigError
 from tools import exit_codes
 from tools.output import Report, add_json_argument, reporting
+from tools.parser import check_seed
 
 BLOCK = 2000  # streams after which targets begin anew
 SHOWN = 20  # failures that are printed
@@ -41,9 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    if args.streams < 1 or args.first < 0 or args.seed < 0:
-        raise ConfigError("--streams takes 1 or more, --first and --seed 0 or more")
     with reporting(args.json) as report:
+        if args.streams < 1 or args.first < 0:
+            raise ConfigError("--streams takes 1 or more, --first 0 or more")
+        check_seed(args.seed)
         result = fuzz(report, args)
         figures = {key: value for key, value in result.items() if key != "failures"}
         report.table(["figure", "value"], [[key.replace("_", " "), value] for key, value in figures.items()])

@@ -35,9 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    if args.times < 1 or args.workers < 1:
-        raise ConfigError(f"--times {args.times} --workers {args.workers}: give numbers from 1 on")
     with reporting(args.json) as report:
+        if args.times < 1 or args.workers < 1:
+            raise ConfigError(f"--times {args.times} --workers {args.workers}: give numbers from 1 on")
         result = summarise(measure(report, args.times, args.workers, args.seed))
         report.table(["figure", "value"], [[key, value] for key, value in result.items()])
         report.result(result)

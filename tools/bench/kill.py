@@ -31,11 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    if args.kills < 0 or args.unguarded < 0 or args.kills + args.unguarded < 1:
-        raise ConfigError(
-            f"--kills {args.kills} --unguarded {args.unguarded}: give numbers from 0 on, one of them not 0"
-        )
     with reporting(args.json) as report:
+        if args.kills < 0 or args.unguarded < 0 or args.kills + args.unguarded < 1:
+            raise ConfigError(
+                f"--kills {args.kills} --unguarded {args.unguarded}: give numbers from 0 on, one of them not 0"
+            )
         result = measure(report, args.kills, args.unguarded, random.Random(args.seed))
         report.table(["figure", "value"], [[key, value] for key, value in result.items()])
         report.result(result)
@@ -59,15 +59,22 @@ def measure(report: Report, kills: int, unguarded: int, dice: random.Random) -> 
                 void += 1
             else:
                 raise BackendError(f"{TRIES} walks in a row ended before they were killed: {row['void']}")
+    return summarise(rows, void)
+
+
+def summarise(rows: list[dict[str, Any]], void: int) -> dict[str, Any]:
+    """What `--json` prints. A time of 1000 ms is a bound, of those that are counted as never off, or never stopped."""
     guarded, alone = [row for row in rows if row["guarded"]], [row for row in rows if not row["guarded"]]
     return {
         "runs": len(guarded),
         "all_damped": sum(row["damped"] for row in guarded),
         "all_off": sum(row["off"] for row in guarded),
+        "never_off": sum(not row["off"] for row in guarded),
         "median_ms": sorted(row["ms"] for row in guarded)[len(guarded) // 2] if guarded else None,
         "worst_ms": max((row["ms"] for row in guarded), default=None),
         "unguarded_runs": len(alone),
         "unguarded_all_stopped": sum(row["stopped"] for row in alone),
+        "unguarded_never_stopped": sum(not row["stopped"] for row in alone),
         "unguarded_worst_ms": max((row["ms"] for row in alone), default=None),
         "walking": sum(row["walking"] for row in rows),
         "logs_read": sum(row["log"] for row in rows),
@@ -76,8 +83,8 @@ def measure(report: Report, kills: int, unguarded: int, dice: random.Random) -> 
 
 
 def kill(rig: Any, log: Path, *, guarded: bool, dice: random.Random) -> dict[str, Any]:
-    """One kill at a random instant of a walk. `ms` is when the last servo was off, or stopped, after the kill. A row
-    with `void` says why there was nothing left to kill."""
+    """One kill at a random instant of a walk. `ms` is when the last servo was off, or stopped, after the kill; how long
+    was waited for it, where it never was. A row with `void` says why there was nothing left to kill."""
     from tools.bench.controller import STAND_SECONDS, Controller, has_torque
 
     rig.control.reset(0)
@@ -107,7 +114,7 @@ def _off(rig: Any, mark: int) -> dict[str, Any]:
     return {
         "off": len(off) == len(joints) and has_none(rig.control),
         "damped": all(i in damped and damped[i] < off.get(i, 0.0) for i in joints),
-        "ms": round(max(off.values()), 1) if len(off) == len(joints) else float("inf"),
+        "ms": _last(off, len(joints)),
     }
 
 
@@ -117,8 +124,13 @@ def _stopped(rig: Any, mark: int) -> dict[str, Any]:
 
     time.sleep(_LATEST)
     stopped = first_taken(rig.control.accepted(), "bus_watchdog", 255, mark)
-    every = len(stopped) == len(rig.robot.joints)
-    return {"stopped": every, "ms": round(max(stopped.values()), 1) if every else float("inf")}
+    joints = len(rig.robot.joints)
+    return {"stopped": len(stopped) == joints, "ms": _last(stopped, joints)}
+
+
+def _last(times: dict[int, float], joints: int) -> float:
+    """When the last of the joints had its time [ms]; a lower bound where one has none."""
+    return round(max(times.values()), 1) if len(times) == joints else 1000.0 * _LATEST
 
 
 def _last_phase(log: Path) -> tuple[str | None, bool]:

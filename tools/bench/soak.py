@@ -14,6 +14,7 @@ from typing import Any
 from hw.config import ConfigError
 from tools import exit_codes
 from tools.output import Report, add_json_argument, reporting
+from tools.parser import check_seed
 from tools.run import positive
 
 TELL_SECONDS = 60.0
@@ -33,11 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    if not 0.0 <= args.share <= 1.0:
-        raise ConfigError(f"--share {args.share}: give a share from 0 to 1")
-    if args.seed < 0:
-        raise ConfigError(f"--seed {args.seed}: give a number from 0 on")
     with reporting(args.json) as report:
+        if not 0.0 <= args.share <= 1.0:
+            raise ConfigError(f"--share {args.share}: give a share from 0 to 1")
+        check_seed(args.seed)
         result = soak(report, args)
         report.table(["figure", "value"], [[key.replace("_", " "), _cell(value)] for key, value in result.items()])
         report.result(result)

@@ -17,7 +17,7 @@ from hw.hal import Array, Backend, BackendError, Sensors
 from hw.robot import Robot
 from tools import exit_codes
 from tools.bringup.line import add_line_arguments, assembled, is_virtual
-from tools.output import Report, reporting
+from tools.output import Report, Screen, reporting
 from tools.prompt import confirm
 
 if TYPE_CHECKING:
@@ -161,8 +161,8 @@ class _Shown:
     """Shows the joint while it moves, and remembers how far it went."""
 
     def __init__(self, guard: Guard, i: int, name: str, start: Array, stream: TextIO) -> None:
-        self._guard, self._i, self._name, self._start, self._stream = guard, i, name, start, stream
-        self._tty = stream.isatty()
+        self._guard, self._i, self._name, self._start = guard, i, name, start
+        self._screen = Screen(stream)
         self._count = 0
         self.low, self.high = float("inf"), float("-inf")
         self.drift: Array | None = None  # (n_joints,) rad, the farthest that each joint was from `start`
@@ -178,13 +178,11 @@ class _Shown:
         away = np.abs(np.nan_to_num(record.observation.position - self._start))
         self.drift = away if self.drift is None else np.maximum(self.drift, away)
         self._count += 1
-        if self._tty and self._count % _SHOW_EVERY == 0:
+        if self._screen.tty and self._count % _SHOW_EVERY == 0:
             effort, goal = float(record.observation.effort[self._i]), float(self._guard.applied[self._i])
             text = f"{self._name} {angle:+.3f} rad  goal {goal:+.3f}  effort {effort:+.2f} N m  {record.phase}"
-            self._stream.write("\r" + text.ljust(78))
-            self._stream.flush()
+            self._screen.write("\r" + text.ljust(78))
 
     def close(self) -> None:
-        if self._tty:
-            self._stream.write("\n")
-            self._stream.flush()
+        if self._screen.tty:
+            self._screen.write("\n")

@@ -1,4 +1,4 @@
-"""One hash of all the code and settings that an episode's record may depend on."""
+"""Hashes of the code and the settings that an episode's record may depend on."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("hw", "sim", "policy", "stack")  # checkpoints among them are hashed where they are used
@@ -27,8 +28,24 @@ def digest(root: Path) -> str:
     return total.hexdigest()
 
 
+def read_anew(robot: str) -> tuple[Any, ...]:
+    """What each episode reads from files again, to be compared: hashes of configs/, and the robot. Nothing is cached.
+
+    Raises ConfigError where the robot's file is no good.
+    """
+    from hw.config import CONFIGS
+    from hw.robot import load_robot
+    from stack.provenance import fingerprint, sha256
+
+    return [(str(path), sha256(path)) for path in _settings(CONFIGS)], fingerprint(load_robot(robot))
+
+
+def _settings(folder: Path) -> Iterator[Path]:
+    yield from (path for path in sorted(folder.rglob("*")) if path.is_file())
+
+
 def _files(root: Path) -> Iterator[Path]:
     for package in PACKAGES:
         yield from (root / package).rglob("*.py")
-    yield from (path for path in (root / "configs").rglob("*") if path.is_file())
+    yield from _settings(root / "configs")
     yield from (root / name for name in JUDGES)

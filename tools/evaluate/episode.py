@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import traceback
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hw.config import ConfigError
 from hw.hal import Array, Trace
+from tools.exit_codes import explain
 
 if TYPE_CHECKING:
     from stack.session import Settings
@@ -28,7 +30,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Done:
-    """An episode's record, or why the run refuses its settings."""
+    """An episode's record, or why the run cannot be done."""
 
     job: Job
     record: dict[str, Any]
@@ -41,11 +43,13 @@ def episode_seed(seed: int, episode: int) -> int:
 
 
 def do(job: Job) -> Done:
-    """Do an episode. A run that cannot be done is an answer too: the other rows of the table go on."""
+    """Do an episode. A run that cannot be done, for whatever reason, is an answer too: the other rows go on."""
     try:
         return Done(job, record(job.settings))
-    except ConfigError as error:
-        return Done(job, {}, str(error))
+    except Exception as error:
+        if os.environ.get("SERVOID_DEBUG") == "1":
+            traceback.print_exc()
+        return Done(job, {}, explain(error))
 
 
 def record(settings: Settings) -> dict[str, Any]:
@@ -57,7 +61,7 @@ def record(settings: Settings) -> dict[str, Any]:
     judged = judge(settings)
     trace, task = judged.trace, judged.task
     limit = round(task.seconds / trace.dt)
-    goal = getattr(task, "goal", None)
+    goal = getattr(task, "goal", None) if trace.goal is None else trace.goal[-1]
     return {
         **judged.row,
         "ticks": min(judged.witness.upright, limit),

@@ -19,6 +19,7 @@ from tools.evaluate.summary import Measured, table
 from tools.evaluate.table import LEFT_OUT, ROWS
 from tools.evaluate.write import HEAD, as_csv, cells, markdown
 from tools.output import Report, add_json_argument, reporting
+from tools.parser import check_seed
 
 QUICK_EPISODES = 2
 QUICK_MINUTES = 9.0  # one more is for the start and for drawing
@@ -48,9 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Evaluate and write; returns 0 when done, whatever the figures. Raises ConfigError."""
-    _check(args)
-    rows = select(ROWS, args.rows, args.quick)
     with reporting(args.json) as report:
+        _check(args)
+        rows = select(ROWS, args.rows, args.quick)
         if args.list:
             report.table(("name", "paper", "row"), [(row.name, row.paper, row.title) for row in rows])
             report.result({"rows": [row.name for row in rows]})
@@ -113,6 +114,7 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError("--fresh forgets what --minutes 0 would tell: leave out one of them")
     if args.workers < 0:
         raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
+    check_seed(args.seed)
 
 
 def _print(report: Report, lines: Sequence[Mapping[str, Any]], encoder: Mapping[str, Any] | None) -> None:
@@ -137,9 +139,15 @@ def _write(
     encoder: Mapping[str, Any] | None,
     report: Report,
 ) -> None:
-    """Markdown, CSV and the paths. Raises ConfigError."""
+    """Markdown, CSV and the paths, where anything was measured: an empty page would replace one that is not.
+
+    Raises ConfigError.
+    """
     from stack.policies import policy_fingerprint
 
+    if not any(result.records for result in measured.values()):
+        report.line(f"nothing was measured: no page is written in {options.out}")
+        return
     commits = sorted({str(record["commit"]) for result in measured.values() for record in result.records})
     facts = [
         f"policy: {options.policy}, checkpoint {policy_fingerprint(options.policy)['checkpoint_sha256']}",

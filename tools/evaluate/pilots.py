@@ -21,11 +21,13 @@ if TYPE_CHECKING:
     from policy.diffusion.settings import DiffusionSettings
 
 EXPERT = "expert"
+_DATA = "runs/walks"  # the dataset that the README shows how to record
+_LAST = "last.safetensors"  # the newest network of a training run, beside its best
 _WHATEVER = ("evaluate_every", "seed")  # of training: what does not make another kind of network
 
 
 class Pilots:
-    """Makes the policies that runs name. Variants of the planner become files of settings in `folder`/policies."""
+    """Makes the policies that runs name. Settings of the planner become files in `folder`/policies, as they are now."""
 
     def __init__(self, policy: str, folder: Path) -> None:
         """`policy` is the evaluated one, named as in `servoid run`. Raises ConfigError for an unknown one."""
@@ -39,27 +41,28 @@ class Pilots:
         """Where the network of its own that a run needs is looked for."""
         return None if run.network is None else self._folder / "networks" / run.network.name / "best.safetensors"
 
-    def training(self, run: Run, data: str = "runs/walks") -> str | None:
-        """How the network that a run lacks is trained; None where nothing is lacking."""
+    def training(self, run: Run) -> str | None:
+        """How the network that a run lacks is trained; None where nothing is lacking. Raises ConfigError."""
         path = self.network(run)
         if run.network is None or path is None or path.is_file():
             return None
-        options, before = run.network.train, ""
-        if run.network.latents:
+        return self._command(run.network, path)
+
+    def _command(self, network: Network, path: Path) -> str:
+        """What trains a network and, before it, its latents; given again, it goes on with what was begun."""
+        options, before = network.train + _anew(path), ""
+        if network.latents:
             latents = self._folder / "networks" / "latents" / "latent.safetensors"
             options += f" --latent {latents}"
-            if not latents.is_file():
-                before = f"`servoid train latent --data {data} --out {latents.parent}`, then "
-        return f"{before}`servoid train diffusion --data {data} --out {path.parent} {options}`"
+            if _share(latents) != 1.0:
+                before = f"`servoid train latent --data {_DATA} --out {latents.parent}{_anew(latents)}`, then "
+        return f"{before}`servoid train diffusion --data {_DATA} --out {path.parent} {options}`"
 
     def name(self, run: Run) -> str:
         """The policy of a run, as `servoid run --policy` takes it. Raises ConfigError for settings that do not fit."""
-        if run.policy == EXPERT:
-            return EXPERT
-        if not run.plan and run.network is None:
-            return self._policy
         settings = self.settings(run)
-        assert settings is not None  # `settings` refuses variants of other policies
+        if settings is None:
+            return EXPERT if run.policy == EXPERT else self._policy
         values = asdict(settings)
         path = self._folder / "policies" / f"{run.task}-{key(values)}.yaml"
         try:
@@ -84,8 +87,19 @@ class Pilots:
         base, path = self._settings, self.network(run)
         if run.network is not None and path is not None:
             _check_training(path, run.network)
+            self._check_whole(path, run.network)
             base = replace(base, checkpoint=str(path.resolve()))
         return override(base, dict(run.plan), "planner setting")
+
+    def _check_whole(self, path: Path, network: Network) -> None:
+        """Raise ConfigError for a network whose training was not finished: the best so far is there from early on."""
+        share, last = _share(path), path.with_name(_LAST)
+        if share is None:
+            raise ConfigError(
+                f"{last} does not say that the training was finished: train anew: {self._command(network, path)}"
+            )
+        if share < 1.0:
+            raise ConfigError(f"{last}: {share:.1%} of its training are done: go on: {self._command(network, path)}")
 
     def fingerprint(self, run: Run) -> dict[str, Any]:
         """Everything about the policy of a run that its episodes depend on: checkpoints by their hash."""
@@ -104,6 +118,20 @@ class Pilots:
         return {**odometry, "settings": values | {"checkpoint": sha256(resolve(values["checkpoint"]))}}
 
 
+def _share(path: Path) -> float | None:
+    """How much of its budget a training has used, 0 to 1, by the newest network beside its best, `path`; None where
+    there is none, or an old one that does not say."""
+    from policy.checkpoint import read_header
+
+    last = path.with_name(_LAST)
+    return read_header(last)["results"].get("share") if last.is_file() else None
+
+
+def _anew(path: Path) -> str:
+    """What a command must say besides where it cannot go on with what is there."""
+    return " --no-resume" if path.is_file() and _share(path) is None else ""
+
+
 @cache
 def _check_training(path: Path, network: Network) -> None:
     """Raise ConfigError for a network that was trained with other options than its row says."""
@@ -115,8 +143,9 @@ def _check_training(path: Path, network: Network) -> None:
     asked = vars(parser.parse_args(["--data", "", "--out", "", *shlex.split(network.train)]))
     header = read_header(path)
     given = {**header.get("config", {}), **header.get("training", {})}
+    whatever = {*_WHATEVER, "minutes"} if asked["steps"] else _WHATEVER  # then they say when to evaluate, and no more
     for name, value in given.items():
-        if name in asked and name not in _WHATEVER and asked[name] != value:
+        if name in asked and name not in whatever and asked[name] != value:
             option = "--" + name.replace("_", "-")
             raise ConfigError(f"{path}: trained with {option} {value}, and this row is of {asked[name]}: train it anew")
 

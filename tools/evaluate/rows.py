@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from hw.config import ConfigError
+from tools.rollout import ENDED
 
 
 @dataclass(frozen=True)
@@ -50,12 +51,16 @@ class Metric:
     of: str
     unit: str = ""
     share: bool = False  # true or false, instead of a number
+    cut_short: bool = False  # of a share: true as well where the guard broke the run off, or it never began
     lower: bool = False  # whether less is better
+    # How an episode counts that fell or was stopped: until then, with what it left undone, or (like all that did not
+    # succeed) not at all.
+    unfinished: Literal["until then", "whole", "left out"] = "until then"
     resolution: float = 0.0  # of the unit: what is finer is rounding of the simulation, and nothing to compare
 
     def values(self, records: Sequence[Mapping[str, Any]]) -> list[float]:
         """The figure of each episode that has it."""
-        values = [_pick(record, self.of) for record in records]
+        values = [True if self.cut_short and cut_short(record) else _pick(record, self.of) for record in records]
         finite = [float(value) for value in values if value is not None and math.isfinite(value)]
         return [round(value / self.resolution) * self.resolution for value in finite] if self.resolution else finite
 
@@ -82,6 +87,11 @@ class Row:
     figure: float | Beside | None = None
     quick: bool = True  # whether --quick measures it
     note: str = ""
+
+
+def cut_short(record: Mapping[str, Any]) -> bool:
+    """Whether an episode ended by a fall, by the guard, or before it began, and not as its task ends."""
+    return bool(record.get("fell")) or record.get("outcome") not in ENDED
 
 
 def _pick(record: Mapping[str, Any], path: str) -> float | None:

@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 from hw.config import ConfigError
 from tools.crew import each
 from tools.evaluate.cache import EpisodeCache, key
+from tools.evaluate.code import read_anew
 from tools.evaluate.episode import Job, do, episode_seed
 from tools.evaluate.pilots import Pilots, spec
 from tools.evaluate.rows import Row, Run
 from tools.evaluate.summary import Measured
+from tools.exit_codes import explain
 
 if TYPE_CHECKING:
     from stack.session import Settings
@@ -43,7 +45,7 @@ class _Work:
 
     run: Run
     settings: Settings
-    pilot: Mapping[str, Any]  # fingerprint of the policy
+    pilot: tuple[Mapping[str, Any], str | None]  # fingerprint of the policy, and the hash of its file of settings
     episodes: int
     cache: EpisodeCache
     rows: list[str] = field(default_factory=list)
@@ -60,30 +62,29 @@ def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[st
     evaluation that is stopped has a bit of everything. A row that cannot be done says why; the others go on. Raises
     ConfigError for a robot or policy that there is not, or where nothing can be written.
     """
-    from hw.robot import load_robot
     from policy.checkpoint import git_commit
 
     begun = time.monotonic()
-    load_robot(options.robot)
+    read = read_anew(options.robot)
     pilots = Pilots(options.policy, options.out)
     works: dict[str, _Work] = {}
     measured: dict[str, Measured] = {}
-    prepared: dict[str, str | ConfigError] = {}  # key of the work of a run, or why there is none
+    prepared: dict[str, str | Exception] = {}  # key of the work of a run, or why there is none
     for row in rows:
-        training = pilots.training(row.run)
-        if training is not None:
-            measured[row.name] = Measured(training=training)
-            continue
         if repr(row.run) not in prepared:
             try:
+                training = pilots.training(row.run)
+                if training is not None:
+                    measured[row.name] = Measured(training=training)
+                    continue
                 work = _prepare(row.run, pilots, options)
                 prepared[repr(row.run)] = work.cache.path.name
                 works.setdefault(work.cache.path.name, work)
-            except ConfigError as error:
+            except Exception as error:  # clips are recorded there: whatever ends that does not end the other rows
                 prepared[repr(row.run)] = error
         found = prepared[repr(row.run)]
-        if isinstance(found, ConfigError):
-            measured[row.name] = Measured(refused=str(found))
+        if isinstance(found, Exception):
+            measured[row.name] = Measured(refused=explain(found))
         else:
             works[found].rows.append(row.name)
     runs, commit = list(works.values()), git_commit()
@@ -99,10 +100,10 @@ def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[st
         if done.refused is not None:
             work.refused = done.refused
         else:
-            if pilots.fingerprint(work.run) != work.pilot:
+            if _pilot(pilots, work.run, work.settings.policy) != work.pilot or read_anew(options.robot) != read:
                 raise ConfigError(
-                    f"the policy of {', '.join(work.rows)} changed while its episodes ran: what was done is kept;"
-                    " give the same command again when its files stay as they are"
+                    f"the policy of {', '.join(work.rows)}, the robot or a file in configs/ changed while episodes ran:"
+                    " what was done is kept; give the same command again when the files stay as they are"
                 )
             work.cache.add(done.job.episode, {**done.record, "commit": commit})
     for work in runs:
@@ -137,7 +138,15 @@ def _prepare(run: Run, pilots: Pilots, options: Options) -> _Work:
         set=chosen,
     )
     cache = EpisodeCache(options.out / "episodes", kept, options.fresh)
-    return _Work(run, settings, kept["policy"], options.episodes or run.episodes, cache)
+    pilot = _pilot(pilots, run, settings.policy)
+    return _Work(run, settings, pilot, options.episodes or run.episodes, cache)
+
+
+def _pilot(pilots: Pilots, run: Run, policy: str) -> tuple[Mapping[str, Any], str | None]:
+    """What the policy of a run is made of, to be compared."""
+    from stack.provenance import sha256
+
+    return pilots.fingerprint(run), sha256(Path(policy))
 
 
 def _jobs(runs: Sequence[_Work], seed: int) -> Iterator[Job]:

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from tools.evaluate.rows import Beside, Row
-from tools.intervals import bootstrap, wilson
+from tools.evaluate.rows import Beside, Row, cut_short
+from tools.intervals import LEAST, bootstrap, wilson
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def _line(row: Row, measured: Measured, values: Mapping[str, float | None]) -> d
         "episodes": len(sample),
         "reached": _reached(row, value, figure),
         "lower_is_better": row.metric.lower,
-        "note": _note(row, measured, len(sample)),
+        "note": _note(row, measured, sample, interval),
     }
 
 
@@ -73,8 +73,8 @@ def _reached(row: Row, value: float | None, figure: float | None) -> bool | None
     return value <= figure if row.metric.lower else value >= figure
 
 
-def _note(row: Row, measured: Measured, counted: int) -> str:
-    parts = [row.note]
+def _note(row: Row, measured: Measured, sample: Sequence[float], interval: Sequence[float] | None) -> str:
+    parts, counted = [row.note], len(sample)
     if measured.training is not None:
         parts.append(f"needs training: {measured.training}")
     if measured.refused is not None:
@@ -82,8 +82,18 @@ def _note(row: Row, measured: Measured, counted: int) -> str:
     if not measured.records and measured.training is None and measured.refused is None:
         parts.append("not measured: no time was left")
     elif counted < len(measured.records):
-        parts.append(f"{len(measured.records) - counted} more episodes ended before there was anything to measure")
+        why = (
+            "did not succeed"
+            if row.metric.unfinished == "left out"
+            else "had ended before there was anything to measure"
+        )
+        parts.append(f"{len(measured.records) - counted} {why}")
     stopped = sum(record.get("outcome") == "stopped" for record in measured.records)
-    if stopped:
+    if row.metric.unfinished == "until then" and not row.metric.share:
+        early = sum(cut_short(record) and bool(row.metric.values([record])) for record in measured.records)
+        parts.append(f"{early} fell or were stopped, and count until then" if early else "")
+    elif stopped:
         parts.append(f"{stopped} stopped by the guard, not for a fall")
+    if sample and interval is None:
+        parts.append("no interval: " + (f"fewer than {LEAST} episodes" if counted < LEAST else "all values are equal"))
     return "; ".join(part for part in parts if part)

@@ -13,8 +13,9 @@ from tools.evaluate.rows import Beside, Metric, Network, Row, Run
 UNIPHYS, CLOC, OURS = "UniPhys", "Diffuse-CLoC", "Servoid"
 
 SUCCESS = Metric("success", share=True)
-FALLS = Metric("fell", share=True, lower=True)
-LENGTH = Metric("ticks", "ticks")
+FALLS = Metric("fell", share=True, cut_short=True, lower=True)  # a robot that cannot go on has not stayed up
+LENGTH = Metric("ticks", "ticks", unfinished="whole")
+ERROR = Metric("metrics.velocity_error_mps", "m/s", lower=True, unfinished="whole")
 
 # How plans are sampled, by the papers' names: settings of the diffusion policy.
 # UniPhys stabilises with level 3 of 50, where noise has a deviation of 0.105 by the cosine schedule: level 1 of 20 has
@@ -38,16 +39,28 @@ def _survive(name: str, title: str, plan: Mapping[str, str], published: float, f
     return Row(f"uniphys/{name}", UNIPHYS, title, run, LENGTH, published, "of 3000 frames", figure)
 
 
+# As many as 45 minutes allow on one busy core. Networks are compared after equal steps, whatever the machine had to do.
+_STEPS = "--steps 15000"
+
+
 def _trained(row: Row, train: str, name: str | None = None, latents: bool = False) -> Row:
-    """The row with a network of its own, trained for 45 minutes, as the reference that it is compared with."""
-    network = Network(name or row.name.replace("/", "-"), f"--minutes 45 --width 128 {train}", latents)
+    """The row with a network of its own, trained for as many steps as the reference that it is compared with."""
+    network = Network(name or row.name.replace("/", "-"), f"{_STEPS} --width 128 {train}", latents)
     return replace(row, run=replace(row.run, network=network), quick=False)
 
 
-def _forest(name: str, title: str, published: float, train: str, network: str | None = None) -> Row:
-    """The forest by a network of its own; all of these execute the first action of each plan: all have that one."""
-    run = Run("forest", plan={"delay": "0", "replan": "1"})
-    return _trained(Row(f"cloc/{name}", CLOC, f"Forest, {title}: success", run, SUCCESS, published), train, network)
+def _network(name: str, title: str, published: float, train: str, network: str | None = None) -> tuple[Row, Row]:
+    """The forest, and a walk under pushes, by one network of its own.
+
+    All of these execute the first action of each plan: all networks have that one.
+    """
+    plan, network = {"delay": "0", "replan": "1"}, network or f"cloc-{name}"
+    forest = Row(f"cloc/{name}", CLOC, f"Forest, {title}: success", Run("forest", plan=plan), SUCCESS, published)
+    perturb = Row(
+        f"cloc/{name}-perturb", CLOC, f"Walk + perturb, {title}: fell or broken off", Run("perturb", plan=plan), FALLS,
+        note="not in the paper's table: the forest's way is scripted, so falls under pushes tell networks apart",
+    )  # fmt: skip
+    return _trained(forest, train, network), _trained(perturb, train, network)
 
 
 _FAR = Run("goal-far")
@@ -69,27 +82,29 @@ _MAIN: tuple[Row, ...] = (
     _survive("length", "Episode length, unconditional: autoregressive + stabilisation", AUTOREGRESSIVE, 2320.3, 2850),
     Row("uniphys/goal-near", UNIPHYS, "Goal, near: success", Run("goal-near"), SUCCESS, 1.0, figure=1.0),
     Row("uniphys/goal-far", UNIPHYS, "Goal, far: success", _FAR, SUCCESS, 0.95, figure=0.95),
-    Row(
-        "uniphys/velocity", UNIPHYS, "Velocity control: error", _VELOCITY,
-        Metric("metrics.velocity_error_mps", "m/s", lower=True), 0.07, figure=0.04,
-    ),
+    Row("uniphys/velocity", UNIPHYS, "Velocity control: error", _VELOCITY, ERROR, 0.07, figure=0.04),
     Row(
         "uniphys/obstacle", UNIPHYS, "Dynamic obstacle: success", Run("obstacle", episodes=50), SUCCESS, 0.94,
         figure=0.94,
     ),
-    Row("cloc/perturb", CLOC, "Walk + perturb: falls", Run("perturb"), FALLS, 0.16, figure=0.16),
+    Row("cloc/perturb", CLOC, "Walk + perturb: fell or broken off", Run("perturb"), FALLS, 0.16, figure=0.16),
     Row("cloc/forest", CLOC, "Forest: success", _FOREST, SUCCESS, 0.96, figure=0.96),
-    Row("cloc/inbetween", CLOC, "In-betweening: falls", _INBETWEEN, FALLS, 0.31, figure=0.31),
+    Row("cloc/inbetween", CLOC, "In-betweening: fell or broken off", _INBETWEEN, FALLS, 0.31, figure=0.31),
 )  # fmt: skip
 
 _BESIDE: tuple[Row, ...] = (
     Row(
-        "cloc/perturb-expert", CLOC, "Walk + perturb: falls, the expert", Run("perturb", policy="expert"), FALLS,
-        note="beside the policy",
+        "uniphys/length-distance", UNIPHYS, "Episode length, unconditional: distance walked", _MAIN[0].run,
+        Metric("metrics.distance_m", "m"), note="a robot that stands lasts long too",
+    ),
+    Row(
+        "cloc/perturb-expert", CLOC, "Walk + perturb: fell or broken off, the expert",
+        Run("perturb", policy="expert"), FALLS, note="beside the policy",
     ),
     Row(
         "cloc/forest-seconds", CLOC, "Forest: time", _FOREST,
-        Metric("metrics.seconds_to_goal", "s", lower=True), 13.23, "s of a human", 6.9, note="of those that succeeded",
+        Metric("metrics.seconds_to_goal", "s", lower=True, unfinished="left out"), 13.23, "s of a human", 6.9,
+        note="of those that succeeded",
     ),
     Row(
         "cloc/inbetween-mjpe", CLOC, "In-betweening: joints", _INBETWEEN,
@@ -119,7 +134,7 @@ _SAMPLING: tuple[Row, ...] = (
             _VELOCITY, set={**_UNSCRIPTED, "cost.speed": "1", "cost.steering": "0.05", "cost.heading": "0.1"},
             plan={**GUIDED, **_UNTOLD},
         ),
-        Metric("metrics.velocity_error_mps", "m/s", lower=True), 0.07, quick=False,
+        ERROR, 0.07, quick=False,
     ),
     Row(
         "uniphys/obstacle-alone", UNIPHYS, "Dynamic obstacle, by eq. 7 alone: success",
@@ -177,16 +192,17 @@ _SHORT = "--horizon 32 --actions 16 --near-actions 16 --committed 0"
 _CAUSAL = "--history 4 --horizon 28 --mask causal --forcing 1 --monotone 0 --emphasis 0"
 
 _TRAINED: tuple[Row, ...] = (
-    _forest("reference", "the reference of the rows below, horizon 32 and 16 actions", 0.96, _SHORT),
-    _forest("horizon-16", "horizon 16 and 16 actions", 0.0, _SHORT.replace("32", "16")),
-    _forest("horizon-64", "horizon 64 and 16 actions", 0.19, _SHORT.replace("32", "64")),
+    *_network("reference", "the reference of the rows below, horizon 32 and 16 actions", 0.96, _SHORT),
+    *_network("horizon-16", "horizon 16 and 16 actions", 0.0, _SHORT.replace("32", "16")),
+    *_network("horizon-64", "horizon 64 and 16 actions", 0.19, _SHORT.replace("32", "64")),
     *(
-        _forest(f"actions-{n}", f"horizon 32 and {n} actions", share, _SHORT.replace("16", str(n)))
+        row
         for n, share in ((1, 0.57), (4, 0.84), (8, 0.80))
+        for row in _network(f"actions-{n}", f"horizon 32 and {n} actions", share, _SHORT.replace("16", str(n)))
     ),
-    _forest("actions-16", "horizon 32 and 16 actions", 0.96, _SHORT, "cloc-reference"),
-    _forest("attention-full", "full attention", 0.58, f"{_SHORT} --mask full"),
-    _forest("attention-diffuser", "Diffuser's attention", 0.0, f"{_SHORT} --mask diffuser_local"),
+    *_network("actions-16", "horizon 32 and 16 actions", 0.96, _SHORT, "cloc-reference"),
+    *_network("attention-full", "full attention", 0.58, f"{_SHORT} --mask full"),
+    *_network("attention-diffuser", "Diffuser's attention", 0.0, f"{_SHORT} --mask diffuser_local"),
     _trained(
         _survive("raw-action", "Episode length, causal attention, raw action", AUTOREGRESSIVE, 238.2, None),
         _CAUSAL,
@@ -214,9 +230,9 @@ _TRAINED: tuple[Row, ...] = (
 _TEXTS: tuple[Row, ...] = (
     Row(
         "text/followed", OURS, "Text, held-out phrasings: instructions followed", _TEXT,
-        Metric("metrics.followed_share"), figure=0.95,
+        Metric("metrics.followed_share", unfinished="whole"), figure=0.95,
     ),
-    Row("text/falls", OURS, "Text, held-out phrasings: falls", _TEXT, FALLS, figure=0.05),
+    Row("text/falls", OURS, "Text, held-out phrasings: fell or broken off", _TEXT, FALLS, figure=0.05),
 )  # fmt: skip
 
 
@@ -264,7 +280,7 @@ _CALLS: tuple[Row, ...] = tuple(
     )
     for name, title, run, metric in (
         ("goal-far", "Goal, far: success", _FAR, SUCCESS),
-        ("perturb", "Walk + perturb: falls", Run("perturb"), FALLS),
+        ("perturb", "Walk + perturb: fell or broken off", Run("perturb"), FALLS),
     )
     for steps in (1, 2, 3, 5, 10)
 )  # fmt: skip

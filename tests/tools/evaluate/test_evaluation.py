@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from hw.config import ConfigError
+from hw.config import CONFIGS, ConfigError
+from hw.hal import BackendError
 from policy.checkpoint import resolve
+from stack.session import Settings
 from tools import rollout
 from tools.cli import main
 from tools.evaluate import clips, session
@@ -19,7 +20,7 @@ from tools.evaluate.cache import EpisodeCache, key
 from tools.evaluate.code import digest
 from tools.evaluate.episode import Done, Job
 from tools.evaluate.pilots import Pilots, spec
-from tools.evaluate.rows import Metric, Network, Row, Run
+from tools.evaluate.rows import Metric, Row, Run
 from tools.evaluate.session import Options, evaluate
 
 NEAR = Row("t/near", "T", "Near", Run("goal-near", episodes=4), Metric("success", share=True))
@@ -104,32 +105,6 @@ def test_quick_cuts_the_longest_episodes_and_does_not_mistake_them_for_whole_one
     assert [job.settings.seconds for job in done] == [61.0, None, 5.0]
 
 
-def test_a_changed_checkpoint_setting_or_task_changes_what_episodes_depend_on(tmp_path: Path) -> None:
-    checkpoint = tmp_path / "mine.safetensors"
-    shutil.copy(resolve("diffusion"), checkpoint)
-
-    def made_of(run: Run) -> str:
-        return key(spec(run, Pilots(str(checkpoint), tmp_path), "op3", 0, None, None))
-
-    run = Run("goal-near")
-    before = made_of(run)
-    assert made_of(Run("goal-near", episodes=7)) == before  # more of the same
-    others = [
-        made_of(Run("goal-near", set={"radius": "0.09"})),
-        made_of(Run("goal-near", plan={"replan": "8"})),
-        made_of(Run("goal-near", randomise=True)),
-        made_of(Run("goal-near", backend="virtual")),
-        made_of(Run("goal-near", policy="expert")),
-        made_of(Run("goal-far")),
-    ]
-    elsewhere = tmp_path / "elsewhere" / "other.safetensors"
-    elsewhere.parent.mkdir()
-    shutil.copy(checkpoint, elsewhere)
-    assert key(spec(run, Pilots(str(elsewhere), tmp_path), "op3", 0, None, None)) == before  # the same bytes
-    checkpoint.write_bytes(checkpoint.read_bytes()[:-4] + b"\0\0\0\1")
-    assert len({before, *others, made_of(run)}) == 8
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -179,18 +154,48 @@ def test_episodes_are_not_those_that_settings_are_tried_on(tmp_path: Path, done:
     assert not set(seeds["goal-near"]) & {rollout.episode_seed(0, episode) for episode in range(100)}
 
 
-def test_a_policy_that_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint = tmp_path / "mine.safetensors"
+def test_what_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each episode reads checkpoint, settings and robot anew; it would be kept under what they were before."""
+    checkpoint, robot = tmp_path / "mine.safetensors", tmp_path / "robots" / "mine.yaml"
     shutil.copy(resolve("diffusion"), checkpoint)
+    shutil.copytree(CONFIGS, tmp_path / "configs")
+    shutil.copytree(CONFIGS / "robots", tmp_path / "robots")
+    shutil.copy(CONFIGS / "robots" / "op3.yaml", robot)
+    changes = [
+        lambda job: checkpoint.write_bytes(checkpoint.read_bytes()[:-4] + b"\0\0\0\1"),
+        lambda job: robot.write_text(robot.read_text().replace("name: op3", "name: mine")),
+        lambda job: (tmp_path / "configs" / "tasks" / "goal-near.yaml").open("a").write("# another\n"),
+        lambda job: Path(job.settings.policy).write_text("steps: 3\n"),
+    ]
+    monkeypatch.setattr("hw.config.CONFIGS", tmp_path / "configs")
+    for number, change in enumerate(changes):
+
+        def do(job: Job, change: Any = change) -> Done:
+            change(job)
+            return Done(job, {"success": True})
+
+        monkeypatch.setattr(session, "do", do)
+        out = tmp_path / str(number)
+        with pytest.raises(ConfigError, match="changed while"):
+            evaluate([NEAR], Options(out, policy=str(checkpoint), robot=str(robot), workers=1), quiet)
+        assert not any('"episode"' in path.read_text() for path in (out / "episodes").glob("*.jsonl"))
+
+
+def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from policy.diffusion.settings import load_settings
+
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("checkpoint: diffusion\nreplan: 6\n")
+    ran = []
 
     def do(job: Job) -> Done:
-        checkpoint.write_bytes(checkpoint.read_bytes()[:-4] + b"\0\0\0\1")
+        ran.append(load_settings(job.settings.policy).replan)
+        mine.write_text("checkpoint: diffusion\nreplan: 8\n")
         return Done(job, {"success": True})
 
     monkeypatch.setattr(session, "do", do)
-    with pytest.raises(ConfigError, match="changed while"):
-        evaluate([NEAR], Options(tmp_path, policy=str(checkpoint), workers=1), quiet)
-    assert not any('"episode"' in path.read_text() for path in (tmp_path / "episodes").glob("*.jsonl"))
+    evaluate([NEAR], Options(tmp_path, policy=str(mine), workers=1), quiet)
+    assert ran == [6, 6, 6, 6]
 
 
 def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done: list[Job]) -> None:
@@ -203,33 +208,19 @@ def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done
     assert len(measured["t/far"].records) == 2
 
 
-def test_a_network_of_latents_wants_the_latents_first(tmp_path: Path) -> None:
-    run, pilots = Run("survive", network=Network("z", "--mask causal", latents=True)), Pilots("diffusion", tmp_path)
-    latents, command = tmp_path / "networks" / "latents" / "latent.safetensors", pilots.training(run)
-    last = f"`servoid train diffusion --data runs/walks --out {tmp_path}/networks/z --mask causal --latent {latents}`"
-    assert command == f"`servoid train latent --data runs/walks --out {latents.parent}`, then {last}"
-    latents.parent.mkdir(parents=True)
-    latents.touch()
-    assert pilots.training(run) == last
+@pytest.mark.parametrize("error", [BackendError("the rig did not answer"), ZeroDivisionError("no floor")])
+def test_an_error_of_one_run_does_not_stop_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def record(settings: Settings) -> dict[str, Any]:
+        if settings.task == "goal-far":
+            raise error
+        return {"success": True}
 
-
-def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path, done: list[Job]) -> None:
-    run = Run("goal-near", episodes=1, network=Network("full", "--width 128 --horizon 24"))
-    row = Row("t/full", "T", "Full", run, Metric("success", share=True))
-    chosen = Options(tmp_path, policy="diffusion", workers=1)
-    measured = evaluate([row], chosen, quiet)["t/full"]
-    command = f"servoid train diffusion --data runs/walks --out {tmp_path}/networks/full --width 128 --horizon 24"
-    assert measured.training == f"`{command}`"
-    assert not measured.records
-    path = tmp_path / "networks" / "full" / "best.safetensors"
-    path.parent.mkdir(parents=True)
-    shutil.copy(resolve("diffusion"), path)
-    assert len(evaluate([row], chosen, quiet)["t/full"].records) == 1
-    assert str(path.resolve()) in Path(done[0].settings.policy).read_text()
-    other = replace(row, run=replace(run, network=Network("full", "--width 128 --horizon 24 --near-actions 16")))
-    refused = evaluate([other], chosen, quiet)["t/full"].refused
-    assert refused is not None
-    assert "trained with --near-actions 8, and this row is of 16" in refused
+    monkeypatch.setattr("tools.evaluate.episode.record", record)
+    measured = evaluate([FAR, NEAR], options(tmp_path), quiet)
+    assert str(error) in (measured["t/far"].refused or "")
+    assert len(measured["t/near"].records) == 4
 
 
 def test_no_time_at_all_tells_what_was_done(tmp_path: Path, done: list[Job]) -> None:
@@ -247,23 +238,18 @@ def test_no_time_at_all_records_no_clips_and_forgets_nothing(tmp_path: Path, cap
     assert "--fresh" in capsys.readouterr().err
 
 
-def test_where_nothing_could_be_run_the_table_is_written_all_the_same(tmp_path: Path) -> None:
-    out = tmp_path / "new"
-    assert main(["evaluate", "papers", "--rows", "cloc/attention-full", "--out", str(out)]) == 0
-    assert "needs training" in (out / "papers.md").read_text()
-
-
-def test_variants_of_the_planner_are_files_that_the_policy_is_made_from(tmp_path: Path) -> None:
-    from policy.diffusion.settings import load_settings
-
-    pilots = Pilots("diffusion", tmp_path)
-    assert pilots.name(Run("goal")) == "diffusion"
-    assert pilots.name(Run("goal", policy="expert")) == "expert"
-    written = load_settings(pilots.name(Run("goal", plan={"replan": "8", "guidance.clip": "3"})))
-    assert (written.replan, written.guidance.clip) == (8, 3.0)
-    assert written.steps == load_settings().steps
-    with pytest.raises(ConfigError, match="replann"):
-        pilots.name(Run("goal", plan={"replann": "8"}))
+def test_where_nothing_was_measured_the_page_that_is_there_stays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["evaluate", "papers", "--policy", "gait", "--out", str(tmp_path), "--rows"]
+    assert main([*words, "cloc/attention-full"]) == 0
+    out = capsys.readouterr().out
+    assert "needs training" in out
+    assert "nothing was measured" in out
+    assert not (tmp_path / "papers.md").exists()
+    (tmp_path / "papers.md").write_text("of an evaluation before")
+    assert main([*words, "uniphys/goal-near", "--minutes", "0"]) == 0
+    assert (tmp_path / "papers.md").read_text() == "of an evaluation before"
 
 
 def test_an_episode_that_ctrl_c_ended_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

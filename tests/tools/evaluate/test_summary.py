@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from dataclasses import replace
 
 import pytest
 
@@ -12,7 +13,6 @@ from tools.evaluate.rows import Beside, Metric, Row, Run, select
 from tools.evaluate.summary import Measured, table
 from tools.evaluate.table import ROWS
 from tools.evaluate.write import as_csv, cells, markdown, number
-from tools.intervals import bootstrap
 from tools.parser import Parser
 
 SHARE = Row("a/share", "A", "Share", Run("goal"), Metric("success", share=True), 0.95, figure=0.9)
@@ -46,6 +46,16 @@ def test_less_is_better_where_it_is() -> None:
     assert one(FALLS, Measured(records(100, 83)))["reached"] is False
 
 
+def test_a_robot_that_cannot_go_on_has_not_stayed_up() -> None:
+    """Else a guard that stops every run, or a robot that never comes up, would be one that never falls."""
+    some = [{**record, "fell": False, "outcome": "stopped"} for record in records(10, 0)]
+    for row in ROWS:
+        if row.metric.of == "fell":
+            line = one(row, Measured(some))
+            assert (line["value"], line["reached"] is True) == (1.0, False), row.name
+            assert "broken off" in row.title
+
+
 def test_episodes_without_the_figure_do_not_count_and_are_told() -> None:
     some = records(5, 5)
     some[0]["metrics"] = {}
@@ -53,7 +63,34 @@ def test_episodes_without_the_figure_do_not_count_and_are_told() -> None:
     some[2]["metrics"]["error_m"] = None  # as it comes back from a file
     line = one(ERROR, Measured(some))
     assert (line["episodes"], line["value"]) == (2, pytest.approx(0.04))
-    assert "3 more episodes" in line["note"]
+    assert "3 had ended before there was anything to measure" in line["note"]
+
+
+def test_a_figure_of_what_came_before_a_fall_says_so() -> None:
+    some = records(5, 3)
+    some[0]["outcome"] = "stopped"
+    some[4]["metrics"] = {}  # it fell before there was anything to measure
+    assert "2 fell or were stopped, and count until then" in one(ERROR, Measured(some))["note"]
+    assert "until then" not in one(ERROR, Measured(records(5, 5)))["note"]
+    whole = replace(ERROR, metric=replace(ERROR.metric, unfinished="whole"))
+    for row in (SHARE, FALLS, whole):
+        assert "until then" not in one(row, Measured(some))["note"], row.name
+    rows = {row.name: row.metric for row in ROWS}
+    whole = {name for name, metric in rows.items() if metric.unfinished == "whole"}
+    assert {"uniphys/length", "uniphys/velocity", "text/followed"} <= whole
+    assert not any(name.startswith("motion/") for name in whole)
+
+
+def test_times_of_those_that_succeeded_say_how_many_did_not() -> None:
+    (row,) = (row for row in ROWS if row.metric.of.startswith("metrics.seconds_to"))
+    some = [
+        {**record, "metrics": {"seconds_to_goal": 9.0 if record["success"] else math.nan}} for record in records(5, 3)
+    ]
+    line = one(row, Measured(some))
+    assert (line["episodes"], line["note"]) == (
+        3,
+        "of those that succeeded; 2 did not succeed; no interval: fewer than 4 episodes",
+    )
 
 
 def test_a_figure_may_be_another_rows_value() -> None:
@@ -89,13 +126,15 @@ def test_an_episode_that_the_guard_broke_off_is_told() -> None:
     assert "1 stopped by the guard" in one(SHARE, Measured(some))["note"]
 
 
-def test_bootstrap_covers_the_mean_and_is_the_same_each_time() -> None:
-    values = [float(x) for x in range(100)]
-    low, high = bootstrap(values) or (0.0, 0.0)
-    assert low == pytest.approx(49.5 - 1.96 * 28.9 / 10, abs=0.5)  # the normal interval, which this many values follow
-    assert high == pytest.approx(49.5 + 1.96 * 28.9 / 10, abs=0.5)
-    assert bootstrap(values) == [low, high]
-    assert bootstrap([1.0]) is None
+def test_a_mean_without_an_interval_says_why() -> None:
+    lengths = Row("a/length", "A", "Length", Run("goal"), Metric("ticks"))
+    assert "no interval: fewer than 4 episodes" in one(lengths, Measured(records(3, 3)))["note"]
+    same = one(lengths, Measured([{**record, "ticks": 3000} for record in records(6, 6)]))
+    assert (same["value"], same["ci95"]) == (3000.0, None)
+    assert "no interval: all values are equal" in same["note"]
+    assert (
+        "no interval" not in one(lengths, Measured(records(4, 4)))["note"] + one(SHARE, Measured(records(1, 1)))["note"]
+    )
 
 
 def test_markdown_and_csv_hold_what_the_table_does() -> None:
@@ -168,7 +207,7 @@ def test_commands_that_train_networks_can_be_typed() -> None:
             words = shlex.split(f"--data runs/walks --out runs/x {row.run.network.train}")
             args = parser.parse_args(words)
             assert args.mask in MASKS, row.name
-            assert args.minutes == 45
+            assert (args.steps, args.width) == (15_000, 128)  # equal ones, whatever the load of the machine was
 
 
 def test_stabilisation_is_about_as_noisy_as_the_papers() -> None:
@@ -193,6 +232,16 @@ def test_rows_of_the_forest_that_are_compared_differ_in_their_network_alone() ->
         train = run.network.train if run.network is not None else None
         same = [other for other, run in trained.items() if run.network is not None and run.network.train == train]
         assert set(same) - {name} <= {"cloc/reference", "cloc/actions-16"}, same
+
+
+def test_each_network_of_the_forest_is_pushed_too() -> None:
+    rows = {row.name: row for row in ROWS}
+    forest = [row for row in ROWS if row.run.task == "forest" and row.run.network is not None]
+    for row in forest:
+        pushed = rows[f"{row.name}-perturb"]
+        assert pushed.run == replace(row.run, task="perturb")
+        assert (pushed.metric, pushed.published) == (rows["cloc/perturb"].metric, None)
+        assert pushed.note.startswith("not in the paper's table")
 
 
 def test_without_rolling_nothing_goes_over_from_plan_to_plan() -> None:
