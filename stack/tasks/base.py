@@ -31,6 +31,7 @@ class BaseTask:
     name: str
     description: str
     settings_type: ClassVar[type[Settings]] = Settings
+    counts_undone: ClassVar[tuple[str, ...]] = ()  # metrics that hold of a run that never began, too
 
     def __init__(self, settings: Any, dt: float) -> None:
         self.settings = settings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -34,7 +34,7 @@ class Text(BaseTask):
     name = "text"
     description = "do what a sentence says; it changes every few seconds"
     settings_type = TextSettings
-    counts_undone: ClassVar[tuple[str, ...]] = ("followed_share",)  # metrics that hold of a run that never began too
+    counts_undone = ("followed_share",)
 
     def __init__(self, settings: TextSettings, dt: float) -> None:
         """Raises ConfigError for a sentence that names no motion."""

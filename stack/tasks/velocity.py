@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -41,9 +41,7 @@ class Velocity(BaseTask):
     name = "velocity"
     description = "walk with a velocity over the ground that changes in steps"
     settings_type = VelocitySettings
-    counts_undone: ClassVar[tuple[str, ...]] = (
-        "velocity_error_mps",
-    )  # metrics that hold of a run that never began too
+    counts_undone = ("velocity_error_mps",)
 
     def reset(self, rng: np.random.Generator) -> None:
         """Draw all velocities of the episode; the first points ahead."""
