@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hw.config import ConfigError
 from hw.hal import Array, Instruction, Plan, PlanRequest, State
 from hw.robot import Robot
 from policy.checkpoint import read_header, resolve
@@ -181,6 +182,10 @@ def diffusion_policy(
     settings.check(config, head.get("training"))  # here, with a plain error, rather than in the planner's process
     space = load_action_space(path, robot)
     planner: Planner
+    if process and not settings.delay:
+        raise ConfigError(
+            "diffusion policy: delay 0 wants plans that take no time: in real time set delay to 1 or more"
+        )
     if process:
         planner = ProcessPlanner(partial(_build, robot, settings, cost))
     else:

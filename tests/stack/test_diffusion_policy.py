@@ -306,6 +306,11 @@ def test_settings_that_the_training_does_not_fit_are_refused_before_anything_sta
         diffusion_policy(ROBOT, untrained(tmp_path, far_actions=0.0, near_actions=5), process=process)
 
 
+def test_plans_that_take_no_time_are_for_simulation_only(settings: DiffusionSettings) -> None:
+    with pytest.raises(ConfigError, match="in real time set delay to 1 or more"):
+        diffusion_policy(ROBOT, replace(settings, delay=0), process=True)
+
+
 def test_rolling_gives_the_same_actions_in_line_and_beside_the_loop(settings: DiffusionSettings) -> None:
     rolling = replace(settings, schedule="rolling", steps=2, replan=1, delay=1)
     inline, process = diffusion_policy(ROBOT, rolling), diffusion_policy(ROBOT, rolling, process=True)

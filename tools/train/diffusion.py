@@ -134,7 +134,9 @@ def main(args: argparse.Namespace) -> int:
     windows = Windows(recording, robot, config, emphasis=args.emphasis, seed=args.seed, latents=latents)
     source = f"{args.data.resolve().name}: {len(recording.spans)} episodes, {len(recording.raw)} ticks"
     trainer = Trainer(windows, robot, config, settings, args.out, source, args.licence, survival)
-    if not (args.resume and trainer.resume()) and args.init is not None:
+    if args.resume and trainer.resume():
+        trainer.require_begun_with(args.init)
+    elif args.init is not None:
         trainer.begin_from(args.init)
     trainer.run()
     return 0
@@ -209,6 +211,15 @@ class Trainer(TimedTrainer):
         self.windows.states, self.windows.actions = model.states, model.actions
         known = {name: model.header[name] for name in ("git_commit", "data", "licence", "results")}
         self.begun_with = {"checkpoint": path.name, "sha256": sha256(path), **known}
+
+    def require_begun_with(self, path: Path | None) -> None:
+        """Raise ConfigError where a resumed run began otherwise than with the checkpoint `path`, as far as is known."""
+        from stack.provenance import sha256
+
+        if path is not None and self.begun_with and self.begun_with["sha256"] != sha256(path):
+            raise ConfigError(
+                f"{self.out}: holds a run that did not begin with {path}: give --no-resume, or another --out"
+            )
 
     def _title(self) -> str:
         size = f"{self.network.parameter_count:,} parameters, {self.config.tokens} tokens"
