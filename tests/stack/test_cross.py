@@ -138,7 +138,7 @@ def test_the_cost_keeps_a_distance_from_where_the_others_will_be() -> None:
         )
         for speed in (0.5, -0.5)
     )
-    assert float(task.cost(ahead, met)) > float(task.cost(ahead, free))
+    assert float(task.cost(ahead, met).detach()) > float(task.cost(ahead, free).detach())
 
 
 def test_who_has_arrived_stands_and_the_first_is_done_when_all_have() -> None:
