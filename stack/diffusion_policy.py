@@ -29,7 +29,6 @@ from policy.diffusion.actions import JOINT_TARGETS, ActionSpace, load_action_spa
 from policy.diffusion.config import check_fit
 from policy.diffusion.features import raw_row
 from policy.diffusion.settings import DiffusionSettings, load_settings
-from policy.text.captions import caption
 from stack.planner import Answer, InlinePlanner, Planner, ProcessPlanner
 from stack.trim import Trim
 
@@ -96,10 +95,7 @@ class DiffusionPolicy:
         self._applied.append(self._space.encode(before, applied))  # what ran at the tick before
         tick = self._tick
         if self._trim is not None:
-            # What is asked has its name before it is corrected: a little drift must not turn a walk into an arc.
-            asked = instruction.velocity
-            text = caption(asked) if instruction.text is None else instruction.text
-            instruction = replace(instruction, velocity=self._trim(state, asked), text=text)
+            instruction = replace(instruction, velocity=self._trim(state, instruction.velocity))
         self._adopt(tick)
         if tick % self._replan == 0 and len(self._states) == self._history:
             held = self._space.encode(row, self._target)

@@ -95,17 +95,15 @@ class Runtime:
         instruction: Instruction,
         seeds: Sequence[tuple[int, int]],
         previous: Previous | None = None,
-        named: Array | None = None,
     ) -> tuple[Array, Array]:
         """Plans of many robots at once, each with its own (seed, tick).
 
         `states` is `(batch, history, raw size)`, the present last; `actions` is `(batch, history - 1 + delay,
         action size)`: those applied, then those that will run anyway, as the model has actions (`Model.space`).
-        `previous` are the plans that run, None at first; only the rolling schedule reads them. `named` `(batch, 3)` are
-        velocities that motions have their names from where the instruction has no text; None: from its own. Returns
-        actions `(batch, actions, action size)` from the present tick on, joint targets [rad] or latents that are
-        decoded with the state of their own tick; and predicted raw rows `(batch, horizon, raw size)`, the first one
-        tick ahead, in the odometry frame.
+        `previous` are the plans that run, None at first; only the rolling schedule reads them. Returns actions
+        `(batch, actions, action size)` from the present tick on, joint targets [rad] or latents that are decoded with
+        the state of their own tick; and predicted raw rows `(batch, horizon, raw size)`, the first one tick ahead, in
+        the odometry frame.
         Batches of different size may differ in the last bits. Raises ValueError like `plan`.
         """
         self._check(states, actions)
@@ -117,7 +115,7 @@ class Runtime:
             keys = [(*pair, *((i,) if i else ())) for pair in seeds for i in range(n)]
             known = self._known(states, actions, instruction)
             matrix, start = self._start(keys, states[:, -1], previous)
-            text = self._text(instruction, len(states), named)
+            text = self._text(instruction, len(states))
             predict = classifier_free(
                 self.engine,
                 None if text is None else text.repeat_interleave(n, 0),
@@ -213,7 +211,7 @@ class Runtime:
         cheapest: Tensor = guidance.cost(states).view(-1, self.samples).argmin(1)
         return first + cheapest
 
-    def _text(self, instruction: Instruction, batch: int, named: Array | None) -> Tensor | None:
+    def _text(self, instruction: Instruction, batch: int) -> Tensor | None:
         """The encoded sentence `(batch, text size)`; where the task gives none, one that names the asked motion.
 
         An empty one tells nothing: motion is then unconditional. A phrasing that was not trained with would be a code
@@ -221,13 +219,13 @@ class Runtime:
         """
         if self._encoder is None or instruction.text == "":
             return None
-        named = instruction.velocity if named is None else named
+        velocity = instruction.velocity
         if instruction.text is not None:
             sentences = [instruction.text] * batch
-        elif named.ndim == 1:
-            sentences = [caption(named)] * batch
+        elif velocity.ndim == 1:
+            sentences = [caption(velocity)] * batch
         else:
-            sentences = [MOTIONS[i].phrasings[0] for i in motion_of(named)]
+            sentences = [MOTIONS[i].phrasings[0] for i in motion_of(velocity)]
         for sentence in set(sentences) - self._read.keys():
             phrasing = self._phrasebook.familiar(sentence) if self._phrasebook else sentence
             self._read[sentence] = torch.from_numpy(self._encoder.encode([phrasing])[0])

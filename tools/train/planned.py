@@ -59,8 +59,7 @@ class PlannedWalker:
             if self._predicted is not None:
                 previous = Previous(tick - self._made, self._predicted, self._plan)
             window = self._states, actions, Instruction(asked)
-            # As on a robot, what is asked has its name before it is corrected.
-            plan, predicted = self._runtime.plan_batch(*window, seeds, previous, named=command)
+            plan, predicted = self._runtime.plan_batch(*window, seeds, previous)
             self._requested = tick
             if settings.delay:
                 self._waiting = plan, predicted
