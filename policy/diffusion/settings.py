@@ -96,10 +96,10 @@ class DiffusionSettings:
     """Settings of the diffusion policy; ticks are those of the control loop."""
 
     checkpoint: str = "diffusion"  # a shipped one, or the path of a .safetensors file
-    steps: int = 5  # network calls that take a token from noise to clean
+    steps: int = 2  # network calls that take a token from noise to clean
     lead: int = 1  # extra calls by which the states are finished before the actions
-    replan: int = 4  # ticks between requests: the actions executed of a plan
-    delay: int = 2  # ticks from a request to the adoption of its plan
+    replan: int = 2  # ticks between requests: the actions executed of a plan
+    delay: int = 1  # ticks from a request to the adoption of its plan
     trim: float = 1.0  # 1/s at which what is asked is corrected by what comes of it; 0: not
     history: int | None = None  # states that a plan is made from; None: as many as the network has
     horizon: int | None = None  # ticks that are planned; None: as many as the network has

@@ -71,7 +71,7 @@ def test_settings_are_fitted_to_what_a_network_can_do(
     shape: dict[str, int], training: dict[str, Any], expected: tuple[int, int, int]
 ) -> None:
     network = DenoiserConfig(108, 20, **shape)
-    settings = DiffusionSettings().fitted(network, training)
+    settings = DiffusionSettings(steps=5, replan=4, delay=2).fitted(network, training)
     assert (settings.steps, settings.replan, settings.delay) == expected
     settings.check(network, training)
 
