@@ -290,14 +290,23 @@ _CALLS: tuple[Row, ...] = tuple(
     for steps in (1, 2, 3, 5, 10)
 )  # fmt: skip
 
-# And how often plans are made, and how long after what they were made from they are adopted.
+# And how often plans are made, how long after what they were made from they are adopted, and whether they are made of
+# the plan that runs.
 _PACE: tuple[Row, ...] = tuple(
     Row(
-        f"pace/{replan}-{delay}", OURS,
-        f"Walk + perturb: fell or broken off (randomised), plans {replan} ticks apart and adopted after {delay}",
-        replace(_PUSHED, plan={"replan": str(replan), "delay": str(delay)}), FALLS, quick=False,
+        f"pace/{name}", OURS, f"Walk + perturb: fell or broken off (randomised), {title}",
+        replace(_PUSHED, plan=plan), FALLS, quick=False,
     )
-    for replan, delay in ((4, 2), (4, 1), (4, 0), (2, 2), (2, 1), (1, 1))
+    for name, title, plan in (
+        *(
+            (
+                f"{replan}-{delay}", f"plans {replan} ticks apart and adopted after {delay}",
+                {"replan": str(replan), "delay": str(delay)},
+            )
+            for replan, delay in ((4, 2), (4, 1), (4, 0), (2, 2), (2, 1), (1, 1))
+        ),
+        ("rolling", "rolling of states and actions", ROLLING),
+    )
 )  # fmt: skip
 
 ON_VIRTUAL = ("uniphys/length", "uniphys/goal-near", "cloc/perturb", "cloc/forest")
