@@ -1,9 +1,10 @@
 """The diffusion planner-controller as a policy: history in, requests out, plans executed by tick.
 
-A plan requested at tick k is adopted at tick k + delay and was made for the actions that run meanwhile. A plan that is
-late is not adopted: the last one goes on by its tick index. So a run does not depend on how fast the machine was. A
-planner that finds no plan, because guidance diverged for one, says why: the last plan goes on, and then its last action
-is held.
+A plan requested at tick k is adopted at tick k + delay and was made for the actions that run meanwhile. While a plan is
+late, the last one goes on by its tick index, and no other is asked for. When it comes it is adopted all the same: it
+knows more than the one that runs, though not what ran since it was due. So a machine that is too slow for `delay` walks
+worse, as with a longer delay, and does not stop. A planner that finds no plan, because guidance diverged for one, says
+why: the last plan goes on, and then its last action is held.
 
 What a plan's actions are is up to the model: joint targets, or latents. A latent is decoded here, at its own tick and
 with the state of that tick. What is asked with a request is in the same terms: targets that ran are encoded with the
@@ -14,7 +15,7 @@ latents, and nobody knows the states yet.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Container
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -34,6 +35,8 @@ from stack.trim import Trim
 
 if TYPE_CHECKING:
     from policy.diffusion.runtime import Cost, Runtime
+
+_MANY = 25  # late plans in a row after which it is said that the machine is too slow
 
 
 class DiffusionPolicy:
@@ -63,7 +66,7 @@ class DiffusionPolicy:
         self._space = space
         self._states: deque[Array] = deque(maxlen=history)
         self._applied: deque[Array] = deque(maxlen=history - 1)
-        self.only: Container[int] | None = None  # requests in time in a recorded run, where it is repeated
+        self.only: Mapping[int, int] | None = None  # where a recorded run is repeated: its requests, and when adopted
         self.reset(0)
 
     def reset(self, seed: int) -> None:
@@ -75,7 +78,9 @@ class DiffusionPolicy:
         self._states.clear()
         self._applied.clear()
         self._target: Array | None = None  # the last one: what is held where no plan says more
-        self._requested: int | None = None
+        self._requested: int | None = None  # what the planner is busy with
+        self._plan: Plan | None = None  # of that request, where it came before it is to be adopted
+        self._late = 0  # plans in a row
         self._ended = self._refused = False
         self._events: list[str] = []
         self.latest_plan: Plan | None = None
@@ -97,13 +102,13 @@ class DiffusionPolicy:
         if self._trim is not None:
             instruction = replace(instruction, velocity=self._trim(state, instruction.velocity))
         self._adopt(tick)
-        if tick % self._replan == 0 and len(self._states) == self._history:
+        if tick % self._replan == 0 and len(self._states) == self._history and self._idle(tick):
             held = self._space.encode(row, self._target)
             meanwhile = [held if self._over(tick) else self._action(tick + i) for i in range(self._delay)]
             actions = np.stack([*self._applied, *meanwhile])
             states = np.stack(self._states)
             self._planner.submit(PlanRequest(tick, states, actions, instruction, self.latest_plan))
-            self._requested = tick
+            self._requested, self._plan = tick, None
             self._adopt(tick)  # at once, when there is no delay
         if self.latest_plan is not None and self._over(tick) and not self._ended:
             self._ended = True
@@ -129,22 +134,36 @@ class DiffusionPolicy:
         plan = self.latest_plan
         return plan is None or tick >= plan.tick + len(plan.actions)
 
+    def _idle(self, tick: int) -> bool:
+        """Whether the planner may be asked. A recorded run says so of a plan that it did adopt."""
+        return self._requested is None or (self.only is not None and tick in self.only)
+
     def _adopt(self, tick: int) -> None:
-        """Take over the plan that is due at `tick`."""
+        """Take over the plan that is due at `tick`, or was due before."""
         if self._requested is None or tick < self._requested + self._delay:
             return
-        requested, self._requested = self._requested, None
-        plan = self._planner.collect(requested, self._wait)
-        if plan is not None and plan.error:
+        requested, due = self._requested, self._requested + self._delay
+        self._plan = plan = self._plan or self._planner.collect(requested, self._wait)
+        if plan is None or (self.only is not None and self.only.get(requested) != tick and not plan.error):
+            if tick == due and not self._late:  # of many in a row, the first
+                self._events.append(
+                    f"the plan requested at tick {requested} was not ready at {tick}: {self._running()}"
+                )
+            return
+        self._requested = self._plan = None
+        if plan.error:
             if not self._refused:  # one that comes again and again is said once
                 self._events.append(f"no plan for tick {requested}: {plan.error}: {self._running()}")
             self._refused = True
             return
-        if self.only is not None and requested not in self.only:
-            plan = None
-        if plan is None:
-            self._events.append(f"the plan requested at tick {requested} was not ready at {tick}: {self._running()}")
-            return
+        if tick >= plan.tick + len(plan.actions):
+            return  # it says nothing of the ticks to come
+        self._late = self._late + 1 if tick > due else 0
+        if self._late == _MANY:
+            self._events.append(
+                f"{_MANY} plans in a row were late: this machine is busy, or too slow for delay: {self._delay} and "
+                f"replan: {self._replan}: set them higher, or steps lower"
+            )
         self.latest_plan, self._ended, self._refused = plan, False, False
         self.adopted.append((requested, tick))
 

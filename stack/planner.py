@@ -37,10 +37,7 @@ class Planner(Protocol):
     def submit(self, request: PlanRequest) -> None: ...
 
     def collect(self, tick: int, wait: bool) -> Plan | None:
-        """The plan requested at `tick`, once; None where it is not ready, unless `wait`. Raises PlannerError.
-
-        Called when the plan is due: without `wait`, a request that nobody has begun to answer by then is dropped.
-        """
+        """The plan requested at `tick`, once; None where it is not ready, unless `wait`. Raises PlannerError."""
         ...
 
     def close(self) -> None: ...
@@ -76,8 +73,7 @@ class ProcessPlanner:
     """Plans in a process of its own, started fresh (spawn), which ends with its parent.
 
     Neither `submit` nor `collect` without `wait` ever blocks: the process is sent a request only when it is idle. One
-    that finds it busy waits here for a `collect` with `wait`, or else is dropped: sent late, its plan would come late
-    as well, and so would all that follow, none of which would find the process idle any more.
+    that finds it busy, with a request from before it or from the last episode, waits here.
     """
 
     def __init__(self, build: Callable[[], Answer], seed: int = 0, start_timeout: float = 120.0) -> None:
@@ -119,8 +115,6 @@ class ProcessPlanner:
         self._pump(0.0)
 
     def collect(self, tick: int, wait: bool) -> Plan | None:
-        if not wait:
-            self._waiting = None
         self._pump(0.0)
         while wait and (self._busy or self._waiting is not None):
             self._pump(None)

@@ -56,7 +56,7 @@ class Script:
     """What came to a recorded run from outside, for a run that repeats it."""
 
     stops: tuple[Event, ...] = ()  # what ended it: Ctrl-C, a full disk
-    plans: frozenset[int] | None = None  # ticks of the plan requests that were answered in time
+    plans: Mapping[int, int] | None = None  # ticks of plan requests, and when their plans were adopted
     velocities: Array | None = None  # (ticks, 3) that a person steered by,
     ended: bool = False  # and whether the person ended the run
 

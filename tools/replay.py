@@ -75,7 +75,7 @@ def replay(log: FlightLog) -> tuple[int, Difference | None]:
     if log.header["policy"]["name"] != settings.policy:
         raise ConfigError(f"{log.path}: recorded with a program's own policy: only that program can repeat it")
     stops = [Event(**event) for event in log.messages["/event"] if event["kind"] in ("interrupt", "record")]
-    plans = frozenset(int(message["requested"]) for message in log.messages["/plan"])
+    plans = {int(message["requested"]): int(message["adopted"]) for message in log.messages["/plan"]}
     recorded = _by_tick(log)
     repeated: dict[int, Tick] = defaultdict(lambda: defaultdict(list))
 

@@ -42,7 +42,7 @@ def marked(asked: PlanRequest, seed: int) -> Plan:
     return Plan(asked.tick, np.full((9, 1), 1000.0 * asked.tick), np.zeros((9, 53)), np.zeros((9, 2)), 0.0)
 
 
-def policy(delay: int, late: tuple[int, ...] = ()) -> tuple[DiffusionPolicy, Spy]:
+def policy(delay: int, late: dict[int, int] | None = None) -> tuple[DiffusionPolicy, Spy]:
     spy = Spy(late)
     spy._answer = marked
     return DiffusionPolicy(spy, history=4, replan=4, delay=delay, space=Marked()), spy
@@ -78,10 +78,11 @@ def test_a_request_holds_what_ran_encoded_with_its_state_and_the_latents_that_wi
 
 def test_the_last_target_is_held_when_a_plan_has_run_out() -> None:
     """A latent that was meant for one state and is decoded with another is no pose to wait in."""
-    of, spy = policy(delay=1, late=(8, 12, 16))
-    targets = run(of, 19)
-    assert targets[12:] == pytest.approx([4012] * 7, rel=1e-6)
-    np.testing.assert_allclose(spy.requests[-1].actions[-1, 0], 4012 - 16, atol=0.01)
+    of, spy = policy(delay=1, late={8: 12})
+    targets = run(of, 25)
+    assert targets[12:] == pytest.approx([4012] * 13, rel=1e-6)
+    assert spy.requests[-1].tick == 24
+    np.testing.assert_allclose(spy.requests[-1].actions[-1, 0], 4012 - 24, atol=0.01)
     assert any("its last action is held" in event for event in of.take_events())
 
 

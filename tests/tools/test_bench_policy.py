@@ -31,7 +31,7 @@ def test_it_prints_one_row_for_each_network_runtime_and_kind_of_guidance(capfd: 
         for gradient in ("none", "analytic", "network")
     ]
     chunked, rolling = load_settings(), load_settings("diffuse_cloc")
-    assert result["plan_due_ms"] == pytest.approx(20), "a plan that takes longer than `delay` is never adopted"
+    assert result["plan_due_ms"] == pytest.approx(20), "a plan that takes longer than `delay` is late"
     assert len({(row["network"], row["call_median_ms"]) for row in rows}) == 2, "a call is the same in every runtime"
     for row in rows:
         settings = chunked if row["runtime"] == "chunked" else rolling
