@@ -36,7 +36,7 @@ from tools.train.survival import closed_loop_survival
 
 ROBOT = load_robot()
 CONFIG = DenoiserConfig(54, 20, layers=1, width=16, heads=2)
-QUICK = Settings(minutes=0.01, batch=16, evaluate_every=0.004, warmup_steps=5)
+QUICK = Settings(minutes=1.0, steps=30, batch=16, evaluate_every=0.4, warmup_steps=5)
 
 
 class Measured:
