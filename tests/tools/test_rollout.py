@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import signal
+import subprocess
+import sys
+import textwrap
 from types import SimpleNamespace
 
 import numpy as np
@@ -100,6 +103,22 @@ def test_an_episode_that_cannot_be_done_does_not_take_the_others_with_it(
     assert main(["rollout", *words, "5"]) == 3  # and where none was done, the error alone
     (line,) = capfd.readouterr().out.splitlines()
     assert json.loads(line) == {"error": "the rig did not answer", "exit_code": 3}
+
+
+def test_many_episodes_take_no_more_memory_than_one() -> None:
+    """In a process of its own: what else was freed in this one would be used again, and hide it."""
+    code = """
+        from pathlib import Path
+        from stack.session import Settings
+        from tools.rollout import episode
+        sizes = []
+        for seed in range(6):
+            episode(Settings("goal", seed=seed, seconds=0.5))
+            sizes.append(int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6)
+        print(max(sizes[1:]) - sizes[0])
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=True)
+    assert float(done.stdout) < 40.0  # MB; 99 where nothing is given back
 
 
 @pytest.mark.parametrize(
