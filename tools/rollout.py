@@ -182,7 +182,7 @@ def judge(job: Settings) -> Judged:
 
 
 def _give_memory_back() -> None:
-    """Hand what a run has freed back to the system: the C library keeps it, some 20 MB of each planner that was made."""
+    """Hand what a run has freed back to the system: the C library keeps some 20 MB of each planner."""
     with suppress(OSError, AttributeError):  # another C library than glibc
         ctypes.CDLL(None).malloc_trim(0)
 
