@@ -65,7 +65,7 @@ def test_inline_and_process_planners_answer_alike() -> None:
         process.close()
 
 
-def test_a_slow_planner_never_blocks_and_skips_what_it_cannot_begin_at_once() -> None:
+def test_a_slow_planner_never_blocks_and_plans_only_the_newest_of_what_waits() -> None:
     planner = ProcessPlanner(partial(build, seconds=0.5))
     try:
         start = time.monotonic()
@@ -75,7 +75,7 @@ def test_a_slow_planner_never_blocks_and_skips_what_it_cannot_begin_at_once() ->
         assert time.monotonic() - start < 0.3
         time.sleep(0.6)
         planner.submit(request(12))
-        assert until_ready(planner, 12).tick == 12  # 0 came too late to be wanted, and 4 and 8 were never planned
+        assert until_ready(planner, 12).tick == 12  # 0 was not wanted any more, and 4 and 8 were never planned
         assert time.monotonic() - start < 1.9
     finally:
         planner.close()

@@ -22,11 +22,11 @@ ERROR = Metric("metrics.velocity_error_mps", "m/s", lower=True, unfinished="whol
 # 0.089 and level 3 of 20 has 0.243. That is for text; under guidance it takes more, and does not say how much.
 _STABLE = {"stabilise": "1"}
 _CHUNKS = {"steps": "5", "replan": "4", "delay": "2"}  # as in configs/policies/uniphys.yaml
-_AT_ONCE = {**_CHUNKS, "lead": "0"}  # state and action of a frame, which are one token in UniPhys
-FULL: Mapping[str, str] = {"schedule": "full_sequence", **_AT_ONCE, **_STABLE}
-AUTOREGRESSIVE: Mapping[str, str] = {"schedule": "autoregressive", **_AT_ONCE, **_STABLE}
-UNSTABLE: Mapping[str, str] = {"schedule": "autoregressive", **_AT_ONCE, "stabilise": "0"}
-GRADUAL: Mapping[str, str] = {"schedule": "gradual", **_AT_ONCE, **_STABLE}
+_AT_ONCE = {"lead": "0"}  # state and action of a frame, which are one token in UniPhys
+FULL: Mapping[str, str] = {"schedule": "full_sequence", **_CHUNKS, **_AT_ONCE, **_STABLE}
+AUTOREGRESSIVE: Mapping[str, str] = {"schedule": "autoregressive", **_CHUNKS, **_AT_ONCE, **_STABLE}
+UNSTABLE: Mapping[str, str] = {"schedule": "autoregressive", **_CHUNKS, **_AT_ONCE, "stabilise": "0"}
+GRADUAL: Mapping[str, str] = {"schedule": "gradual", **_CHUNKS, **_AT_ONCE, **_STABLE}
 # Actions come after the states that guidance moved.
 GUIDED: Mapping[str, str] = {"schedule": "gradual", **_CHUNKS, **_STABLE}
 # As in configs/policies/diffuse_cloc.yaml; at a level of 20 nothing but a frame's noise goes over to the next plan.
