@@ -36,9 +36,9 @@ class Marks:
     path: Path
     lines: dict[str, int] = field(default_factory=dict)
 
-    def error(self, key: str, message: str) -> ConfigError:
-        """An error at `key`, or at the nearest key above it that is in the file."""
-        at = key
+    def error(self, key: str, message: str, at: str | None = None) -> ConfigError:
+        """An error of `key`, with the line of `at` (default: `key`) or of the nearest key above that is in the file."""
+        at = key if at is None else at
         while at not in self.lines and at:
             at = at[: max(at.rfind("."), at.rfind("["), 0)]
         return ConfigError(f"{self.path}:{self.lines.get(at, 1)}: {key + ': ' if key else ''}{message}")
@@ -156,8 +156,9 @@ class _Reader:
         values = {name: self.read(item, hints[name], _join(key, name)) for name, item in items.items()}
         try:
             return cls(**values)
-        except ValueError as error:  # the dataclass's own check
-            raise self.marks.error(key, str(error)) from error
+        except ValueError as error:  # the dataclass's own check, which names what is wrong
+            named = {found.start(): name for name in items if (found := re.search(rf"\b{name}\b", str(error)))}
+            raise self.marks.error(key, str(error), _join(key, named[min(named)]) if named else key) from error
 
     def mapping(self, node: yaml.Node, key: str) -> dict[str, yaml.Node]:
         if not isinstance(node, yaml.MappingNode):

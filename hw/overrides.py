@@ -22,33 +22,34 @@ def override(base: T, settings: dict[str, str], where: str = "--set", beside: It
     of points as `x,y:x,y`. `beside` are names that are read elsewhere, and may be meant by one that is unknown here.
     Raises ConfigError naming the setting for an unknown key or a value that does not parse.
     """
-    for key, text in settings.items():
-        base = _set(base, key, key, text, where, beside)
-    return base
+    return _set(base, [(key, key, text) for key, text in settings.items()], where, beside)
 
 
-def _set(base: Any, key: str, full: str, text: str, where: str, beside: Iterable[str] = ()) -> Any:
+def _set(base: Any, settings: list[tuple[str, str, str]], where: str, beside: Iterable[str] = ()) -> Any:
+    """`base` with (key, key as typed, text) read, all at once: values that are good together come in any order."""
     hints = typing.get_type_hints(type(base))
-    name, _, rest = key.partition(".")
-    if name not in hints:
-        raise ConfigError(f"{where} {full}={text}: unknown setting '{name}': {nearest(name, (*hints, *beside))}")
-    if rest:
-        inner = getattr(base, name)
-        if not is_dataclass(inner):
-            raise ConfigError(f"{where} {full}={text}: '{name}' has no settings of its own")
-        return _replace(base, name, _set(inner, rest, full, text, where), f"{where} {full}={text}")
+    values: dict[str, Any] = {}
+    inner: dict[str, list[tuple[str, str, str]]] = {}
+    for key, full, text in settings:
+        name, _, rest = key.partition(".")
+        if name not in hints:
+            raise ConfigError(f"{where} {full}={text}: unknown setting '{name}': {nearest(name, (*hints, *beside))}")
+        if rest:
+            if not is_dataclass(getattr(base, name)):
+                raise ConfigError(f"{where} {full}={text}: '{name}' has no settings of its own")
+            inner.setdefault(name, []).append((rest, full, text))
+            continue
+        try:
+            values[name] = _parse(text.strip(), hints[name])
+        except ValueError as error:
+            raise ConfigError(f"{where} {full}={text}: expected {error}") from error
+    values |= {name: _set(getattr(base, name), parts, where) for name, parts in inner.items()}
     try:
-        value = _parse(text.strip(), hints[name])
+        return replace(base, **values)
     except ValueError as error:
-        raise ConfigError(f"{where} {full}={text}: expected {error}") from error
-    return _replace(base, name, value, f"{where} {full}={text}")
-
-
-def _replace(base: Any, name: str, value: Any, where: str) -> Any:
-    try:
-        return replace(base, **{name: value})
-    except ValueError as error:
-        raise ConfigError(f"{where}: {error}") from error
+        typed = [(key.partition(".")[0], f"{full}={text}") for key, full, text in settings]
+        named = [words for name, words in typed if re.search(rf"\b{name}\b", str(error))]
+        raise ConfigError(f"{where} {' '.join(named or [words for _, words in typed])}: {error}") from error
 
 
 def _parse(text: str, hint: Any) -> Any:

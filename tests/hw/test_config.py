@@ -72,7 +72,7 @@ def test_reads_what_people_write(tmp_path: Path) -> None:
         (("id: 7", "id: 7.5"), 2, "id: expected a whole number, got the number '7.5'"),
         (("id: 7", "id: yes"), 2, "id: expected a whole number, got the boolean 'yes'"),
         (("id: 7", "id: 1:30"), 2, "id: expected a whole number"),  # base 60 in YAML 1.1
-        (("id: 7", "id: 300"), 1, "id: servos have IDs up to 252"),
+        (("id: 7", "id: 300"), 2, "id: servos have IDs up to 252"),
         (("kp: 8", "kp: '8'"), 5, "gains.kp: expected a number, got the text '8'; take the quotes away"),
         (("kp: 8", "kp: 8 N m"), 5, "gains.kp: expected a number"),
         (("kp: 8", "kp: 45deg"), 5, "without the unit 'deg'"),
@@ -164,3 +164,27 @@ def test_override_reads_text_by_type() -> None:
 def test_override_refuses(key: str, text: str, words: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(words)):
         override(BASE, {key: text})
+
+
+@dataclass(frozen=True)
+class Span:
+    low: float = 0.0
+    high: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.low > self.high:
+            raise ValueError(f"low: {self.low:g} is above high ({self.high:g})")
+
+
+@dataclass(frozen=True)
+class Ruler:
+    span: Span = Span()
+
+
+@pytest.mark.parametrize("keys", [("low", "high"), ("high", "low")])
+def test_settings_that_are_good_together_come_in_any_order(keys: tuple[str, str]) -> None:
+    moved = {"low": "2", "high": "3"}
+    assert override(Span(), {key: moved[key] for key in keys}) == Span(2.0, 3.0)
+    assert override(Ruler(), {f"span.{key}": moved[key] for key in keys}) == Ruler(Span(2.0, 3.0))
+    with pytest.raises(ConfigError, match=r"--set span\.low=2: low: 2 is above high"):
+        override(Ruler(), {"span.low": "2"})

@@ -24,7 +24,7 @@ def test_unknown_names_are_refused_with_the_line_and_the_nearest_one(tmp_path: P
     refused(
         tmp_path,
         "steps: 5\nschedule: roling\n",
-        r"mine\.yaml:1: no schedule is called 'roling': did you mean 'rolling'",
+        r"mine\.yaml:2: no schedule is called 'roling': did you mean 'rolling'",
     )
     refused(
         tmp_path, "gradual:\n  shape: pyramide\n", r"gradual: no shape is called 'pyramide': did you mean 'pyramid'"
