@@ -15,6 +15,7 @@ from hw.robot import Robot
 from policy import checkpoint
 from policy.checkpoint import CheckpointError
 from policy.diffusion.features import raw_layout, token_layout
+from policy.diffusion.masks import check_mask
 from policy.text.encoder import code_size
 
 KIND = "diffusion"  # of a checkpoint
@@ -41,6 +42,7 @@ class DenoiserConfig:
         for name in ("state_size", "action_size", "layers", "width", "heads", "history", "horizon", "levels"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"denoiser: {name} must be at least 1, not {getattr(self, name)}")
+        check_mask(self.mask)
         if self.text_size < 0 or bool(self.text) != bool(self.text_size):
             raise ConfigError(f"denoiser: an encoder '{self.text}' and a text_size of {self.text_size} do not agree")
         if not 0 <= self.actions <= self.horizon:

@@ -58,9 +58,14 @@ MASKS: dict[str, Callable[[Array, Array], Array]] = {
 }
 
 
-def attention_mask(name: str, state_ticks: Array, action_ticks: Array) -> Array:
-    """Mask `name` for tokens of the given ticks. Raises ConfigError with the nearest name if there is none."""
+def check_mask(name: str) -> None:
+    """Raise ConfigError with the nearest name where no mask is called `name`."""
     if name not in MASKS:
         near = get_close_matches(name, MASKS, n=1, cutoff=0.0)[0]
         raise ConfigError(f"no attention mask is called '{name}': did you mean '{near}'? There are {', '.join(MASKS)}.")
+
+
+def attention_mask(name: str, state_ticks: Array, action_ticks: Array) -> Array:
+    """Mask `name` for tokens of the given ticks. Raises ConfigError where there is none."""
+    check_mask(name)
     return MASKS[name](state_ticks, action_ticks)

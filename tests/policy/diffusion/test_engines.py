@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from policy.diffusion import engines, export
 from policy.diffusion.checkpoint import Model
 from policy.diffusion.config import DenoiserConfig
 from policy.diffusion.denoiser import Denoiser
-from policy.diffusion.engines import ENGINES, REFERENCE, check_engine, load_engine
+from policy.diffusion.engines import ENGINES, REFERENCE, check_engine, deviation, load_engine
 from policy.diffusion.masks import MASKS
 from policy.diffusion.runtime import Runtime
 from policy.diffusion.sampler import classifier_free
@@ -171,6 +172,17 @@ def test_the_gradient_through_the_network_needs_torch() -> None:
     states, *rest = window(denoiser.config, 1, shared=True)
     with pytest.raises(RuntimeError, match="no gradient through the network"):
         load_engine(installed("onnx"), denoiser)(states.requires_grad_(), *rest)
+
+
+@pytest.mark.parametrize("broken", ["states", "actions"])
+def test_what_is_not_a_number_deviates_from_torch(broken: str) -> None:
+    denoiser = model().denoiser
+
+    def engine(*inputs: torch.Tensor, **text: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        states, actions = denoiser(*inputs, **text)
+        return (states * math.nan, actions) if broken == "states" else (states, actions * math.nan)
+
+    assert math.isnan(deviation(engine, denoiser))
 
 
 def test_an_engine_that_computes_something_else_is_refused(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -72,6 +74,8 @@ def test_an_unknown_mask_is_refused_with_the_nearest_name() -> None:
     config = DenoiserConfig(5, 3)
     with pytest.raises(ConfigError, match="did you mean 'state_full_action_causal'"):
         attention_mask("state_full_action_casual", config.state_ticks, config.action_ticks)
+    with pytest.raises(ConfigError, match="did you mean 'causal'"):
+        replace(config, mask="casual")  # before a network is made, or data are read for one
     with pytest.raises(ConfigError, match="did you mean 'causal'"):
         Denoiser(DenoiserConfig(5, 3, mask="casual"))
 
