@@ -21,13 +21,13 @@ def build(robot: Robot, scene: Scene | None = None) -> mujoco.MjModel:
     """Compile the model of `robot` on a floor, with a scene. Actuator i drives joint i of the robot's file.
 
     The MJCF's own actuators, sensors and keyframes are replaced. Raises ConfigError naming what the MJCF lacks or the
-    joint whose servo cannot be simulated beside the others, and ValueError for a scene of other robots and obstacles:
-    what a robot feels is told by its place among robots alone.
+    joint whose servo cannot be simulated beside the others, and for a scene of other robots and obstacles: what a robot
+    feels is told by its place among robots alone.
     """
     result = spec(robot, robots := count_robots(scene))
     if scene is not None:
         if robots > 1 and len(scene.pillars) + len(scene.spheres):
-            raise ValueError("a scene has other robots, or pillars and spheres, but not yet both")
+            raise ConfigError("a scene has other robots, or pillars and spheres, but not yet both")
         add_scene(result, scene)
     return result.compile()
 

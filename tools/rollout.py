@@ -72,12 +72,15 @@ def main(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     from stack.backends import backend_kind
+    from stack.tasks import task_class
 
     if args.episodes < 1:
         raise ConfigError(f"--episodes: {args.episodes} is not a number of episodes; give 1 or more")
     if args.workers < 0:
         raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
     check_seed(args.seed)
+    if task_class(args.task).steered:
+        raise ConfigError(f"task '{args.task}' is steered by a person: use `servoid run {args.task}`")
     if not backend_kind(args.backend).simulated:
         raise ConfigError(f"backend '{args.backend}' has no truth to judge by: use a simulated one, or `servoid run`")
 

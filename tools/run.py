@@ -71,11 +71,12 @@ def main(args: argparse.Namespace) -> int:
         with Interrupt(eager=True) as interrupt:  # these take a while, and a Ctrl-C meanwhile must not get lost
             from stack.backends import backend_kind
             from stack.session import Settings, run
+            from stack.tasks import task_class
             from tools.live import LiveLine
 
             interrupt.settle()
 
-        watched = sys.stdout.isatty() and not args.json
+        watched = (sys.stdout.isatty() and not args.json) or task_class(args.task).steered
         plan = Settings(
             task=args.task,
             backend=args.backend,

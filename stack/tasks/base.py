@@ -31,6 +31,7 @@ class BaseTask:
     name: str
     description: str
     settings_type: ClassVar[type[Settings]] = Settings
+    steered: ClassVar[bool] = False  # by a person, who needs real time
     counts_undone: ClassVar[tuple[str, ...]] = ()  # metrics that hold of a run that never began, too
 
     def __init__(self, settings: Any, dt: float) -> None:

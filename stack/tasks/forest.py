@@ -28,7 +28,7 @@ class ForestSettings(Settings):
     depth: Annotated[float, "m, along it"] = 2.5
     clearing: Annotated[float, "m around start and goal without a pillar"] = 0.35
     spacing: Annotated[float, "m at least between the middles of two pillars"] = 0.3
-    places: Annotated[tuple[Pillar, ...], "x, y, radius m of each pillar: fixes the forest"] = ()
+    places: Annotated[tuple[Pillar, ...], "x,y,radius:x,y,radius:... m of each pillar: fixes the forest"] = ()
     x: Annotated[float | None, "m ahead of the start: fixes the goal (else drawn behind the forest)"] = None
     y: Annotated[float | None, "m to the left of the start: fixes the goal"] = None
     radius: Annotated[float, "m from the goal that count as reached"] = 0.14
@@ -40,6 +40,8 @@ class ForestSettings(Settings):
         require_positive(self, "pillar_radius", "width", "depth", "radius")
         if self.pillars < 0 or self.spacing < 0.0 or self.clearing < 0.0:
             raise ValueError("pillars, spacing and clearing: must not be negative")
+        if any(radius <= 0.0 for _, _, radius in self.places):
+            raise ValueError("places: the radius of a pillar must be positive")
 
 
 class Forest(BaseTask):

@@ -82,12 +82,13 @@ def total_cost(trajectory: Trajectory, instruction: Instruction, weights: Weight
 
 
 def goal_cost(trajectory: Trajectory, goal: Array, weights: Weights) -> Any:
-    """Of each tick, for a goal `(2,)` m: `(batch,)`.
+    """Of each tick, for a goal `(2,)` or `(batch, 2)` m: `(batch,)`.
 
     `w1 |p - g| + w2 (1 - cos(heading, g - p))` (UniPhys, eq. 5), and `w3 |p - g|^2` (Diffuse-CLoC's G_wp, section 4.1).
     The bearing of a near goal turns with every step, by 1 / d, so facing it is weighted with d^2 / (d^2 + 0.1^2).
     """
-    way = trajectory.displacement.new_tensor(np.asarray(goal, dtype=float)) - trajectory.displacement
+    place = np.asarray(goal, dtype=float)[..., None, :]  # the same for all ticks
+    way = trajectory.displacement.new_tensor(place) - trajectory.displacement
     distance = _norm(way)
     ahead = way[..., 0] * trajectory.yaw.cos() + way[..., 1] * trajectory.yaw.sin()
     turned = distance * (distance - ahead) / (distance**2 + _NEAR**2)

@@ -74,7 +74,7 @@ class Path(BaseTask):
 
     def done(self, state: State) -> bool:
         """At the end of the path."""
-        return self._at >= len(self.points) - round(0.4 * self.settings.tolerance / _SPACING)
+        return self._at >= len(self.points) - max(round(0.4 * self.settings.tolerance / _SPACING), 1)
 
     def success(self, trace: Trace) -> bool:
         """Never fallen, near the path on average, and at its end by way of it. The trace is in the odometry frame."""

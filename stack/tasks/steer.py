@@ -32,6 +32,7 @@ class Steer(BaseTask):
     name = "steer"
     description = "walk as a person steers, with a gamepad or by keys"
     settings_type = SteerSettings
+    steered = True
 
     def __init__(self, settings: SteerSettings, dt: float) -> None:
         super().__init__(settings, dt)

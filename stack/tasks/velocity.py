@@ -33,8 +33,8 @@ class VelocitySettings(Settings):
         require_ranges(self, "speed", "turn")
         if self.speed[0] < 0.0:
             raise ValueError("speed: must not be negative; its direction is drawn")
-        if not 0.0 <= self.settle < self.every:
-            raise ValueError(f"settle: {self.settle:g} must be below every ({self.every:g})")
+        if self.settle < 0.0 or self.settle + self.cycle > self.every:
+            raise ValueError(f"settle: {self.settle:g} s leaves no cycle of {self.cycle:g} s of every {self.every:g} s")
 
 
 class Velocity(BaseTask):

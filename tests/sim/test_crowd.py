@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from test_scene import TICK, state
 
+from hw.config import ConfigError
 from hw.hal import Array, Command, Mode, Scene
 from hw.robot import Robot, load_robot
 from sim.backend import SimBackend
@@ -72,7 +73,7 @@ def test_rows_are_views_of_the_one_world(robot: Robot) -> None:
         crowd.reset(np.array([0]))
     with pytest.raises(ValueError, match="not a world of 2 robots"):
         Crowd(one, 2)
-    with pytest.raises(ValueError, match="not yet both"):
+    with pytest.raises(ConfigError, match="not yet both"):
         build(robot, replace(scene((1.0, 0.0, 0.0)), pillars=np.ones((1, 3))))
 
 

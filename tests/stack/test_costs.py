@@ -66,6 +66,15 @@ def pull(distance: float, weights: Weights, bearing: float = 1.0) -> tuple[float
     return value(cost), float(gradient.norm())
 
 
+def test_each_robot_of_a_batch_may_have_a_goal_of_its_own() -> None:
+    goals, weights = np.array([[1.0, 0.0], [0.0, 2.0]]), Weights(goal=2.0, facing=3.0)
+    for ticks in (2, 3):  # as many as robots, or more
+        one, two = moves(np.zeros((ticks, 2))), moves(np.zeros((ticks, 2)))
+        two.displacement, two.yaw = (torch.cat([part, part]) for part in (one.displacement, one.yaw))
+        alone = [value(goal_cost(one, goal, weights)) for goal in goals]
+        np.testing.assert_allclose(goal_cost(two, goals, weights).detach().numpy(), alone, rtol=1e-6)
+
+
 def test_facing_a_near_goal_does_not_outweigh_being_there() -> None:
     facing, goal = Weights(facing=1.0), Weights(goal=1.0)
     for distance in (0.001, 0.02, 0.1):

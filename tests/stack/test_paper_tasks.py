@@ -114,6 +114,8 @@ def test_forest_refuses_what_cannot_be() -> None:
         load_task("forest", {"places": "1,0.1,0.05", "x": "1", "y": "0"})
     with pytest.raises(ConfigError, match=r"start at x=0, y=0 is inside the pillar at x=0\.1, y=0"):
         load_task("forest", {"places": "0.1,0,0.05"})
+    with pytest.raises(ConfigError, match="radius of a pillar must be positive"):
+        load_task("forest", {"places": "1,0,0.05:1,0.5,-0.05"})
     wall = ":".join(f"3.2,{y:g},0.1" for y in np.linspace(-0.6, 0.6, 5))  # wherever behind the forest the goal is drawn
     with pytest.raises(
         ConfigError, match=r"goal at x=3\.2, y=\S+ is inside the pillar at x=3\.2.*fix the goal by x and y"
@@ -188,6 +190,11 @@ def test_velocities_that_a_fall_left_undone_count_as_not_walked() -> None:
 
 
 # --- path
+
+
+def test_a_fine_tolerance_leaves_the_end_of_a_path_to_be_come_to() -> None:
+    task = load_task("path", {"shape": "s", "tolerance": "0.01"}, DT)
+    assert len(drive(task, 60.0).yaw) * DT < 50.0  # it ends there, and not when time runs out
 
 
 @pytest.mark.parametrize(

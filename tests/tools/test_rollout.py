@@ -214,3 +214,10 @@ def test_the_witness_sees_the_run_in_the_frame_it_started_in() -> None:
 def test_bad_choices_are_refused_before_anything_runs(words: list[str], named: str) -> None:
     with pytest.raises(ConfigError, match=named):
         rollout.main(options(*words))
+
+
+def test_a_task_that_a_person_steers_is_no_rollout() -> None:
+    arguments = options()
+    arguments.task = "steer"
+    with pytest.raises(ConfigError, match="servoid run steer"):
+        rollout.main(arguments)

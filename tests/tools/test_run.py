@@ -54,6 +54,22 @@ def test_json_is_one_object_on_standard_output(capfd):
     ends_off(read_log(values["log"]))
 
 
+@pytest.mark.parametrize(
+    ("words", "realtime"),
+    [(["walk"], False), (["steer"], True), (["steer", "--json"], True), (["steer", "--fast"], False)],
+)
+def test_who_steers_is_given_real_time_whoever_reads_the_output(words, realtime, monkeypatch):
+    asked = []
+
+    def run(settings, **_):
+        asked.append(settings.realtime)
+        raise ConfigError("seen")
+
+    monkeypatch.setattr("stack.session.run", run)
+    assert main(["run", *words]) == 2
+    assert asked == [realtime]
+
+
 def test_live_line_summary_and_log_for_a_person(capsys):
     assert main(RUN) == 0
     out = capsys.readouterr().out
