@@ -15,7 +15,7 @@ JUDGES = ("tools/witness.py", "tools/motion.py", "tools/rollout.py", "tools/eval
 
 @cache
 def code() -> str:
-    """Hash of the code that runs. It is taken once: what is edited while an evaluation runs is not what runs."""
+    """Hash of the code when the evaluation began: `read_anew` tells whether it is still the same."""
     return digest(ROOT)
 
 
@@ -29,15 +29,16 @@ def digest(root: Path) -> str:
 
 
 def read_anew(robot: str) -> tuple[Any, ...]:
-    """What each episode reads from files again, to be compared: hashes of configs/, and the robot. Nothing is cached.
+    """What an episode may read from files again, to be compared: hashes of code and configs/, and the robot.
 
-    Raises ConfigError where the robot's file is no good.
+    Nothing is cached. Code is among it because workers and virtual rigs import what they need when they need it. Raises
+    ConfigError where the robot's file is no good.
     """
     from hw.config import CONFIGS
     from hw.robot import load_robot
     from stack.provenance import fingerprint, sha256
 
-    return [(str(path), sha256(path)) for path in _settings(CONFIGS)], fingerprint(load_robot(robot))
+    return digest(ROOT), [(str(path), sha256(path)) for path in _settings(CONFIGS)], fingerprint(load_robot(robot))
 
 
 def _settings(folder: Path) -> Iterator[Path]:

@@ -102,8 +102,8 @@ def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[st
         else:
             if _pilot(pilots, work.run, work.settings.policy) != work.pilot or read_anew(options.robot) != read:
                 raise ConfigError(
-                    f"the policy of {', '.join(work.rows)}, the robot or a file in configs/ changed while episodes ran:"
-                    " what was done is kept; give the same command again when the files stay as they are"
+                    f"the policy of {', '.join(work.rows)}, the robot, the code or a file in configs/ changed while"
+                    " episodes ran: what was done is kept; give the same command again when the files stay as they are"
                 )
             work.cache.add(done.job.episode, {**done.record, "commit": commit})
     for work in runs:

@@ -23,8 +23,8 @@ class Measured:
 def table(rows: Sequence[Row], measured: Mapping[str, Measured]) -> list[dict[str, Any]]:
     """The rows as JSON values, in order; `measured` by the rows' names.
 
-    `value` is null where nothing was measured, and then `reached` is false. `reached` is null where no figure is to be
-    reached.
+    `value` is null where nothing was measured. `reached` is null where no figure is to be reached, and false where one
+    is and nothing was measured.
     """
     values = {row.name: _value(row, measured[row.name]) for row in rows}
     return [_line(row, measured[row.name], values) for row in rows]
@@ -66,10 +66,10 @@ def _figure(row: Row, values: Mapping[str, float | None]) -> float | None:
 
 def _reached(row: Row, value: float | None, figure: float | None) -> bool | None:
     """By the value itself, not by its interval."""
-    if value is None:
+    if row.figure is None:
+        return None
+    if value is None or figure is None:
         return False
-    if figure is None:
-        return None if row.figure is None else False
     return value <= figure if row.metric.lower else value >= figure
 
 

@@ -15,7 +15,7 @@ from policy.checkpoint import resolve
 from stack.session import Settings
 from tools import rollout
 from tools.cli import main
-from tools.evaluate import clips, session
+from tools.evaluate import clips, code, session
 from tools.evaluate.cache import EpisodeCache, key
 from tools.evaluate.code import digest
 from tools.evaluate.episode import Done, Job
@@ -161,11 +161,18 @@ def test_what_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch:
     shutil.copytree(CONFIGS, tmp_path / "configs")
     shutil.copytree(CONFIGS / "robots", tmp_path / "robots")
     shutil.copy(CONFIGS / "robots" / "op3.yaml", robot)
+    code.code()  # that of this program, once and for all
+    module = tmp_path / "hw" / "module.py"
+    for path in (module, *(tmp_path / judge for judge in code.JUDGES)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    monkeypatch.setattr(code, "ROOT", tmp_path)
     changes = [
         lambda job: checkpoint.write_bytes(checkpoint.read_bytes()[:-4] + b"\0\0\0\1"),
         lambda job: robot.write_text(robot.read_text().replace("name: op3", "name: mine")),
         lambda job: (tmp_path / "configs" / "tasks" / "goal-near.yaml").open("a").write("# another\n"),
         lambda job: Path(job.settings.policy).write_text("steps: 3\n"),
+        lambda job: module.write_text("edited = True\n"),
     ]
     monkeypatch.setattr("hw.config.CONFIGS", tmp_path / "configs")
     for number, change in enumerate(changes):

@@ -82,7 +82,7 @@ def test_a_figure_of_what_came_before_a_fall_says_so() -> None:
 
 
 def test_times_of_those_that_succeeded_say_how_many_did_not() -> None:
-    (row,) = (row for row in ROWS if row.metric.of.startswith("metrics.seconds_to"))
+    (row,) = (row for row in ROWS if row.name == "cloc/rolling-both-seconds")
     some = [
         {**record, "metrics": {"seconds_to_goal": 9.0 if record["success"] else math.nan}} for record in records(5, 3)
     ]
@@ -114,6 +114,7 @@ def test_a_figure_may_be_another_rows_value() -> None:
     ],
 )
 def test_what_was_not_measured_has_no_value_and_says_why(measured: Measured, told: str) -> None:
+    assert one(replace(SHARE, figure=None), measured)["reached"] is None
     line = one(SHARE, measured)
     assert (line["value"], line["ci95"], line["episodes"], line["reached"]) == (None, None, 0, False)
     assert told in line["note"]
@@ -226,8 +227,10 @@ def test_stabilisation_is_about_as_noisy_as_the_papers() -> None:
 
 
 def test_rows_of_the_forest_that_are_compared_differ_in_their_network_alone() -> None:
-    trained = {row.name: row.run for row in ROWS if row.run.task == "forest" and row.run.network is not None}
+    forest = [row for row in ROWS if row.run.task == "forest" and row.metric.share]
+    trained = {row.name: row.run for row in forest if row.run.network is not None}
     assert {"cloc/reference", "cloc/horizon-16", "cloc/horizon-64", "cloc/actions-1"} <= trained.keys()
+    assert {run.plan["schedule"] for run in trained.values()} == {"rolling"}  # those of the paper's table roll
     assert len({repr(run.plan) for run in trained.values()}) == 1
     assert trained["cloc/reference"] == trained["cloc/actions-16"]  # trained once, measured once
     for name, run in trained.items():
@@ -239,8 +242,9 @@ def test_rows_of_the_forest_that_are_compared_differ_in_their_network_alone() ->
 def test_each_network_of_the_forest_is_pushed_too() -> None:
     rows = {row.name: row for row in ROWS}
     forest = [row for row in ROWS if row.run.task == "forest" and row.run.network is not None]
-    for row in forest:
-        pushed = rows[f"{row.name}-perturb"]
+    for row in (row for row in forest if row.metric.share):
+        timed, pushed = rows[f"{row.name}-seconds"], rows[f"{row.name}-perturb"]
+        assert (timed.run, timed.published_unit) == (row.run, "s of a human")
         assert pushed.run == replace(row.run, task="perturb", randomise=True)
         assert (pushed.metric, pushed.published) == (rows["cloc/perturb"].metric, None)
         assert pushed.note.startswith("not in the paper's table")
