@@ -13,7 +13,6 @@ from policy.diffusion.schedule import DenoisingMatrix
 from policy.diffusion.settings import Autoregressive, DiffusionSettings, Gradual
 
 NETWORK = DenoiserConfig(108, 20)  # 4 past and 16 future states, 20 noise levels
-COMMITTED = 2  # actions that run while the plan is made
 FOLDER = Path("docs/schedules")
 
 # Picture to settings; with the rolling schedule one frame is new.
@@ -29,8 +28,7 @@ PICTURES = {
 def matrix(name: str) -> DenoisingMatrix:
     """The matrix of a picture, with past states and past and committed actions held clean."""
     drawn = PICTURES[name].matrix(NETWORK, fresh=1)
-    committed = min(COMMITTED, PICTURES[name].delay)
-    return drawn.hold(NETWORK.state_ticks <= 0, NETWORK.action_ticks < committed)
+    return drawn.hold(NETWORK.state_ticks <= 0, NETWORK.action_ticks < PICTURES[name].delay)
 
 
 def draw(name: str, out: Path) -> None:
@@ -38,7 +36,7 @@ def draw(name: str, out: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    rows, committed = matrix(name), min(COMMITTED, PICTURES[name].delay)
+    rows = matrix(name)
     figure = Figure(figsize=(8.4, 0.9 + 0.16 * rows.calls), layout="constrained")
     FigureCanvasAgg(figure)
     image: Any = None
@@ -50,7 +48,7 @@ def draw(name: str, out: Path) -> None:
         axes.set_xlabel("tick from now", fontsize=8)
         axes.set_xticks(np.arange(ticks[0], ticks[-1] + 1, 4))
         axes.tick_params(labelsize=7)
-        known = 0.5 if title == "states" else committed - 0.5  # what is known lies to the left
+        known = 0.5 if title == "states" else PICTURES[name].delay - 0.5  # what is known lies to the left
         axes.axvline(known, color="#f28e1c", lw=1.0)
     figure.axes[0].set_ylabel("network calls", fontsize=8)
     figure.colorbar(image, ax=figure.axes, label="noise level").ax.tick_params(labelsize=7)

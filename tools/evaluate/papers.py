@@ -1,7 +1,7 @@
 """Print the papers' tables with this project's column beside the published one.
 
-Episodes that were done are kept under --out and not repeated, as long as checkpoint, settings and task are the same: an
-evaluation that was interrupted goes on where it was. docs/evaluation.md says what each row means.
+Episodes that were done are kept under --out and not repeated, as long as checkpoint, settings, task and code are the
+same: an evaluation that was interrupted goes on where it was. docs/evaluation.md says what each row means.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("runs/papers"), help="folder (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one a core)")
-    parser.add_argument("--episodes", type=int, help="a row, instead of its own number")
-    parser.add_argument("--seconds", type=float, help="at most so long an episode: for a try")
-    parser.add_argument("--minutes", type=float, help="stop then; the same command goes on. 0: tell what was done")
-    parser.add_argument("--seed", type=int, default=0, help="of the first episode's stream (default: %(default)s)")
-    parser.add_argument("--fresh", action="store_true", help="do again what was done")
+    parser.add_argument("--episodes", type=int, help="episodes of each row (default: its own number, 100 for most)")
+    parser.add_argument("--seconds", type=float, help="end each episode then, for a try: figures mean little")
+    parser.add_argument("--minutes", type=float, help="stop after so many; the same command goes on. 0: print what was done")
+    parser.add_argument("--seed", type=int, default=0, help="of everything that is random (default: %(default)s)")
+    parser.add_argument("--fresh", action="store_true", help="do all episodes anew")
     add_json_argument(parser)
 
 
