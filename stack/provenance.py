@@ -30,6 +30,7 @@ def header(settings: Any, robot: Robot, task: Task, body: str, policy: dict[str,
         "settings": plain(dataclasses.asdict(settings)),
         "seed": settings.seed,
         "task": {"name": task.name} | described(getattr(task, "settings", None)),
+        "task_files": files(getattr(task, "settings", None)),
         "scene": described(task.scene()) or None,
         **fingerprint(robot),
         "backend": body,
@@ -59,6 +60,15 @@ def described(value: Any) -> dict[str, Any]:
         return {}
     values: dict[str, Any] = plain(dataclasses.asdict(value))
     return values
+
+
+def files(settings: Any) -> dict[str, str | None]:
+    """Hashes of the files that a task's settings name, such as clips, by their paths; none for what is no dataclass."""
+    if not dataclasses.is_dataclass(settings):
+        return {}
+    values = [getattr(settings, field.name) for field in dataclasses.fields(settings)]
+    named = [part for value in values for part in (value if isinstance(value, tuple) else (value,))]
+    return {str(path): sha256(path) for path in named if isinstance(path, Path)}
 
 
 def sha256(path: Path) -> str | None:

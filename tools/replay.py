@@ -106,7 +106,7 @@ def changes(log: FlightLog) -> list[str]:
     settings = _settings(log)
     policy, header = policy_fingerprint(settings.policy), {**log.header, **_part("policy", log.header["policy"])}
     now = fingerprint(load_robot(settings.robot)) | _part("policy", policy)
-    now |= {"task": _task(settings), "versions": versions(), "git_commit": git_commit()}
+    now |= _task(settings) | {"versions": versions(), "git_commit": git_commit()}
     names = {
         "robot": "the robot's file",
         "servos": "a servo's file",
@@ -117,6 +117,7 @@ def changes(log: FlightLog) -> list[str]:
         "policy.planner": "the planner's settings",
         "policy.gait": "the gait's settings",
         "task": "the task's settings",
+        "task_files": "a file that the task's settings name",
         "versions": "installed packages",
         "git_commit": "the source",
     }
@@ -128,14 +129,15 @@ def _part(name: str, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _task(settings: Settings) -> dict[str, Any]:
-    """The task as a log's header has it, by the settings' file of today."""
-    from stack.provenance import described
+    """The task as a log's header has it, by the files of today."""
+    from stack.provenance import described, files
     from stack.tasks import load_settings
 
     chosen = {key: value for key, value in settings.set.items() if key != "gain"}  # which is the servos'
     if settings.seconds is not None:
         chosen["seconds"] = repr(settings.seconds)
-    return {"name": settings.task} | described(load_settings(settings.task, chosen))
+    task = load_settings(settings.task, chosen)
+    return {"task": {"name": settings.task} | described(task), "task_files": files(task)}
 
 
 def _settings(log: FlightLog) -> Settings:

@@ -58,3 +58,18 @@ def test_a_run_in_which_no_plan_was_in_time_is_repeated_without_one(tmp_path: Pa
     log = read_log(tmp_path / "a.mcap")
     assert not log.messages["/plan"]
     assert replay(log)[1] is None
+
+
+def test_a_clip_that_is_not_the_one_it_was_is_named(tmp_path: Path) -> None:
+    for name, turn in (("clip", "0.3"), ("other", "-0.3")):
+        turned = {"vx": "0.15", "yaw_rate": turn}
+        run(Settings("walk", policy="gait", seconds=2.0, set=turned, record=tmp_path / f"{name}.mcap"))
+    clip = tmp_path / "clip.mcap"
+    chosen = {"clips": str(clip), "count": "1"}
+    run(Settings("inbetween", policy="gait", set=chosen, record=tmp_path / "a.mcap"))
+    log = read_log(tmp_path / "a.mcap")
+    assert list(log.header["task_files"]) == [str(clip)]
+    assert changes(log) == []
+    assert replay(log)[1] is None
+    clip.write_bytes((tmp_path / "other.mcap").read_bytes())
+    assert changes(log) == ["a file that the task's settings name"]
