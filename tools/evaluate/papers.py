@@ -41,7 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one a core)")
     parser.add_argument("--episodes", type=int, help="episodes of each row (default: its own number, 100 for most)")
     parser.add_argument("--seconds", type=float, help="end each episode then, for a try: figures mean little")
-    parser.add_argument("--minutes", type=float, help="stop after so many; the same command goes on. 0: print what was done")
+    parser.add_argument(
+        "--minutes", type=float, help="stop after so many; the same command goes on. 0: print what was done"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of everything that is random (default: %(default)s)")
     parser.add_argument("--fresh", action="store_true", help="do all episodes anew")
     add_json_argument(parser)
