@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from shipped_runs import drive, walked
 
+from hw.config import CONFIGS
 from hw.robot import load_robot
 from sim.backend import SimBackend
 from stack.session import Settings, run
@@ -35,3 +38,18 @@ def test_it_starts_from_rest_and_walks_ten_seconds_where_it_is_asked(
     went = np.array([*result.trace.displacement[-1][:2], turned])
     for reached, wanted in zip(went, least, strict=True):
         assert reached * np.sign(wanted) >= abs(wanted)
+
+
+@pytest.mark.parametrize(("name", "schedule", "samples"), [("uniphys", "gradual", 3), ("diffuse_cloc", "rolling", 1)])
+def test_it_walks_by_the_settings_of_either_paper(name: str, schedule: str, samples: int) -> None:
+    driven = walked(drive("walk", {"vx": "0.2"}, policy=str(CONFIGS / "policies" / f"{name}.yaml")))
+    assert driven.truth.displacement[-1, 0] > 0.2
+    assert abs(driven.truth.displacement[-1, 1]) < 0.2
+    runtime = driven.planner.runtime
+    assert (runtime.settings.schedule, runtime.samples) == (schedule, samples)
+    assert runtime.cost is not None
+    # With the rolling schedule a plan goes on from the one that runs: told of another, it would be another.
+    last = driven.planner.requests[-1]
+    first = driven.plans[0].plan
+    others = driven.planner.answer(last).actions, driven.planner.answer(replace(last, previous=first)).actions
+    assert np.array_equal(*others) == (schedule != "rolling")

@@ -1,0 +1,132 @@
+"""The planner of the shipped model answers nothing for a second while the robot walks, in the closed loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from shipped_runs import ROBOT
+
+from hw.hal import Mode, Plan, PlanRequest, Trace
+from policy.diffusion.settings import load_settings
+from stack.diffusion_policy import DiffusionPolicy, diffusion_policy
+from stack.loop import TickRecord
+from stack.planner import Planner
+from stack.session import Result, Settings, prepare, run
+from tools.witness import Witness
+
+STALL = 50  # ticks: twice as long as a plan lasts
+PHASES = (100, 103, 106, 109)  # ticks of the task at which it begins: over half a gait cycle, so over all of a step
+SPEED = 0.15  # m/s
+AFTER = 70  # ticks that the run goes on for
+
+
+class Stalled:
+    """A planner that is not ready at the ticks of a stall, like one in a process that does not get its turn."""
+
+    def __init__(self, planner: Planner, first: int) -> None:
+        self._planner, self._stall = planner, range(first, first + STALL)
+        self.policy: DiffusionPolicy
+
+    def reset(self, seed: int) -> None:
+        self._planner.reset(seed)
+
+    def submit(self, request: PlanRequest) -> None:
+        self._planner.submit(request)
+
+    def collect(self, tick: int, wait: bool) -> Plan | None:
+        assert not wait
+        return None if self.policy._tick in self._stall else self._planner.collect(tick, wait)
+
+    def close(self) -> None:
+        self._planner.close()
+
+
+@dataclass(frozen=True)
+class Walk:
+    first: int  # tick of the task at which the stall began
+    result: Result
+    truth: Trace
+    records: list[TickRecord]
+    policy: DiffusionPolicy
+
+    @property
+    def task(self) -> list[TickRecord]:
+        """Records of the task's ticks."""
+        return [record for record in self.records if record.proposal.instruction is not None]
+
+
+def walk(first: int) -> Walk:
+    job = Settings("walk", seconds=(first + STALL + AFTER) * ROBOT.dt, seed=1, set={"vx": str(SPEED)})
+    task, backend = prepare(job)
+    body: Any = backend
+    policy = diffusion_policy(ROBOT, cost=task.cost)
+    stalled = Stalled(policy._planner, first)
+    stalled.policy = policy
+    policy._planner, policy._wait = stalled, False  # as beside the loop
+    witness, records = Witness(body.truth, ROBOT.dt), list[TickRecord]()
+
+    def watch(record: TickRecord) -> None:
+        witness(record)
+        records.append(record)
+
+    return Walk(first, run(job, backend=body, on_tick=watch, policy=policy), witness.trace(), records, policy)
+
+
+@pytest.fixture(scope="module")
+def walks() -> list[Walk]:
+    return [walk(first) for first in PHASES]
+
+
+def test_the_last_plan_runs_out_and_its_last_action_is_held_until_the_next(walks: list[Walk]) -> None:
+    for one in walks:
+        plans = {record.proposal.plan.adopted: record.proposal.plan.plan for record in one.task if record.proposal.plan}
+        last = max(tick for tick in plans if tick < one.first + 2)
+        plan, ends = plans[last], plans[last].tick + len(plans[last].actions)
+        until = min(tick for tick in plans if tick > last)
+        assert one.first + STALL <= until <= one.first + STALL + load_settings().replan
+        wished = np.array([record.proposal.target for record in one.task[last:until]])
+        np.testing.assert_array_equal(wished[: ends - last], plan.actions[last - plan.tick :])
+        np.testing.assert_array_equal(wished[ends - last :], np.tile(plan.actions[-1], (until - ends, 1)))
+        sent = np.array([record.command.position for record in one.task[ends + 5 : until]])
+        assert len(sent) > 15
+        np.testing.assert_array_equal(sent, np.tile(sent[0], (len(sent), 1)))  # and the servos were told so
+        assert all(record.command.mode is Mode.ACTIVE for record in one.task[last:until])
+
+
+def test_events_say_that_a_plan_is_late_and_that_the_last_one_ended_once_each(walks: list[Walk]) -> None:
+    for one in walks:
+        texts = [event.text for event in one.result.events if event.kind == "plan"]
+        assert len(texts) == 2, texts
+        assert "was not ready at" in texts[0]
+        assert "ended before another one came: its last action is held" in texts[1]
+
+
+def test_the_robot_stays_up_while_the_action_is_held(walks: list[Walk]) -> None:
+    """The pose that a plan ends in may be one of a step, which nobody can stand in for long."""
+    upright = [one for one in walks if len(one.task) > one.first + STALL]
+    assert len(upright) == len(walks)
+
+
+def moved(one: Walk) -> float:
+    """How far it came after the stall [m]."""
+    return float(one.truth.displacement[-1, 0] - one.truth.displacement[one.first + STALL, 0])
+
+
+def test_it_walks_on_afterwards_or_the_guard_ends_the_run_damped_and_off(walks: list[Walk]) -> None:
+    """It depends on the foot that it stood on: of a stall in some poses it falls when it wants to walk on."""
+    upright = [one for one in walks if not one.truth.fallen]
+    assert upright
+    for one in walks:
+        assert one.result.trace.fallen == one.truth.fallen  # it knows
+        assert one.records[-1].command.mode is Mode.OFF
+        if one in upright:
+            assert one.result.outcome in ("succeeded", "timed_out")
+            assert moved(one) > 0.3 * SPEED * AFTER * ROBOT.dt
+        else:
+            assert one.result.outcome == "fell"
+            (fall,) = [event for event in one.result.events if event.kind == "fall"]
+            ended = [record.command.mode for record in one.records if record.tick >= fall.tick]
+            assert set(ended[:-1]) == {Mode.DAMP}
