@@ -1,11 +1,13 @@
-"""The phases of a run: home, stand still, do the task, end."""
+"""The phases of a run: home, stand still, do the task, come to rest, end."""
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
 
-from hw.hal import Array, Observation, Percept, Policy, State, Task, Trace
+import numpy as np
+
+from hw.hal import Array, Instruction, Observation, Percept, Policy, State, Task, Trace
 from hw.robot import Robot
 from stack.coast import missing
 from stack.loop import Adopted, Estimator, Proposal
@@ -59,6 +61,8 @@ class Director:
                 self._guard.start()
         elif phase is Phase.RUNNING and state is not None:
             return self._do_task(state)
+        elif phase is Phase.STOPPING and state is not None:
+            return self._come_to_rest(state)
         return Proposal()
 
     def trace(self) -> Trace:
@@ -91,13 +95,26 @@ class Director:
         try:
             target = self._policy.act(state, self._guard.applied, instruction)
         except Exception as error:  # whatever a controller raises, the robot must end safe
-            where = traceback.extract_tb(error.__traceback__)[-1]
-            what = f"{type(error).__name__}: {error} ({where.filename}:{where.lineno})"
-            self._guard.fault("policy", f"the policy failed: {what}")
+            self._guard.fault("policy", _failed(error))
             return shown
+        self._tell()
+        return Proposal(target, instruction, percept, self._adopted())
+
+    def _come_to_rest(self, state: State) -> Proposal:
+        """Ask the policy to stand. No tick of this is the task's."""
+        try:
+            target = self._policy.act(state, self._guard.applied, Instruction(np.zeros(3)))
+        except Exception as error:  # it walked until now: a crouch is better than a robot that goes limp in mid step
+            self._guard.note("policy", _failed(error))
+            self._guard.lower()
+            return Proposal()
+        self._tell()
+        return Proposal(target, plan=self._adopted())
+
+    def _tell(self) -> None:
+        """What the policy wants a person to know, as events."""
         for text in self._policy.take_events() if hasattr(self._policy, "take_events") else ():
             self._guard.note("plan", text)
-        return Proposal(target, instruction, percept, self._adopted())
 
     def _adopted(self) -> Adopted | None:
         """The plan that a planning policy took over at this tick."""
@@ -110,3 +127,8 @@ class Director:
     def _end(self, how: str, text: str) -> None:
         self.ended = how
         self._guard.stop("task", text)
+
+
+def _failed(error: Exception) -> str:
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    return f"the policy failed: {type(error).__name__}: {error} ({where.filename}:{where.lineno})"

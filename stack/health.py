@@ -138,10 +138,10 @@ class Health:
         if len(self._supply) < LOW_TICKS:
             return []
         supply = max(self._supply)
-        found = []
         if limits.voltage is not None and supply < limits.voltage:
             text = f"the supply is down to {supply:.1f} V, {at}: charge the battery"
-            found.append(Finding("lowered", "voltage", text, name))
+            return [Finding("lowered", "voltage", text, name)]  # as strong as it was, like one that is hot
+        found = []
         if limits.derate_voltage is not None:
             span = limits.derate_voltage - (limits.voltage or 0.0)
             if self._weaken(np.full_like(self.factor, _ramp((limits.derate_voltage - supply) / span))):

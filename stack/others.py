@@ -20,7 +20,7 @@ from stack.loop import Loop, TickRecord
 from stack.odometry import load_odometry
 from stack.safety import ENDED, Guard, Phase
 
-_ENDING = {Phase.LOWERING, *ENDED}
+_ENDING = {Phase.STOPPING, Phase.LOWERING, *ENDED}
 _QUIET = {"phase", "task", "first"}  # kinds of events of others that the first robot's log does without
 
 

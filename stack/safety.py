@@ -14,8 +14,9 @@ tests/stack/test_safety.py:
 6. Samples older than `stale` ticks, or that never came, end in FAULT; so do a servo's error and, once the robot was
    brought home, tilt beyond `tilt`.
 7. A stop that leaves time for it (Ctrl-C, the stop button, heat, a low supply, a blocked joint, a full disk, the end of
-   a task) lowers a standing robot first. One that was not brought home, but holds the pose that it was found in, is not
-   lowered: it hangs or lies.
+   a task) lets a walking robot come to rest, for REST_SECONDS at most, and lowers it then: lowered in mid step it often
+   falls. With a joint that is blocked it takes no more steps. One that was not brought home, but holds the pose that it
+   was found in, is not lowered: it hangs or lies.
 8. Gains only go down within a run: below what was asked for where servos get hot, the supply low or a joint blocked.
 
 Homing is the guard's own: from the pose that the robot is in, slowly, to the home pose.
@@ -24,6 +25,7 @@ Homing is the guard's own: from the pose that the robot is in, slowly, to the ho
 from __future__ import annotations
 
 import math
+from collections import deque
 from enum import StrEnum
 
 import numpy as np
@@ -37,8 +39,12 @@ from stack.event import Event
 from stack.health import Health
 from stack.limits import limit
 
+BLOCKED = "overload"  # kind of the event of a joint that pushes against something
 PATIENCE = 3  # targets in a row that may be not finite
+REST_SECONDS = 1.5
 LOWER_SECONDS = 1.5
+# At rest: goals have stayed within so many rad of each other for so many s, more than a foot is up in a step.
+REST_GOALS, REST_WINDOW = 0.05, 0.3
 # Braked before torque goes off, so that the robot settles instead of dropping. What is fatal must be off within 0.5 s:
 # that leaves 0.1 s for torque off to be acknowledged.
 DAMP_SECONDS = 0.4
@@ -53,12 +59,14 @@ class Phase(StrEnum):
     HOMING = "homing"  # going to the home pose
     READY = "ready"  # holding it
     RUNNING = "running"  # following targets
+    STOPPING = "stopping"  # the same, of a policy that is asked to stand
     LOWERING = "lowering"  # going to a crouch, to end
     DAMPED = "damped"  # braking, then torque off
     FAULT = "fault"  # the same, for a reason that a person must look at
 
 
-POWERED = {Phase.HOMING, Phase.READY, Phase.RUNNING, Phase.LOWERING}
+POWERED = {Phase.HOMING, Phase.READY, Phase.RUNNING, Phase.STOPPING, Phase.LOWERING}
+FOLLOWING = {Phase.RUNNING, Phase.STOPPING}
 ENDED = {Phase.DAMPED, Phase.FAULT}
 
 
@@ -94,6 +102,8 @@ class Guard:
         self._events: list[Event] = []
         self._command = self._make(Mode.OFF)
         self._motion: Motion | None = None
+        self._goals: deque[Array] = deque(maxlen=round(REST_WINDOW * robot.rate))  # of the last ticks while stopping
+        self._stopping_ticks = 0
         self._stands = True  # once it is home: so it is upright, and can be lowered
         self._rejected = 0
         self._damped_ticks = 0
@@ -125,16 +135,23 @@ class Guard:
         self._enter(Phase.RUNNING, "running")
 
     def stop(self, kind: str, text: str, joint: str | None = None) -> None:
-        """End in order: lowered if it stands, damped, off. Does nothing when the robot is ending already."""
-        if self.phase in ENDED or self.phase is Phase.LOWERING:
+        """End in order: brought to rest and lowered if it stands, damped, off. Does nothing when it is ending."""
+        if self.phase in {Phase.LOWERING, *ENDED} or (self.phase is Phase.STOPPING and kind != BLOCKED):
             return
         self.cause = self.cause or kind
         self.note(kind, text, joint)
-        if self.phase in {Phase.READY, Phase.RUNNING} and self._stands:
-            self._motion = Motion(self.applied, self.lowest, round(LOWER_SECONDS * self.robot.rate))
-            self._enter(Phase.LOWERING, "lowering")
+        if self.phase is Phase.RUNNING and self._stands and kind != BLOCKED:
+            self._enter(Phase.STOPPING, "coming to rest")
+        elif self.phase in {Phase.READY, *FOLLOWING} and self._stands:
+            self.lower()
         else:  # limp, held or on the way home: the robot may hang or lie, and a crouch would be one more motion
             self._enter(Phase.DAMPED, "damped")
+
+    def lower(self) -> None:
+        """Go to the crouch, as far as that is still to be done: `stop` does, when the robot has come to rest."""
+        if self.phase in {Phase.READY, *FOLLOWING}:
+            self._motion = Motion(self.applied, self.lowest, round(LOWER_SECONDS * self.robot.rate))
+            self._enter(Phase.LOWERING, "lowering")
 
     def fault(self, kind: str, text: str, joint: str | None = None) -> None:
         """End at once: damped, then off."""
@@ -175,13 +192,15 @@ class Guard:
 
         `observation` holds the newest sample of each joint and its age; `state` is read for the tilt alone, and is None
         while there is not a sample of everything yet; `target` `(n_joints,)` rad is what a policy proposes and is
-        looked at only in RUNNING, where None means that it proposes nothing and the goal holds.
+        looked at only in RUNNING and STOPPING, where None means that it proposes nothing and the goal holds.
         """
         if self.phase in POWERED:
             self._check(observation, state)
-        if self.phase is Phase.RUNNING and target is not None:
+        if self.phase is Phase.STOPPING and self._rests():
+            self.lower()
+        if self.phase in FOLLOWING and target is not None:
             self._accept(target)
-        elif self.phase in {Phase.READY, Phase.RUNNING}:
+        elif self.phase in {Phase.READY, *FOLLOWING}:
             self._accepted = (
                 self._tick
             )  # a goal that is held is accepted anew, so that time spent holding earns no leap
@@ -262,6 +281,13 @@ class Guard:
             return
         step = self.robot.limits.homing_speed * self.robot.dt
         self.applied = np.clip(self._motion.next(), self.applied - step, self.applied + step)
+
+    def _rests(self) -> bool:
+        """Whether a robot that is stopping has come to rest, or had its time."""
+        self._stopping_ticks += 1
+        self._goals.append(self.applied)
+        still = len(self._goals) == self._goals.maxlen and float(np.ptp(self._goals, axis=0).max()) < REST_GOALS
+        return still or self._stopping_ticks > REST_SECONDS * self.robot.rate
 
     def _lower_on(self) -> None:
         assert self._motion is not None

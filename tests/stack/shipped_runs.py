@@ -58,8 +58,9 @@ class Driven:
 
     @property
     def plans(self) -> list[Adopted]:
-        """What was adopted, in order."""
-        return [record.proposal.plan for record in self.records if record.proposal.plan is not None]
+        """What was adopted while the task lasted, in order."""
+        seen = [record.proposal for record in self.records if record.proposal.instruction is not None]
+        return [proposal.plan for proposal in seen if proposal.plan is not None]
 
     def told(self) -> set[str]:
         """Kinds of the events until the task was over, but for those of every run."""
@@ -87,6 +88,8 @@ def drive(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("stack.diffusion_policy.InlinePlanner", listening)
         result = run(settings, backend=body, on_tick=watch)
+    for planner in planners:  # what comes after the task is no concern of it: to stand
+        planner.requests = [request for request in planner.requests if request.tick < result.ticks - 1]
     return Driven(result, witness.trace(), records, planners)
 
 

@@ -106,7 +106,7 @@ def test_a_hot_servo_is_softened_alone_then_the_robot_lowered() -> None:
     rig.temperature[KNEE] = 71.0
     assert rig.ticks_until("temperature") <= 10
     assert rig.first("temperature").joint == "l_knee"
-    assert rig.guard.phase is Phase.LOWERING
+    assert rig.guard.phase is Phase.STOPPING
     assert len([event for event in rig.events if event.kind == "derated"]) <= 9, "said once a step, not once a tick"
 
 
@@ -123,7 +123,7 @@ def test_a_low_supply_softens_everything_and_then_lowers_named_with_the_lowest_s
     assert event.joint == "l_knee"
     assert "9.7 V at l_knee" in event.text
     assert "charge the battery" in event.text
-    assert rig.guard.phase is Phase.LOWERING
+    assert rig.guard.phase is Phase.STOPPING
 
 
 def test_a_stumbles_sag_is_no_low_supply() -> None:
@@ -200,11 +200,11 @@ def test_the_stop_button_lowers_and_pressed_again_damps_at_once() -> None:
     rig = Rig().running()
     rig.fault |= STOP_BUTTON
     rig.step()
-    assert rig.guard.phase is Phase.LOWERING
+    assert rig.guard.phase is Phase.STOPPING
     assert rig.guard.cause == "button"
     assert "stop button" in rig.first("button").text
     rig.step(5)
-    assert rig.guard.phase is Phase.LOWERING, "holding it down is not pressing it again"
+    assert rig.guard.phase is Phase.STOPPING, "holding it down is not pressing it again"
     assert len([event for event in rig.events if event.kind == "button"]) == 1
     rig.fault |= STOP_BUTTON_AGAIN
     rig.step()
@@ -227,7 +227,7 @@ def test_an_input_voltage_error_lowers_and_others_damp_each_servo_named() -> Non
     rig = Rig().running()
     rig.fault[3] = INPUT_VOLTAGE
     rig.step()
-    assert rig.guard.phase is Phase.LOWERING
+    assert rig.guard.phase is Phase.STOPPING
     assert "input voltage" in rig.first("voltage").text
     rig.fault[5] = rig.fault[KNEE] = TORQUE_LOST
     rig.step()

@@ -52,21 +52,27 @@ def test_real_time_has_the_same_result(tmp_path):
     assert slow_result.late_p99_ms > 0.0
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_interrupted_while_walking_it_is_lowered_upright_then_off(seed):
+@pytest.mark.parametrize(
+    ("policy", "seed"),
+    [*(("gait", seed) for seed in range(4)), *((name, seed) for name in ("expert", "diffusion") for seed in (0, 1))],
+)
+def test_interrupted_while_walking_it_is_lowered_upright_then_off(policy, seed):
+    """Lowered in mid step, the expert tipped over more often than not."""
     stop = 130 + int(np.random.default_rng(seed).integers(100))
     body = SimBackend(ROBOT, seed=seed)
     lowering, modes = [], []
 
     def watch(record):
         modes.append(record.command.mode)
-        if record.phase is Phase.LOWERING:
+        if record.phase in (Phase.STOPPING, Phase.LOWERING):
             lowering.append((float(body.truth.tilt[0]), float(body.truth.position[0, 2])))
 
     script = Script((Event(stop, 0.0, "interrupt", None, "Ctrl-C"),))
-    settings = Settings("walk", policy="gait", seed=seed, seconds=20.0, set={"vx": "0.1"})
+    speed = "0.1" if policy == "gait" else "0.25"
+    settings = Settings("walk", policy=policy, seed=seed, seconds=20.0, set={"vx": speed})
     result = run(settings, backend=body, on_tick=watch, script=script)
     assert result.outcome == "interrupted"
+    assert max(tilt for tilt, _ in lowering) < np.radians(15)
     assert lowering[-1][0] < np.radians(10)
     assert lowering[-1][1] < 0.75 * ROBOT.standing_height
     assert modes[-1] is Mode.OFF

@@ -66,8 +66,9 @@ def test_it_is_named_within_10_ticks_and_the_robot_lowered(happens: Any, kind: s
     phases = [record.phase for record in records if record.tick >= AT]
     assert [phases[i] for i in np.flatnonzero(np.diff([list(Phase).index(p) for p in phases]))] == [
         Phase.RUNNING,
+        Phase.STOPPING,
         Phase.LOWERING,
-    ], "lowered, then damped"
+    ], "brought to rest, lowered, then damped"
     assert records[-1].command.mode is Mode.OFF
     assert body.torque == (0,) * 20
     assert result.outcome == "stopped"

@@ -71,7 +71,7 @@ def test_standing_for_a_second_succeeds_and_ends_off():
     assert body.closed
     assert policy.closed
     phases = [event.text.split(",")[0] for event in result.events if event.kind == "phase"]
-    assert phases == ["homing", "ready", "running", "lowering", "damped"]
+    assert phases == ["homing", "ready", "running", "coming to rest", "lowering", "damped"]
 
 
 def test_it_homes_slowly_from_where_it_is():
@@ -309,7 +309,7 @@ def test_a_script_repeats_which_plans_came_in_time():
         return [command.position for command in body.sent]
 
     recorded = sent(policy=Planning(late=(8, 20)))
-    in_time = {tick: tick + 2 for tick in range(0, 60, 4) if tick not in (8, 20)}
+    in_time = {tick: tick + 2 for tick in range(0, 200, 4) if tick not in (8, 20)}
     np.testing.assert_array_equal(sent(policy=Planning(), script=Script(plans=in_time)), recorded)
     assert not np.array_equal(sent(policy=Planning()), recorded)
 
