@@ -4,7 +4,8 @@ A plan requested at tick k is adopted at tick k + delay and was made for the act
 late, the last one goes on by its tick index, and no other is asked for. When it comes it is adopted all the same: it
 knows more than the one that runs, though not what ran since it was due. So a machine that is too slow for `delay` walks
 worse, as with a longer delay, and does not stop. A planner that finds no plan, because guidance diverged for one, says
-why: the last plan goes on, and then its last action is held.
+why: the last plan goes on. Where a plan ends before another one comes, the robot goes to the pose that it stands in:
+held in mid step it stays up, but falls when it is to walk on, or to be lowered.
 
 What a plan's actions are is up to the model: joint targets, or latents. A latent is decoded here, at its own tick and
 with the state of that tick. What is asked with a request is in the same terms: targets that ran are encoded with the
@@ -15,7 +16,7 @@ latents, and nobody knows the states yet.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -30,12 +31,14 @@ from policy.diffusion.actions import JOINT_TARGETS, ActionSpace, load_action_spa
 from policy.diffusion.config import check_fit
 from policy.diffusion.features import raw_row
 from policy.diffusion.settings import DiffusionSettings, load_settings
+from stack.min_jerk import MinJerk
 from stack.planner import Answer, InlinePlanner, Planner, ProcessPlanner
 from stack.trim import Trim
 
 if TYPE_CHECKING:
     from policy.diffusion.runtime import Cost, Runtime
 
+_STAND_SECONDS = 0.4  # as long as a step: of 0.8 s robots fell
 _MANY = 25  # late plans in a row after which it is said that the machine is too slow
 
 
@@ -54,16 +57,19 @@ class DiffusionPolicy:
         wait: bool = True,
         trim: Trim | None = None,
         space: ActionSpace = JOINT_TARGETS,
+        stand: Callable[[Array], MinJerk] | None = None,
     ) -> None:
         """`history` is the number of states that a request holds. With `wait` no plan is ever late: for simulation.
 
-        `trim` corrects the velocity that is asked of the planner. `space` is what its plans call actions.
+        `trim` corrects the velocity that is asked of the planner. `space` is what its plans call actions. `stand` is
+        the way from a pose to that of standing, for when a plan has ended; without it the last action is held.
         """
         if not 0 <= delay <= replan:
             raise ValueError(f"delay must be 0 to replan ({replan} ticks), not {delay}")
         self._planner = planner
         self._history, self._replan, self._delay, self._wait, self._trim = history, replan, delay, wait, trim
         self._space = space
+        self._stand = stand
         self._states: deque[Array] = deque(maxlen=history)
         self._applied: deque[Array] = deque(maxlen=history - 1)
         self.only: Mapping[int, int] | None = None  # where a recorded run is repeated: its requests, and when adopted
@@ -78,6 +84,7 @@ class DiffusionPolicy:
         self._states.clear()
         self._applied.clear()
         self._target: Array | None = None  # the last one: what is held where no plan says more
+        self._way: MinJerk | None = None  # to standing
         self._requested: int | None = None  # what the planner is busy with
         self._plan: Plan | None = None  # of that request, where it came before it is to be adopted
         self._late = 0  # plans in a row
@@ -113,11 +120,14 @@ class DiffusionPolicy:
         if self.latest_plan is not None and self._over(tick) and not self._ended:
             self._ended = True
             self._events.append(
-                f"the plan of tick {self.latest_plan.tick} ended before another one came: its last action is held"
+                f"the plan of tick {self.latest_plan.tick} ended before another one came: it comes to a stand"
             )
         self._tick += 1
         if not self._over(tick):
-            self._target = self._space.decode(row, self._action(tick))
+            self._target, self._way = self._space.decode(row, self._action(tick)), None
+        elif self.latest_plan is not None and self._stand is not None:
+            self._way = self._way or self._stand(self._target)
+            self._target = self._way.next()
         return self._target.copy()
 
     def take_events(self) -> tuple[str, ...]:
@@ -206,9 +216,12 @@ def diffusion_policy(
     else:
         planner = InlinePlanner(_build(robot, settings, cost))
     trim = Trim(robot.dt, settings.trim) if settings.trim else None
-    return DiffusionPolicy(
-        planner, config.history, settings.replan, settings.delay, wait=not process, trim=trim, space=space
-    )
+    pace = settings.replan, settings.delay
+
+    def stand(pose: Array) -> MinJerk:
+        return MinJerk(pose, robot.home, round(_STAND_SECONDS * robot.rate))
+
+    return DiffusionPolicy(planner, config.history, *pace, wait=not process, trim=trim, space=space, stand=stand)
 
 
 def _build(robot: Robot, settings: DiffusionSettings, cost: Cost | None) -> Answer:

@@ -38,6 +38,7 @@ from stack.crouch import crouch
 from stack.event import Event
 from stack.health import Health
 from stack.limits import limit
+from stack.min_jerk import PEAK, MinJerk
 
 BLOCKED = "overload"  # kind of the event of a joint that pushes against something
 PATIENCE = 3  # targets in a row that may be not finite
@@ -49,7 +50,6 @@ REST_GOALS, REST_WINDOW = 0.05, 0.3
 # that leaves 0.1 s for torque off to be acknowledged.
 DAMP_SECONDS = 0.4
 HOME_TOLERANCE = 0.35  # rad that a joint may be from home after homing: above any sag under the robot's own weight
-MIN_JERK_PEAK = 1.875  # peak over mean speed of a minimum-jerk motion (Flash and Hogan, 1985)
 
 
 class Phase(StrEnum):
@@ -70,22 +70,6 @@ FOLLOWING = {Phase.RUNNING, Phase.STOPPING}
 ENDED = {Phase.DAMPED, Phase.FAULT}
 
 
-class Motion:
-    """A minimum-jerk motion between two poses, one sample a call."""
-
-    def __init__(self, start: Array, end: Array, ticks: int) -> None:
-        self._start, self._end, self._ticks, self._tick = start, end, max(1, ticks), 0
-
-    @property
-    def done(self) -> bool:
-        return self._tick >= self._ticks
-
-    def next(self) -> Array:
-        self._tick = min(self._tick + 1, self._ticks)
-        s = self._tick / self._ticks
-        return self._start + (self._end - self._start) * (10 * s**3 - 15 * s**4 + 6 * s**5)
-
-
 class Guard:
     """Decides and sends every command. `gain` scales the servos' position gain, 1 being as configured."""
 
@@ -101,7 +85,7 @@ class Guard:
         self._health = Health(robot, self._gain)
         self._events: list[Event] = []
         self._command = self._make(Mode.OFF)
-        self._motion: Motion | None = None
+        self._motion: MinJerk | None = None
         self._goals: deque[Array] = deque(maxlen=round(REST_WINDOW * robot.rate))  # of the last ticks while stopping
         self._stopping_ticks = 0
         self._stands = True  # once it is home: so it is upright, and can be lowered
@@ -119,8 +103,8 @@ class Guard:
         if not self._take(observation):
             return
         distance = float(np.abs(self.robot.home - self.applied).max())
-        seconds = MIN_JERK_PEAK * distance / self.robot.limits.homing_speed
-        self._motion = Motion(self.applied, self.robot.home, math.ceil(seconds * self.robot.rate))
+        seconds = PEAK * distance / self.robot.limits.homing_speed
+        self._motion = MinJerk(self.applied, self.robot.home, math.ceil(seconds * self.robot.rate))
         self._enter(Phase.HOMING, f"homing, {seconds:.1f} s")
 
     def hold(self, observation: Observation) -> None:
@@ -150,7 +134,7 @@ class Guard:
     def lower(self) -> None:
         """Go to the crouch, as far as that is still to be done: `stop` does, when the robot has come to rest."""
         if self.phase in {Phase.READY, *FOLLOWING}:
-            self._motion = Motion(self.applied, self.lowest, round(LOWER_SECONDS * self.robot.rate))
+            self._motion = MinJerk(self.applied, self.lowest, round(LOWER_SECONDS * self.robot.rate))
             self._enter(Phase.LOWERING, "lowering")
 
     def fault(self, kind: str, text: str, joint: str | None = None) -> None:

@@ -22,6 +22,7 @@ from policy.diffusion.features import Normaliser, raw_layout
 from policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 from stack import planner as planner_module
 from stack.diffusion_policy import DiffusionPolicy, diffusion_policy
+from stack.min_jerk import MinJerk
 from stack.planner import InlinePlanner, ProcessPlanner
 from stack.trim import Trim
 
@@ -203,11 +204,23 @@ def test_what_is_asked_is_corrected_and_has_the_name_of_its_correction() -> None
     assert asked.text is None
 
 
+def test_without_a_plan_it_comes_to_a_stand_and_from_there_goes_on_with_the_next() -> None:
+    home = np.full(20, -1.0)
+    policy = DiffusionPolicy(
+        Spy(late={8: 16}), history=4, replan=4, delay=1, stand=lambda pose: MinJerk(pose, home, ticks=4)
+    )
+    targets = run(policy, 32)
+    assert targets[18:20] == [4018, 4019]  # its last actions
+    np.testing.assert_allclose(targets[19:23], -1.0 + 4020.0 * (1.0 - np.array([0.0, 0.103515625, 0.5, 0.896484375])))
+    assert targets[23] == -1.0
+    assert targets[-1] > 8000.0
+
+
 def test_the_last_action_is_held_when_plans_stop_coming_and_it_is_said_once() -> None:
     policy = DiffusionPolicy(Spy(late={8: 100}), history=4, replan=4, delay=1)
     assert run(policy, 24)[18:] == [4018, 4019, 4019, 4019, 4019, 4019]
     ended = [text for text in policy.take_events() if "ended before another one came" in text]
-    assert ended == ["the plan of tick 4 ended before another one came: its last action is held"]
+    assert ended == ["the plan of tick 4 ended before another one came: it comes to a stand"]
 
 
 def test_a_request_holds_the_plan_that_runs() -> None:

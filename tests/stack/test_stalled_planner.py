@@ -80,7 +80,7 @@ def walks() -> list[Walk]:
     return [walk(first) for first in PHASES]
 
 
-def test_the_last_plan_runs_out_and_its_last_action_is_held_until_the_next(walks: list[Walk]) -> None:
+def test_the_last_plan_runs_out_and_the_robot_comes_to_a_stand_until_the_next(walks: list[Walk]) -> None:
     for one in walks:
         plans = {record.proposal.plan.adopted: record.proposal.plan.plan for record in one.task if record.proposal.plan}
         last = max(tick for tick in plans if tick < one.first + 2)
@@ -89,10 +89,14 @@ def test_the_last_plan_runs_out_and_its_last_action_is_held_until_the_next(walks
         assert one.first + STALL <= until <= one.first + STALL + load_settings().replan
         wished = np.array([record.proposal.target for record in one.task[last:until]])
         np.testing.assert_array_equal(wished[: ends - last], plan.actions[last - plan.tick :])
-        np.testing.assert_array_equal(wished[ends - last :], np.tile(plan.actions[-1], (until - ends, 1)))
-        sent = np.array([record.command.position for record in one.task[ends + 5 : until]])
-        assert len(sent) > 15
-        np.testing.assert_array_equal(sent, np.tile(sent[0], (len(sent), 1)))  # and the servos were told so
+        away = np.abs(wished[ends - last - 1 :] - ROBOT.home).max(1)
+        assert away[0] > 0.1  # rad: in mid step
+        assert (np.diff(away) <= 0.0).all()
+        standing = round(0.4 * ROBOT.rate)
+        assert 0 < standing < until - ends
+        np.testing.assert_allclose(
+            wished[ends - last + standing :], ROBOT.home[None].repeat(until - ends - standing, 0)
+        )
         assert all(record.command.mode is Mode.ACTIVE for record in one.task[last:until])
 
 
@@ -101,13 +105,7 @@ def test_events_say_that_a_plan_is_late_and_that_the_last_one_ended_once_each(wa
         texts = [event.text for event in one.result.events if event.kind == "plan"]
         assert len(texts) == 2, texts
         assert "was not ready at" in texts[0]
-        assert "ended before another one came: its last action is held" in texts[1]
-
-
-def test_the_robot_stays_up_while_the_action_is_held(walks: list[Walk]) -> None:
-    """The pose that a plan ends in may be one of a step, which nobody can stand in for long."""
-    upright = [one for one in walks if len(one.task) > one.first + STALL]
-    assert len(upright) == len(walks)
+        assert "ended before another one came: it comes to a stand" in texts[1]
 
 
 def moved(one: Walk) -> float:
@@ -115,18 +113,10 @@ def moved(one: Walk) -> float:
     return float(one.truth.displacement[-1, 0] - one.truth.displacement[one.first + STALL, 0])
 
 
-def test_it_walks_on_afterwards_or_the_guard_ends_the_run_damped_and_off(walks: list[Walk]) -> None:
-    """It depends on the foot that it stood on: of a stall in some poses it falls when it wants to walk on."""
-    upright = [one for one in walks if not one.truth.fallen]
-    assert upright
+def test_it_stays_up_and_walks_on_afterwards(walks: list[Walk]) -> None:
+    """Held in the pose of a step, the robot fell in half of these when it was to walk on."""
     for one in walks:
-        assert one.result.trace.fallen == one.truth.fallen  # it knows
+        assert one.result.outcome in ("succeeded", "timed_out")
+        assert not one.truth.fallen
+        assert moved(one) > 0.3 * SPEED * AFTER * ROBOT.dt
         assert one.records[-1].command.mode is Mode.OFF
-        if one in upright:
-            assert one.result.outcome in ("succeeded", "timed_out")
-            assert moved(one) > 0.3 * SPEED * AFTER * ROBOT.dt
-        else:
-            assert one.result.outcome == "fell"
-            (fall,) = [event for event in one.result.events if event.kind == "fall"]
-            ended = [record.command.mode for record in one.records if record.tick >= fall.tick]
-            assert set(ended[:-1]) == {Mode.DAMP}
