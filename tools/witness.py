@@ -11,6 +11,7 @@ import numpy as np
 
 from hw.hal import Array, Trace, Truth
 from stack.loop import TickRecord
+from stack.safety import Phase
 from tools.motion import Poses
 
 if TYPE_CHECKING:
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
 class Witness:
     """An `on_tick` listener: one row for each tick of the task. `stage` is the scene in play, where there is one.
 
-    In a world of several robots it follows the first; that any of them fell or touched another counts.
+    In a world of several robots it follows the first; that any of them fell or touched another counts. `fell_ending`:
+    whether it fell after the task, while it came to rest or was lowered.
     """
 
     def __init__(self, truth: Truth, dt: float, stage: Stage | None = None) -> None:
@@ -30,11 +32,13 @@ class Witness:
         self._up: list[Array] = []
         self._obstacles: list[Array] = []
         self._robots: list[Array] = []
-        self._fallen = self._touched = False
+        self._fallen = self._touched = self.fell_ending = False
         self.upright = 0  # ticks of the task before the robot had fallen
 
     def __call__(self, record: TickRecord) -> None:
         instruction, truth = record.proposal.instruction, self._truth
+        if record.phase in (Phase.STOPPING, Phase.LOWERING) and not self._fallen:
+            self.fell_ending |= bool(truth.fallen[0])
         if instruction is None:
             return
         self._fallen |= bool(truth.fallen.any())

@@ -26,6 +26,7 @@ from tools.witness import Witness
 
 WORDS = ["walk", "--policy", "gait", "--seconds", "3", "--episodes", "2", "--seed", "3"]
 KEYS = {
+    "fell_ending_rate",
     "task", "policy", "backend", "robot", "randomised", "episodes", "seed", "success_rate", "success_ci95", "fall_rate",
     "mean_seconds", "metrics", "wall_seconds",
 }  # fmt: skip
@@ -87,7 +88,8 @@ def test_an_episode_that_cannot_be_done_does_not_take_the_others_with_it(
             raise BackendError("the rig did not answer")
         done.append(job.seed)
         return {
-            "seed": job.seed, "success": True, "fell": False, "broken_off": False, "seconds": 3.0, "metrics": {},
+            "seed": job.seed, "success": True, "fell": False, "broken_off": False, "fell_ending": False, "seconds": 3.0,
+            "metrics": {},
             "odometry_error_m": 0.01,
         }  # fmt: skip
 
@@ -169,6 +171,7 @@ def test_a_run_that_never_began_is_counted_and_not_a_crash(monkeypatch: pytest.M
             **row,
             "success": True,
             "broken_off": False,
+            "fell_ending": False,
             "metrics": {"distance_m": 2.0},
             "odometry_error_m": 0.02,
             "seconds": 4.0,
@@ -185,18 +188,24 @@ def test_the_witness_sees_the_run_in_the_frame_it_started_in() -> None:
     half = np.pi / 4  # facing along y
     truth = backend.truth
     instruction = SimpleNamespace(velocity=np.array([0.1, 0, 0]))
-    record = SimpleNamespace(proposal=SimpleNamespace(instruction=instruction))
+    record = SimpleNamespace(proposal=SimpleNamespace(instruction=instruction), phase=Phase.RUNNING)
+    ending = [SimpleNamespace(proposal=SimpleNamespace(instruction=None), phase=phase) for phase in Phase]
     truth.qpos[0, :2], truth.qpos[0, 3:7] = (1.0, 2.0), (np.cos(half), 0, 0, np.sin(half))
     witness(record)
     truth.qpos[0, :2] = 1.0, 2.5
     witness(record)
-    witness(SimpleNamespace(proposal=SimpleNamespace(instruction=None)))  # homing is not the task
+    for other in ending:  # homing is not the task, nor is what comes after it
+        witness(other)
     seen = witness.trace()
     np.testing.assert_allclose(seen.displacement[:, :2], [[0, 0], [0.5, 0]], atol=1e-12)
     np.testing.assert_allclose(seen.yaw, 0.0, atol=1e-12)
     assert not seen.fallen
     assert witness.odometry_error(seen) == 0.0
     truth.qpos[0, 2] = 0.1
+    for other in ending:
+        witness(other)
+        assert witness.fell_ending == (other.phase in (Phase.STOPPING, Phase.LOWERING, Phase.DAMPED, Phase.FAULT))
+    assert not witness.trace().fallen  # in the task it had not
     witness(record)
     assert witness.trace().fallen
 
