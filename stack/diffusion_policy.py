@@ -38,7 +38,7 @@ from stack.trim import Trim
 if TYPE_CHECKING:
     from policy.diffusion.runtime import Cost, Runtime
 
-_STAND_SECONDS = 0.4  # as long as a step: of 0.8 s robots fell
+STAND_SECONDS = 0.4  # with 0.8 s some fell
 _MANY = 25  # late plans in a row after which it is said that the machine is too slow
 
 
@@ -110,9 +110,7 @@ class DiffusionPolicy:
             instruction = replace(instruction, velocity=self._trim(state, instruction.velocity))
         self._adopt(tick)
         if tick % self._replan == 0 and len(self._states) == self._history and self._idle(tick):
-            held = self._space.encode(row, self._target)
-            meanwhile = [held if self._over(tick) else self._action(tick + i) for i in range(self._delay)]
-            actions = np.stack([*self._applied, *meanwhile])
+            actions = np.stack([*self._applied, *self._meanwhile(tick, row)])
             states = np.stack(self._states)
             self._planner.submit(PlanRequest(tick, states, actions, instruction, self.latest_plan))
             self._requested, self._plan = tick, None
@@ -120,7 +118,8 @@ class DiffusionPolicy:
         if self.latest_plan is not None and self._over(tick) and not self._ended:
             self._ended = True
             self._events.append(
-                f"the plan of tick {self.latest_plan.tick} ended before another one came: it comes to a stand"
+                f"the plan of tick {self.latest_plan.tick} ended before another one came: "
+                + ("the robot comes to a stand" if self._stand else "its last action is held")
             )
         self._tick += 1
         if not self._over(tick):
@@ -177,6 +176,18 @@ class DiffusionPolicy:
         self.latest_plan, self._ended, self._refused = plan, False, False
         self.adopted.append((requested, tick))
 
+    def _meanwhile(self, tick: int, row: Array) -> list[Array]:
+        """The actions of the next `delay` ticks, as long as no other plan comes."""
+        plan = self.latest_plan
+        says = 0 if plan is None else max(plan.tick + len(plan.actions) - tick, 0)
+        actions = [self._action(tick + ahead) for ahead in range(min(says, self._delay))]
+        if len(actions) < self._delay:
+            last = self._space.decode(row, actions[-1]) if actions else self._target
+            assert last is not None
+            way = self._way or (MinJerk(last, last, 1) if plan is None or self._stand is None else self._stand(last))
+            actions += [self._space.encode(row, way.ahead(1 + n)) for n in range(self._delay - len(actions))]
+        return actions
+
     def _running(self) -> str:
         return "the goal is held" if self.latest_plan is None else f"that of {self.latest_plan.tick} goes on"
 
@@ -219,7 +230,7 @@ def diffusion_policy(
     pace = settings.replan, settings.delay
 
     def stand(pose: Array) -> MinJerk:
-        return MinJerk(pose, robot.home, round(_STAND_SECONDS * robot.rate))
+        return MinJerk(pose, robot.home, round(STAND_SECONDS * robot.rate))
 
     return DiffusionPolicy(planner, config.history, *pace, wait=not process, trim=trim, space=space, stand=stand)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -84,29 +85,26 @@ class Director:
         self._tape.add(state, instruction, percept)
         shown = Proposal(instruction=instruction, percept=percept)
         if self._task.done(state):
-            self._end("done", DONE)
-            return shown
+            return self._end("done", DONE, shown, state)
         if tick * self._robot.dt >= self._task.seconds:
-            self._end("time", f"{self._task.seconds:g} s are over")
-            return shown
+            return self._end("time", f"{self._task.seconds:g} s are over", shown, state)
         velocity = self._task.disturbance(tick)
         if velocity is not None and self._push is not None:
             self._push(velocity)
         try:
             target = self._policy.act(state, self._guard.applied, instruction)
         except Exception as error:  # whatever a controller raises, the robot must end safe
-            self._guard.fault("policy", _failed(error))
+            self._guard.give_up(_failed(error))
             return shown
         self._tell()
         return Proposal(target, instruction, percept, self._adopted())
 
     def _come_to_rest(self, state: State) -> Proposal:
-        """Ask the policy to stand. No tick of this is the task's."""
+        """Ask the policy to stand."""
         try:
             target = self._policy.act(state, self._guard.applied, Instruction(np.zeros(3)))
-        except Exception as error:  # it walked until now: a crouch is better than a robot that goes limp in mid step
-            self._guard.note("policy", _failed(error))
-            self._guard.lower()
+        except Exception as error:
+            self._guard.give_up(_failed(error))
             return Proposal()
         self._tell()
         return Proposal(target, plan=self._adopted())
@@ -124,9 +122,13 @@ class Director:
         self._plans = len(adopted)
         return Adopted(*adopted[-1], self._policy.latest_plan)  # type: ignore[attr-defined]
 
-    def _end(self, how: str, text: str) -> None:
+    def _end(self, how: str, text: str, shown: Proposal, state: State) -> Proposal:
+        """End the task. The policy is asked at this tick too: a walking robot has no time for a tick without."""
         self.ended = how
         self._guard.stop("task", text)
+        if self._guard.phase is not Phase.STOPPING:
+            return shown
+        return replace(self._come_to_rest(state), instruction=shown.instruction, percept=shown.percept)
 
 
 def _failed(error: Exception) -> str:

@@ -49,6 +49,7 @@ class Health:
         self._weak: Array = np.ones(len(servos))  # the part of `factor` that heat and supply account for
         self._blocked = np.zeros(len(servos))  # s
         self._supply: deque[float] = deque(maxlen=LOW_TICKS)  # V, the median of the servos' at the last ticks
+        self._low = False  # whether the supply was ever too low
 
     def examine(self, observation: Observation, state: State | None, applied: Array, *, upright: bool) -> list[Finding]:
         """Everything wrong at this tick, the worst first.
@@ -99,7 +100,7 @@ class Health:
         if pressed & STOP_BUTTON_AGAIN:
             return [Finding("now", "button", "the stop button was pressed twice")]
         if pressed & STOP_BUTTON:
-            return [Finding("lowered", "button", "the stop button was pressed: lowering; once more to damp at once")]
+            return [Finding("lowered", "button", "the stop button was pressed: stopping; once more to damp at once")]
         return []
 
     def _bus(self, observation: Observation) -> list[Finding]:
@@ -138,9 +139,11 @@ class Health:
         if len(self._supply) < LOW_TICKS:
             return []
         supply = max(self._supply)
-        if limits.voltage is not None and supply < limits.voltage:
+        low = limits.voltage is not None and supply < limits.voltage
+        self._low |= low
+        if self._low:  # it keeps its strength from now on: one that goes soft while it is brought to rest would fall
             text = f"the supply is down to {supply:.1f} V, {at}: charge the battery"
-            return [Finding("lowered", "voltage", text, name)]  # as strong as it was, like one that is hot
+            return [Finding("lowered", "voltage", text, name)] if low else []
         found = []
         if limits.derate_voltage is not None:
             span = limits.derate_voltage - (limits.voltage or 0.0)

@@ -11,7 +11,7 @@ from typing import Any
 
 from stack.event import Event
 
-ONCE = "interrupted: lowering; once more for torque off at once"
+ONCE = "interrupted: stopping; once more for torque off at once"
 TWICE = "interrupted twice: torque off at once"
 
 

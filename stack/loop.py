@@ -17,7 +17,7 @@ from stack.safety import Guard, Phase
 
 @dataclass(frozen=True, slots=True)
 class Adopted:
-    """A plan at the tick of its adoption; ticks count from the start of the task."""
+    """A plan at the tick of its adoption; ticks count calls of the policy in this run."""
 
     requested: int
     adopted: int

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hw.hal import Array
 
-PEAK = 1.875  # highest over mean speed
+MIN_JERK_PEAK = 1.875  # highest over mean speed
 
 
 class MinJerk:
@@ -19,5 +19,9 @@ class MinJerk:
 
     def next(self) -> Array:
         self._tick = min(self._tick + 1, self._ticks)
-        s = self._tick / self._ticks
+        return self.ahead(0)
+
+    def ahead(self, ticks: int) -> Array:
+        """Where so many more calls of `next` will be."""
+        s = min(self._tick + ticks, self._ticks) / self._ticks
         return self._start + (self._end - self._start) * (10 * s**3 - 15 * s**4 + 6 * s**5)

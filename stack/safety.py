@@ -38,14 +38,15 @@ from stack.crouch import crouch
 from stack.event import Event
 from stack.health import Health
 from stack.limits import limit
-from stack.min_jerk import PEAK, MinJerk
+from stack.min_jerk import MIN_JERK_PEAK, MinJerk
 
 BLOCKED = "overload"  # kind of the event of a joint that pushes against something
+ASKED = {"interrupt", "button"}  # kinds of what a person does to stop the robot
 PATIENCE = 3  # targets in a row that may be not finite
 REST_SECONDS = 1.5
 LOWER_SECONDS = 1.5
 # At rest: goals have stayed within so many rad of each other for so many s, more than a foot is up in a step.
-REST_GOALS, REST_WINDOW = 0.05, 0.3
+REST_RANGE, REST_WINDOW = 0.05, 0.3
 # Braked before torque goes off, so that the robot settles instead of dropping. What is fatal must be off within 0.5 s:
 # that leaves 0.1 s for torque off to be acknowledged.
 DAMP_SECONDS = 0.4
@@ -86,8 +87,9 @@ class Guard:
         self._events: list[Event] = []
         self._command = self._make(Mode.OFF)
         self._motion: MinJerk | None = None
-        self._goals: deque[Array] = deque(maxlen=round(REST_WINDOW * robot.rate))  # of the last ticks while stopping
-        self._stopping_ticks = 0
+        self._goals: deque[tuple[int, Array]] = deque()  # of the last ticks while stopping
+        self._stopping = 0  # tick at which that began
+        self._again: set[str] = set()  # kinds of the wishes to stop that came while stopping
         self._stands = True  # once it is home: so it is upright, and can be lowered
         self._rejected = 0
         self._damped_ticks = 0
@@ -103,7 +105,7 @@ class Guard:
         if not self._take(observation):
             return
         distance = float(np.abs(self.robot.home - self.applied).max())
-        seconds = PEAK * distance / self.robot.limits.homing_speed
+        seconds = MIN_JERK_PEAK * distance / self.robot.limits.homing_speed
         self._motion = MinJerk(self.applied, self.robot.home, math.ceil(seconds * self.robot.rate))
         self._enter(Phase.HOMING, f"homing, {seconds:.1f} s")
 
@@ -120,22 +122,31 @@ class Guard:
 
     def stop(self, kind: str, text: str, joint: str | None = None) -> None:
         """End in order: brought to rest and lowered if it stands, damped, off. Does nothing when it is ending."""
-        if self.phase in {Phase.LOWERING, *ENDED} or (self.phase is Phase.STOPPING and kind != BLOCKED):
+        if self.phase is Phase.STOPPING and kind != BLOCKED:
+            if kind in ASKED and kind not in self._again:  # a person shall see that it was heard
+                self.note(kind, text)
+            self._again.add(kind)
+            return
+        if self.phase in {Phase.LOWERING, *ENDED}:
             return
         self.cause = self.cause or kind
         self.note(kind, text, joint)
         if self.phase is Phase.RUNNING and self._stands and kind != BLOCKED:
+            self._stopping = self._tick
+            self._again.add(kind)
             self._enter(Phase.STOPPING, "coming to rest")
         elif self.phase in {Phase.READY, *FOLLOWING} and self._stands:
-            self.lower()
+            self._lower()
         else:  # limp, held or on the way home: the robot may hang or lie, and a crouch would be one more motion
             self._enter(Phase.DAMPED, "damped")
 
-    def lower(self) -> None:
-        """Go to the crouch, as far as that is still to be done: `stop` does, when the robot has come to rest."""
-        if self.phase in {Phase.READY, *FOLLOWING}:
-            self._motion = MinJerk(self.applied, self.lowest, round(LOWER_SECONDS * self.robot.rate))
-            self._enter(Phase.LOWERING, "lowering")
+    def give_up(self, text: str, joint: str | None = None) -> None:
+        """Of a policy that fails: damped; but where the robot is coming to rest, do not wait for that and lower it."""
+        if self.phase is Phase.STOPPING:
+            self.note("policy", text, joint)
+            self._lower()
+        else:
+            self.fault("policy", text, joint)
 
     def fault(self, kind: str, text: str, joint: str | None = None) -> None:
         """End at once: damped, then off."""
@@ -181,7 +192,7 @@ class Guard:
         if self.phase in POWERED:
             self._check(observation, state)
         if self.phase is Phase.STOPPING and self._rests():
-            self.lower()
+            self._lower()
         if self.phase in FOLLOWING and target is not None:
             self._accept(target)
         elif self.phase in {Phase.READY, *FOLLOWING}:
@@ -236,7 +247,7 @@ class Guard:
     def _accept(self, target: Array) -> None:
         proposal = np.asarray(target, dtype=float)
         if proposal.shape != self.applied.shape:
-            self.fault("policy", f"a target of shape {proposal.shape}, but the robot has {len(self.applied)} joints")
+            self.give_up(f"a target of shape {proposal.shape}, but the robot has {len(self.applied)} joints")
             return
         bad = np.flatnonzero(~np.isfinite(proposal))
         if bad.size:
@@ -245,7 +256,7 @@ class Guard:
             if self._rejected == 1:
                 self.note("rejected", f"target of {joint} is {proposal[bad[0]]}: the last goal holds", joint)
             if self._rejected >= PATIENCE:
-                self.fault("policy", f"{PATIENCE} targets in a row are not finite, the last for {joint}", joint)
+                self.give_up(f"{PATIENCE} targets in a row are not finite, the last for {joint}", joint)
             return
         self._rejected = 0
         self.applied = limit(proposal, self.applied, self.robot, self._elapsed())
@@ -268,10 +279,18 @@ class Guard:
 
     def _rests(self) -> bool:
         """Whether a robot that is stopping has come to rest, or had its time."""
-        self._stopping_ticks += 1
-        self._goals.append(self.applied)
-        still = len(self._goals) == self._goals.maxlen and float(np.ptp(self._goals, axis=0).max()) < REST_GOALS
-        return still or self._stopping_ticks > REST_SECONDS * self.robot.rate
+        if self._tick - self._stopping >= REST_SECONDS * self.robot.rate:
+            return True
+        window = REST_WINDOW * self.robot.rate
+        self._goals.append((self._tick, self.applied))
+        while len(self._goals) > 1 and self._tick - self._goals[1][0] >= window:
+            self._goals.popleft()
+        goals = [goal for _, goal in self._goals]
+        return self._tick - self._goals[0][0] >= window and float(np.ptp(goals, axis=0).max()) < REST_RANGE
+
+    def _lower(self) -> None:
+        self._motion = MinJerk(self.applied, self.lowest, round(LOWER_SECONDS * self.robot.rate))
+        self._enter(Phase.LOWERING, "lowering")
 
     def _lower_on(self) -> None:
         assert self._motion is not None

@@ -40,7 +40,7 @@ def robots(log: FlightLog) -> Array | None:
 
 
 def plans(log: FlightLog) -> list[DrawnPlan]:
-    """Predicted paths. Their ticks count calls of the policy, one for each tick of the task."""
+    """Predicted paths of the task. Ticks of plans count calls of the policy: one a tick, and some after the task."""
     ticks = task_ticks(log)
     if not log.messages["/plan"]:
         return []
@@ -48,6 +48,8 @@ def plans(log: FlightLog) -> list[DrawnPlan]:
     displacement, yaw = log.column("/state", "displacement"), log.column("/state", "yaw")
     found = []
     for message in log.messages["/plan"]:
+        if message["requested"] >= len(ticks):
+            continue  # to come to rest
         row = at[int(ticks[message["requested"]])]
         c, s = np.cos(yaw[row]), np.sin(yaw[row])
         turn = np.array([[c, -s], [s, c]])

@@ -37,9 +37,10 @@ class Witness:
 
     def __call__(self, record: TickRecord) -> None:
         instruction, truth = record.proposal.instruction, self._truth
-        if record.phase in (Phase.STOPPING, Phase.LOWERING) and not self._fallen:
-            self.fell_ending |= bool(truth.fallen[0])
         if instruction is None:
+            if self._rows and not self._fallen:
+                self.fell_ending |= record.phase in (Phase.STOPPING, Phase.LOWERING) and bool(truth.fallen[0])
+                self.fell_ending |= any(event.kind == "fall" for event in record.events)
             return
         self._fallen |= bool(truth.fallen.any())
         self.upright += not self._fallen

@@ -216,11 +216,24 @@ def test_without_a_plan_it_comes_to_a_stand_and_from_there_goes_on_with_the_next
     assert targets[-1] > 8000.0
 
 
+def test_a_plan_that_is_asked_for_on_the_way_to_a_stand_knows_of_that_way() -> None:
+    home = np.full(20, -1.0)
+    spy = Spy(late={8: 16})
+    policy = DiffusionPolicy(spy, history=4, replan=4, delay=3, stand=lambda pose: MinJerk(pose, home, ticks=40))
+    targets = run(policy, 40)
+    standing = [request for request in spy.requests if request.tick > 20 and targets[request.tick] < 4019.0]
+    assert standing
+    for request in standing:
+        np.testing.assert_allclose(request.actions[-3, 0], targets[request.tick])
+        if targets[request.tick + 2] < targets[request.tick]:  # no other plan has come by then
+            np.testing.assert_allclose(request.actions[-3:, 0], targets[request.tick : request.tick + 3])
+
+
 def test_the_last_action_is_held_when_plans_stop_coming_and_it_is_said_once() -> None:
     policy = DiffusionPolicy(Spy(late={8: 100}), history=4, replan=4, delay=1)
     assert run(policy, 24)[18:] == [4018, 4019, 4019, 4019, 4019, 4019]
     ended = [text for text in policy.take_events() if "ended before another one came" in text]
-    assert ended == ["the plan of tick 4 ended before another one came: it comes to a stand"]
+    assert ended == ["the plan of tick 4 ended before another one came: its last action is held"]
 
 
 def test_a_request_holds_the_plan_that_runs() -> None:

@@ -175,6 +175,27 @@ def test_a_robot_that_is_lowered_for_heat_keeps_its_strength() -> None:
     np.testing.assert_array_equal(rig.gain, 1.0)
 
 
+def test_a_robot_that_is_lowered_for_a_low_supply_keeps_its_strength_though_the_supply_recovers() -> None:
+    """It does when the motors have less to do, and then all gains would go down in the middle of the crouch."""
+    rig = Rig().running()
+    rig.voltage[:] = 9.8
+    rig.ticks_until("voltage")
+    rig.voltage[:] = 10.2
+    rig.step(30)
+    assert rig.guard.phase is Phase.LOWERING
+    np.testing.assert_array_equal(rig.gain, 1.0)
+
+
+def test_a_joint_that_is_blocked_while_the_robot_comes_to_rest_has_it_lowered_at_once() -> None:
+    rig = Rig().running()
+    rig.stuck[KNEE] = ROBOT.home[KNEE] - 0.5
+    rig.ticks_until("derated")
+    rig.guard.stop("interrupt", "Ctrl-C")
+    assert rig.guard.phase is Phase.STOPPING
+    rig.ticks_until("overload")
+    assert rig.guard.phase is Phase.LOWERING
+
+
 @pytest.mark.parametrize("case", ["sagging", "moving", "for a moment", "soft gains", "hot"])
 def test_work_is_not_taken_for_a_block(case: str) -> None:
     rig = Rig(gain=0.4 if case == "soft gains" else 1.0).running()

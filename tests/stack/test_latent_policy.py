@@ -83,7 +83,7 @@ def test_the_last_target_is_held_when_a_plan_has_run_out() -> None:
     assert targets[12:] == pytest.approx([4012] * 13, rel=1e-6)
     assert spy.requests[-1].tick == 24
     np.testing.assert_allclose(spy.requests[-1].actions[-1, 0], 4012 - 24, atol=0.01)
-    assert any("it comes to a stand" in event for event in of.take_events())
+    assert any("its last action is held" in event for event in of.take_events())
 
 
 def latents() -> LatentActions:

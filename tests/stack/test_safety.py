@@ -343,6 +343,39 @@ def test_7_a_blocked_joint_takes_no_step_more():
         assert rig.guard.phase is Phase.LOWERING
 
 
+def test_7_time_to_rest_is_time_and_not_decisions():
+    """A slow policy lets ticks pass."""
+    rig = Rig().running()
+    rig.guard.stop("interrupt", "Ctrl-C")
+    began = rig.tick
+    while rig.guard.phase is not Phase.LOWERING:
+        rig.step(steps(rig.tick), ticks=3)
+    assert (rig.tick - began) * ROBOT.dt <= REST_SECONDS + 3 * ROBOT.dt
+
+
+def test_7_a_policy_that_fails_while_it_stops_has_the_robot_lowered_and_not_dropped():
+    for broken in (np.full(N, np.nan), np.zeros(N + 1)):
+        rig = Rig().running()
+        rig.guard.stop("interrupt", "Ctrl-C")
+        for _ in range(PATIENCE):
+            rig.step(broken)
+        assert rig.guard.phase is Phase.LOWERING
+        assert rig.guard.cause == "interrupt"
+        assert "policy" in rig.kinds()
+
+
+def test_7_a_person_who_stops_what_is_stopping_is_told_once_that_it_was_heard():
+    rig = Rig().running()
+    rig.guard.stop("task", "done")
+    for _ in range(3):
+        rig.guard.stop("button", "the stop button was pressed")
+        rig.guard.stop("temperature", "hot")
+    rig.step()
+    assert rig.kinds().count("button") == 1
+    assert rig.kinds().count("temperature") == 0
+    assert rig.guard.cause == "task"
+
+
 @pytest.mark.parametrize("phase", [Phase.STOPPING, Phase.LOWERING])
 def test_7_a_fall_while_stopping_or_lowering_damps(phase):
     rig = Rig().running()

@@ -74,6 +74,32 @@ def test_standing_for_a_second_succeeds_and_ends_off():
     assert phases == ["homing", "ready", "running", "coming to rest", "lowering", "damped"]
 
 
+def test_after_the_task_a_policy_is_asked_to_stand_and_one_that_fails_then_is_lowered():
+    class Last(Still):
+        def __init__(self, fails):
+            super().__init__()
+            self.fails, self.asked = fails, []
+
+        def act(self, state, applied, instruction):
+            self.asked.append(instruction)
+            if self.fails and len(self.asked) == 55:
+                raise RuntimeError("worn out")
+            return super().act(state, applied, instruction)
+
+    for fails in (False, True):
+        result, body, policy = stand(policy=Last(fails))
+        assert result.outcome == "succeeded"
+        assert result.ticks == 51
+        rest = policy.asked[50:]  # at the task's last tick already: no tick passes without a target
+        assert len(rest) == 5 if fails else len(rest) >= 15
+        assert all(not one.velocity.any() and one.goal is None and one.text is None for one in rest)
+        phases = [event.text for event in result.events if event.kind == "phase"]
+        assert phases[-3:] == ["coming to rest", "lowering", "damped"]
+        failures = [event.text for event in result.events if event.kind == "policy"]
+        assert len(failures) == fails
+        assert body.sent[-1].mode is Mode.OFF
+
+
 def test_it_homes_slowly_from_where_it_is():
     body = Simulated(ROBOT, ROBOT.home + 0.4)
     result, _, _ = stand(body)

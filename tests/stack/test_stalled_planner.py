@@ -11,7 +11,7 @@ from shipped_runs import ROBOT
 
 from hw.hal import Mode, Plan, PlanRequest, Trace
 from policy.diffusion.settings import load_settings
-from stack.diffusion_policy import DiffusionPolicy, diffusion_policy
+from stack.diffusion_policy import STAND_SECONDS, DiffusionPolicy, diffusion_policy
 from stack.loop import TickRecord
 from stack.planner import Planner
 from stack.session import Result, Settings, prepare, run
@@ -92,7 +92,7 @@ def test_the_last_plan_runs_out_and_the_robot_comes_to_a_stand_until_the_next(wa
         away = np.abs(wished[ends - last - 1 :] - ROBOT.home).max(1)
         assert away[0] > 0.1  # rad: in mid step
         assert (np.diff(away) <= 0.0).all()
-        standing = round(0.4 * ROBOT.rate)
+        standing = round(STAND_SECONDS * ROBOT.rate)
         assert 0 < standing < until - ends
         np.testing.assert_allclose(
             wished[ends - last + standing :], ROBOT.home[None].repeat(until - ends - standing, 0)
@@ -105,7 +105,7 @@ def test_events_say_that_a_plan_is_late_and_that_the_last_one_ended_once_each(wa
         texts = [event.text for event in one.result.events if event.kind == "plan"]
         assert len(texts) == 2, texts
         assert "was not ready at" in texts[0]
-        assert "ended before another one came: it comes to a stand" in texts[1]
+        assert "ended before another one came: the robot comes to a stand" in texts[1]
 
 
 def moved(one: Walk) -> float:

@@ -19,7 +19,10 @@ def test_a_plan_starts_where_it_was_requested_and_points_along_the_heading():
         if tick >= 4:  # the task begins at tick 4 of the run
             messages["/instruction"].append({"tick": tick, "place": pack([1.0, 2.0], "<f4")})
     path = pack([[0.0, 0.0], [0.5, 0.0]], "<f4")  # half a metre ahead
-    messages["/plan"] = [{"tick": 8, "requested": 2, "adopted": 4, "path": path}]
+    messages["/plan"] = [
+        {"tick": 8, "requested": 2, "adopted": 4, "path": path},
+        {"tick": 12, "requested": 6, "adopted": 8, "path": path},  # after the task, to come to rest
+    ]
     log = FlightLog(Path("a.mcap"), {}, messages, complete=True)
     (plan,) = flightpath.plans(log)
     assert plan.adopted == 8

@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 
 from hw.config import ConfigError
+from stack.event import Event
 from stack.flightlog import read_log
 from stack.policies import policy_fingerprint
 from stack.session import Script, Settings, run
+from tools.flightpath import plans
 from tools.replay import changes, replay
 
 
@@ -73,3 +75,15 @@ def test_a_clip_that_is_not_the_one_it_was_is_named(tmp_path: Path) -> None:
     assert replay(log)[1] is None
     clip.write_bytes((tmp_path / "other.mcap").read_bytes())
     assert changes(log) == ["a file that the task's settings name"]
+
+
+def test_a_walk_that_is_stopped_in_mid_step_is_repeated_and_drawn(tmp_path: Path) -> None:
+    """The planner goes on until the robot has come to rest, after the last tick of the task."""
+    chosen = Settings("walk", seconds=9.0, set={"vx": "0.2"}, record=tmp_path / "a.mcap")
+    stopped = run(chosen, script=Script((Event(200, 0.0, "interrupt", None, "Ctrl-C"),)))
+    assert stopped.outcome == "interrupted"
+    log = read_log(tmp_path / "a.mcap")
+    task = len(log.messages["/instruction"])
+    assert log.messages["/plan"][-1]["requested"] >= task
+    assert replay(log)[1] is None
+    assert 0 < len(plans(log)) < len(log.messages["/plan"])

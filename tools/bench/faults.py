@@ -18,7 +18,14 @@ from tools import exit_codes
 from tools.output import Report, add_json_argument, reporting
 from tools.run import positive
 
-QUICK = ("drop", "corrupt", "dead", "overheating", "vanish")  # kinds of a quick campaign: one of each outcome and port
+QUICK = (
+    "drop",
+    "corrupt",
+    "dead",
+    "overheating",
+    "button",
+    "vanish",
+)  # kinds of a quick campaign: one of each outcome and port
 TRIAL_SECONDS = 120.0  # after which a trial hangs: it takes 1 to 2 on a core of its own
 
 

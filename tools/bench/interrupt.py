@@ -1,8 +1,8 @@
 """Interrupt runs (Ctrl-C) at random instants, on virtual rigs in real time, and see that torque is off afterwards.
 
 An instant is any from the first byte on the bus: while connecting, homing, standing, walking. Every fourth run gets a
-second Ctrl-C while it is being lowered. All servos must have said that torque is off, or the run ends with another exit
-code; and the rig must agree.
+second Ctrl-C while it comes to rest, is lowered or damped. All servos must have said that torque is off, or the run ends
+with another exit code; and the rig must agree.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from typing import Any
 
 from hw.config import ConfigError
 from hw.hal import BackendError
+from stack.safety import DAMP_SECONDS, LOWER_SECONDS, REST_SECONDS
 from tools import exit_codes
 from tools.output import Report, add_json_argument, reporting
 
 SPAN_SECONDS = 6.0  # of a run in which the instants lie
 AGAIN = 4  # one run in so many is interrupted twice
-AGAIN_SECONDS = 2.0
+AGAIN_SECONDS = REST_SECONDS + LOWER_SECONDS + DAMP_SECONDS
 TRIES = 10  # for a run that goes on until then: on a machine that is too busy the guard stops it before
 
 

@@ -20,7 +20,7 @@ from sim.rig.local import LocalBackend
 from sim.rig.rig import Rig
 from stack.event import Event
 from stack.loop import TickRecord
-from stack.safety import LOWER_SECONDS, Phase
+from stack.safety import LOWER_SECONDS, REST_SECONDS, Phase
 from stack.session import Settings, run
 
 DETECTION_TICKS = 10  # within which a fault that is not absorbed must be named
@@ -205,7 +205,7 @@ def _judge(verdict: Verdict, robot: Robot, body: Witnessed, watch: _Watch, outco
         verdict.problems.append(f"still driven at the end: {', '.join(body.later)}")
     if verdict.ended == "damped" and named_ns is not None:
         verdict.off_seconds = _off_seconds(body.accepted, named_ns)
-        latest = OFF_SECONDS + (LOWER_SECONDS if in_order else 0.0)
+        latest = OFF_SECONDS + (REST_SECONDS + LOWER_SECONDS if in_order else 0.0)
         if verdict.off_seconds is not None and verdict.off_seconds > latest:
             verdict.problems.append(f"torque off {verdict.off_seconds:.2f} s after it was named")
 
