@@ -1,8 +1,8 @@
 """Interrupt runs (Ctrl-C) at random instants, on virtual rigs in real time, and see that torque is off afterwards.
 
 An instant is any from the first byte on the bus: while connecting, homing, standing, walking. Every fourth run gets a
-second Ctrl-C while it comes to rest, is lowered or damped. All servos must have said that torque is off, or the run ends
-with another exit code; and the rig must agree.
+second Ctrl-C while it comes to rest, is lowered or damped. All servos must have said that torque is off, or the run
+ends with another exit code; and the rig must agree.
 """
 
 from __future__ import annotations
