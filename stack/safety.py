@@ -1,7 +1,7 @@
 """The guard: the only holder of the motors.
 
-Everything else proposes targets; what reaches a servo is decided here. Its invariants, each of which is a test in
-tests/stack/test_safety.py:
+Everything else proposes targets; what reaches a servo is decided here. Its invariants, each of which has its tests in
+tests/stack/test_safety*.py:
 
 1. A position that is sent ACTIVE is finite and inside the joint's range less the margin, or on its way there from a
    measured pose that was outside.

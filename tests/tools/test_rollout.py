@@ -189,25 +189,41 @@ def test_the_witness_sees_the_run_in_the_frame_it_started_in() -> None:
     truth = backend.truth
     instruction = SimpleNamespace(velocity=np.array([0.1, 0, 0]))
     record = SimpleNamespace(proposal=SimpleNamespace(instruction=instruction), phase=Phase.RUNNING)
-    ending = [SimpleNamespace(proposal=SimpleNamespace(instruction=None), phase=phase) for phase in Phase]
+    nothing = SimpleNamespace(instruction=None)
     truth.qpos[0, :2], truth.qpos[0, 3:7] = (1.0, 2.0), (np.cos(half), 0, 0, np.sin(half))
     witness(record)
     truth.qpos[0, :2] = 1.0, 2.5
     witness(record)
-    for other in ending:  # homing is not the task, nor is what comes after it
-        witness(other)
+    witness(SimpleNamespace(proposal=nothing, phase=Phase.HOMING, events=()))  # which is not the task
     seen = witness.trace()
     np.testing.assert_allclose(seen.displacement[:, :2], [[0, 0], [0.5, 0]], atol=1e-12)
     np.testing.assert_allclose(seen.yaw, 0.0, atol=1e-12)
     assert not seen.fallen
     assert witness.odometry_error(seen) == 0.0
     truth.qpos[0, 2] = 0.1
-    for other in ending:
-        witness(other)
-        assert witness.fell_ending == (other.phase in (Phase.STOPPING, Phase.LOWERING, Phase.DAMPED, Phase.FAULT))
-    assert not witness.trace().fallen  # in the task it had not
     witness(record)
     assert witness.trace().fallen
+
+
+@pytest.mark.parametrize(
+    ("phase", "kinds", "counts"),
+    [
+        (Phase.READY, (), False),
+        (Phase.STOPPING, (), True),
+        (Phase.LOWERING, (), True),
+        (Phase.DAMPED, (), False),  # it lies down then
+        (Phase.FAULT, ("fall",), True),  # the guard saw it first
+    ],
+)
+def test_a_fall_after_the_task_is_one_while_ending(phase: Phase, kinds: tuple[str, ...], counts: bool) -> None:
+    backend = SimBackend(load_robot(), seed=1)
+    witness = Witness(backend.truth, 0.02)
+    asked, nothing = (SimpleNamespace(instruction=i) for i in (SimpleNamespace(velocity=np.zeros(3)), None))
+    witness(SimpleNamespace(proposal=asked, phase=Phase.RUNNING))
+    backend.truth.qpos[0, 2] = 0.1
+    witness(SimpleNamespace(proposal=nothing, phase=phase, events=[SimpleNamespace(kind=kind) for kind in kinds]))
+    assert witness.fell_ending == counts
+    assert not witness.trace().fallen
 
 
 @pytest.mark.parametrize(
