@@ -24,6 +24,7 @@ BLOCKED_SECONDS = 0.5  # at full output without moving: a servo shuts itself dow
 SOFT_SECONDS = 0.25  # the same, until its gain goes down
 FULL = 0.9  # of the position error that saturates a servo's output
 STILL = 0.05  # of the no-load speed
+BLOCKED = "overload"  # kind of the event of a joint that pushes against something
 
 
 class Finding(NamedTuple):
@@ -168,7 +169,7 @@ class Health:
             found.append(Finding("", "derated", text, self._names[i]))
         for i in np.flatnonzero(self._blocked > BLOCKED_SECONDS).tolist():
             text = f"{self._names[i]} pushes with all it has and does not move: is it blocked?"
-            found.append(Finding("lowered", "overload", text, self._names[i]))
+            found.append(Finding("lowered", BLOCKED, text, self._names[i]))
         return found
 
     def _weaken(self, factor: Array) -> list[int]:

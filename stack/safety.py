@@ -36,11 +36,10 @@ from hw.robot import Robot
 from stack.coast import missing
 from stack.crouch import crouch
 from stack.event import Event
-from stack.health import Health
+from stack.health import BLOCKED, Health
 from stack.limits import limit
 from stack.min_jerk import MIN_JERK_PEAK, MinJerk
 
-BLOCKED = "overload"  # kind of the event of a joint that pushes against something
 ASKED = {"interrupt", "button"}  # kinds of what a person does to stop the robot
 PATIENCE = 3  # targets in a row that may be not finite
 REST_SECONDS = 1.5

@@ -10,7 +10,8 @@ from fake_body import tilted
 from test_safety import ROBOT, N, Rig
 
 from hw.hal import Mode
-from stack.safety import BLOCKED, PATIENCE, REST_SECONDS, REST_WINDOW, Phase
+from stack.health import BLOCKED
+from stack.safety import PATIENCE, REST_SECONDS, REST_WINDOW, Phase
 
 
 def test_heat_lowers_before_it_damps():
