@@ -110,6 +110,7 @@ class Keyboard:
         self._before: Any = termios.tcgetattr(self._fd)
         atexit.register(self.close)  # however the program ends: a terminal that does not echo is a nuisance
         tty.setcbreak(self._fd)  # Ctrl-C still interrupts
+        termios.tcflush(self._fd, termios.TCIFLUSH)  # keys that were meant for something else
         self._way, self._ends = np.zeros(3), False
         print(KEYS_HELP, file=sys.stderr, flush=True)
 

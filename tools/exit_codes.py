@@ -40,7 +40,7 @@ def exit_code(error: BaseException) -> int:
 def explain(error: BaseException) -> str:
     """One line about an exception, for the person who typed the command."""
     if isinstance(error, KeyboardInterrupt):
-        return "interrupted"
+        return str(error) or "interrupted"
     text = " ".join(str(error).split())
     if isinstance(error, ConfigError | BackendError):
         return text

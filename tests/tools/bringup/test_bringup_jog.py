@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import termios
 import threading
 import time
 from dataclasses import replace
@@ -108,11 +109,11 @@ def test_a_held_key_moves_and_letting_go_stops(
 ) -> None:
     """On a terminal, with keys that repeat as a held one does, then silence, then the other way, then q."""
     master, slave = os.openpty()
-    ready = threading.Event()
+    over = threading.Event()
 
     def person() -> None:
-        ready.wait()
-        time.sleep(1.0)
+        while termios.tcgetattr(slave)[3] & termios.ICANON and not over.wait(0.1):
+            pass  # until keys are read one by one
         for key, count in ((b"\x1b[C", 30), (b"", 40), (b"\x1b[D", 15), (b"", 40)):
             for _ in range(count):
                 os.write(master, key)
@@ -126,17 +127,13 @@ def test_a_held_key_moves_and_letting_go_stops(
         def fileno(self) -> int:
             return slave
 
-        def readline(self) -> str:
-            ready.set()
-            return "\n"
-
     monkeypatch.setattr("sys.stdin", Terminal())
     hands = threading.Thread(target=person)
     hands.start()
     try:
-        code = main(["bringup", "jog", "l_knee", *VIRTUAL])
+        code = main(["bringup", "jog", "l_knee", *VIRTUAL, "--start"])
     finally:
-        ready.set()
+        over.set()
         hands.join()
         os.close(master)
         os.close(slave)
