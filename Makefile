@@ -1,4 +1,5 @@
 # make demo: install, then walk to a goal.   make test: install what tests need, then run all of them.
+# make quick: the tests that take less than some seconds each.
 # make clean: remove the environment and caches; what was recorded and trained under runs/ stays.   PYTHON=... chooses the interpreter (3.11 or newer).
 
 PYTHON ?= $(shell for p in python3.11 python3; do $$p -c '' 2>/dev/null && echo $$p && break; done)
@@ -6,7 +7,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test clean
+.PHONY: demo test quick clean
 
 demo: $(VENV)/.installed-demo
 	mkdir -p runs && rm -f runs/demo.mcap runs/demo.mp4 runs/demo.png
@@ -16,6 +17,9 @@ test: $(VENV)/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/pytest
+
+quick: $(VENV)/.installed-test
+	$(BIN)/pytest -m "not slow"
 
 # A stamp is newer than pyproject.toml once its packages are installed, so that nothing is installed twice.
 $(VENV)/.installed-demo: pyproject.toml | $(BIN)/python

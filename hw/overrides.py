@@ -10,7 +10,7 @@ from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hw.config import ConfigError, nearest, parse_number
+from servoid.hw.config import ConfigError, nearest, parse_number
 
 T = TypeVar("T")
 

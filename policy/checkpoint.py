@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from hw.config import ConfigError
-from hw.hal import Array
-from hw.robot import Robot
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
 
 CHECKPOINTS = Path(__file__).resolve().parent / "checkpoints"
 FORMAT = 1  # raised when an older program could not read the header any more

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from hw.hal import Array
-from hw.robot import Robot
-from policy import checkpoint
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
+from servoid.policy import checkpoint
 
 
 class Mlp:

@@ -9,12 +9,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hw.hal import Array, Command, Mode, Observation, Percept, Scene, State, World
-from hw.robot import Robot
-from sim.model import build
-from sim.scene import Stage, count_robots
-from sim.truth import Truth
-from sim.worlds import Worlds
+from servoid.hw.contracts.body import Array, Command, Mode, Observation
+from servoid.hw.contracts.control import State
+from servoid.hw.contracts.world import Percept, Scene, World
+from servoid.hw.robot.description import Robot
+from servoid.sim.model import build
+from servoid.sim.scene import Stage, count_robots
+from servoid.sim.truth import Truth
+from servoid.sim.worlds import Worlds
 
 OTHERS_STREAM = 2  # distinguishes the other robots' random streams from others of the same seed; 1 is the task's
 
@@ -71,7 +73,7 @@ class SimBackend:
         self._worlds.push(changes)
 
     def look(self, state: State) -> Percept:
-        """What the robot sees of the scene (see `hw.hal.Surroundings`)."""
+        """What the robot sees of the scene (see `servoid.hw.contracts.world.Surroundings`)."""
         assert self.stage is not None, "there is no scene"
         return self.stage.look(state)
 
@@ -100,7 +102,7 @@ class OtherBody:
         return SimSensors(self._world._worlds, self._number), SimMotors(self._world, self._number)
 
     def look(self, state: State) -> Percept:
-        """What it sees of the scene (see `hw.hal.Surroundings`)."""
+        """What it sees of the scene (see `servoid.hw.contracts.world.Surroundings`)."""
         return self._stage.look(state)
 
     def close(self) -> None:

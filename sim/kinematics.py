@@ -5,9 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from hw.hal import Array
-from hw.robot import Robot
-from sim.model import build
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
+from servoid.sim.model import build
 
 
 def joint_places(robot: Robot, joints: Array) -> Array:

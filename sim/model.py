@@ -7,11 +7,11 @@ from pathlib import Path
 
 import mujoco
 
-from hw.config import ConfigError
-from hw.hal import Scene
-from hw.robot import Robot, Servo
-from sim.crowd import add_others, prefix
-from sim.scene import FOUND, PREFIX, add_scene, count_robots
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.world import Scene
+from servoid.hw.robot.description import Robot, Servo
+from servoid.sim.multi_robot import add_others, prefix
+from servoid.sim.scene import FOUND, PREFIX, add_scene, count_robots
 
 TIMESTEP = 0.004  # s
 _FORCE, _NET = 2, 3  # data bit beside FOUND, and reduction, of MuJoCo's contact sensor

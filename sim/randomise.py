@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.hal import Array
-from hw.robot import Robot
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
 
 # Ranges of the randomised robot. Where a nominal value follows, they are those of an XM430-W350 and of the IMU of an
 # OP3-class robot: another one's range is as much wider or narrower as its own value is greater or smaller.

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from hw.hal import Array
-from hw.robot import Robot
-from sim.crowd import prefix
-from sim.model import spec
-from sim.scene import PILLAR_COLOUR, PILLAR_HEIGHT, SPHERE_COLOUR
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
+from servoid.sim.model import spec
+from servoid.sim.multi_robot import prefix
+from servoid.sim.scene import PILLAR_COLOUR, PILLAR_HEIGHT, SPHERE_COLOUR
 
 AZIMUTH, ELEVATION, DISTANCE = 140.0, -20.0, 1.3  # degrees and m, of the camera that follows the robot
 ABOVE, ROOM = -40.0, 0.8  # degrees, and m for each m between robots, of the camera that shows several of them

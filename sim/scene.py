@@ -8,8 +8,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hw.hal import Array, Percept, Scene, State, Truth
-from sim.crowd import prefix
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import State
+from servoid.hw.contracts.world import Percept, Scene, Truth
+from servoid.sim.multi_robot import prefix
 
 PREFIX = "scene/"  # of the names of a scene's bodies, which follow the robot's
 PILLAR_HEIGHT = 0.4  # m: taller than the robot's shoulders

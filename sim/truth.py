@@ -5,9 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from hw.hal import Array
-from hw.robot import Robot
-from sim.scene import scene_sensors
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
+from servoid.sim.scene import scene_sensors
 
 FALL_HEIGHT = 0.6  # of the standing height
 FALL_TILT = np.deg2rad(60.0)

@@ -12,15 +12,15 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from hw.config import ConfigError
-from hw.hal import Array, Command, Mode, Observation
-from hw.legs import Legs
-from hw.robot import Imu, Robot
-from sim.crowd import Crowd
-from sim.model import TIMESTEP, build
-from sim.randomise import Body, draw, longest
-from sim.scene import robot_bodies
-from sim.truth import Truth
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array, Command, Mode, Observation
+from servoid.hw.robot.description import Imu, Robot
+from servoid.hw.robot.legs import Legs
+from servoid.sim.model import TIMESTEP, build
+from servoid.sim.multi_robot import Crowd
+from servoid.sim.randomise import Body, draw, longest
+from servoid.sim.scene import robot_bodies
+from servoid.sim.truth import Truth
 
 NOISE_ROWS = 64  # ticks of sensor noise drawn at a time
 VELOCITY_NOISE = 0.02  # rad/s, standard deviation, before quantisation

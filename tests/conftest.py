@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from synthetic_recording import write_dataset
 
-from hw.robot import load_robot
+from servoid.hw.robot.description import load_robot
 
 
 @pytest.fixture(scope="session")

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hw.config import ConfigError
-from hw.robot import Imu, Joint, Limits, Link, Robot, load_robot
-from policy.checkpoint import REQUIRED
-from policy.diffusion.features import raw_layout
-from sim.model import build
-from sim.worlds import Worlds
-from stack.logformat import SCHEMAS
-from tools.collect import _features
+from servoid.hw.config import ConfigError
+from servoid.hw.robot.description import Imu, Joint, Limits, Link, Robot, load_robot
+from servoid.policy.checkpoint import REQUIRED
+from servoid.policy.diffusion.features import raw_layout
+from servoid.sim.model import build
+from servoid.sim.worlds import Worlds
+from servoid.stack.log.format import SCHEMAS
+from servoid.tools.learn.collect import _features
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = (ROOT / "docs" / "own-robot.md").read_text()

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from hw.config import ConfigError
-from stack import tasks
-from stack.backends import BACKENDS
-from stack.policies import POLICIES
-from tools.cli import VERBS, Verb, main
-from tools.parser import Parser, settings
+from servoid.hw.config import ConfigError
+from servoid.stack import tasks
+from servoid.stack.control.policies import POLICIES
+from servoid.stack.runtime.backends import BACKENDS
+from servoid.tools.cli import VERBS, Verb, main
+from servoid.tools.common.parser import Parser, settings
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
@@ -65,7 +65,7 @@ def look_up(args: Namespace, verb: Verb) -> None:
         given = settings(args) if hasattr(args, "set") else {}
         given.pop("gain", None)  # the run's own, not the task's
         tasks.load_settings(task, given)
-    if verb.module in ("tools.run", "tools.rollout"):
+    if verb.module in ("servoid.tools.commands.run", "servoid.tools.commands.rollout"):
         assert args.policy in POLICIES
         assert args.backend in BACKENDS
 

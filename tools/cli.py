@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from types import ModuleType
 
-from tools import exit_codes
-from tools.parser import Parser, suggestion
+from servoid.tools.common import exit_codes
+from servoid.tools.common.parser import Parser, suggestion
 
 
 @dataclass(frozen=True)
@@ -27,57 +27,59 @@ class Verb:
 
 
 VERBS: dict[str, Verb] = {
-    "tasks": Verb("list what can be run, with settings", "tools.tasks"),
-    "doctor": Verb("check whether this machine is ready", "tools.doctor"),
-    "run": Verb("run a task on a robot", "tools.run"),
-    "rollout": Verb("run a task many times in simulation and measure it", "tools.rollout"),
-    "virtual": Verb("serve a virtual rig on a serial port", "tools.virtual"),
+    "tasks": Verb("list what can be run, with settings", "servoid.tools.commands.tasks"),
+    "doctor": Verb("check whether this machine is ready", "servoid.tools.commands.doctor"),
+    "run": Verb("run a task on a robot", "servoid.tools.commands.run"),
+    "rollout": Verb("run a task many times in simulation and measure it", "servoid.tools.commands.rollout"),
+    "virtual": Verb("serve a virtual rig on a serial port", "servoid.tools.commands.virtual"),
     "bringup": Verb(
         "bring hardware up, step by step",
         verbs={
-            "find-port": Verb("find the robot's serial port", "tools.bringup.find_port"),
-            "scan": Verb("ask who is on the bus", "tools.bringup.scan"),
-            "setup": Verb("give a servo its ID and baud", "tools.bringup.setup"),
-            "check": Verb("compare every servo with the robot's file", "tools.bringup.check"),
-            "calibrate": Verb("measure zeros and directions, moved by hand", "tools.bringup.calibrate"),
-            "jog": Verb("move one joint, slowly and a little", "tools.bringup.jog"),
-            "watch": Verb("watch temperatures, voltages, loads and the bus", "tools.bringup.watch"),
+            "find-port": Verb("find the robot's serial port", "servoid.tools.bringup.find_port"),
+            "scan": Verb("ask who is on the bus", "servoid.tools.bringup.scan"),
+            "setup": Verb("give a servo its ID and baud", "servoid.tools.bringup.setup"),
+            "check": Verb("compare every servo with the robot's file", "servoid.tools.bringup.check"),
+            "calibrate": Verb("measure zeros and directions, moved by hand", "servoid.tools.bringup.calibrate"),
+            "jog": Verb("move one joint, slowly and a little", "servoid.tools.bringup.jog"),
+            "watch": Verb("watch temperatures, voltages, loads and the bus", "servoid.tools.bringup.watch"),
         },
     ),
-    "collect": Verb("record demonstrations of the expert as a dataset", "tools.collect"),
+    "collect": Verb("record demonstrations of the expert as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
         "train a network",
         verbs={
-            "expert": Verb("PPO: the tracker of references", "tools.train.expert"),
-            "odometry": Verb("the correction of leg odometry", "tools.train.odometry"),
-            "latent": Verb("latent actions, which the diffusion model may plan in", "tools.train.latent"),
-            "diffusion": Verb("the diffusion planner-controller", "tools.train.diffusion"),
+            "expert": Verb("PPO: the tracker of references", "servoid.tools.learn.trainers.expert"),
+            "odometry": Verb("the correction of leg odometry", "servoid.tools.learn.trainers.odometry"),
+            "latent": Verb(
+                "latent actions, which the diffusion model may plan in", "servoid.tools.learn.trainers.latent"
+            ),
+            "diffusion": Verb("the diffusion planner-controller", "servoid.tools.learn.trainers.diffusion"),
         },
     ),
     "evaluate": Verb(
         "measure a policy the way that papers do",
         verbs={
             "papers": Verb(
-                "the tables of UniPhys and Diffuse-CLoC, with a column of one's own", "tools.evaluate.papers"
+                "the tables of UniPhys and Diffuse-CLoC, with a column of one's own", "servoid.tools.evaluate.papers"
             )
         },
     ),
     "bench": Verb(
         "measure speed and what faults do, on this machine",
         verbs={
-            "sim": Verb("batched simulation against the raw engine", "tools.bench.sim"),
-            "policy": Verb("planning time", "tools.bench.policy"),
-            "loop": Verb("lateness of the control loop", "tools.bench.loop"),
-            "kill": Verb("what becomes of the servos when the controller is killed", "tools.bench.kill"),
-            "interrupt": Verb("whether torque is off after Ctrl-C at any instant", "tools.bench.interrupt"),
-            "bus": Verb("time of a control cycle on the servo bus", "tools.bench.bus"),
-            "faults": Verb("what faults of the rig do to a walking robot", "tools.bench.faults"),
-            "soak": Verb("long walk over a line that loses packets", "tools.bench.soak"),
-            "fuzz": Verb("random bytes into everything that reads bytes", "tools.bench.fuzz"),
+            "sim": Verb("batched simulation against the raw engine", "servoid.tools.bench.sim"),
+            "policy": Verb("planning time", "servoid.tools.bench.policy"),
+            "loop": Verb("lateness of the control loop", "servoid.tools.bench.loop"),
+            "kill": Verb("what becomes of the servos when the controller is killed", "servoid.tools.faults.kill"),
+            "interrupt": Verb("whether torque is off after Ctrl-C at any instant", "servoid.tools.faults.interrupt"),
+            "bus": Verb("time of a control cycle on the servo bus", "servoid.tools.bench.bus"),
+            "faults": Verb("what faults of the rig do to a walking robot", "servoid.tools.faults.campaign"),
+            "soak": Verb("long walk over a line that loses packets", "servoid.tools.faults.soak"),
+            "fuzz": Verb("random bytes into everything that reads bytes", "servoid.tools.faults.fuzz"),
         },
     ),
-    "replay": Verb("repeat a recorded run and compare", "tools.replay"),
-    "plot": Verb("draw a recorded run", "tools.plot"),
+    "replay": Verb("repeat a recorded run and compare", "servoid.tools.commands.replay"),
+    "plot": Verb("draw a recorded run", "servoid.tools.commands.plot"),
 }
 
 

@@ -9,18 +9,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 
-from hw.clock import WallClock
-from hw.dynamixel.bus import LONGEST_RETURN_DELAY, Bus, Counters
-from hw.dynamixel.lifeline import Lifeline
-from hw.dynamixel.motors import DynamixelMotors
-from hw.dynamixel.port import Port, SerialPort
-from hw.dynamixel.sensors import DynamixelSensors, present
-from hw.dynamixel.survey import Difference, as_table, compare, correct, find_board, find_servos
-from hw.dynamixel.units import Units
-from hw.dynamixel.watch import Watch
-from hw.hal import BackendError, Clock
-from hw.imu.serial_imu import SerialImu
-from hw.robot import Robot
+from servoid.hw.clock import WallClock
+from servoid.hw.contracts.body import BackendError, Clock
+from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY, Bus, Counters
+from servoid.hw.dynamixel.guardian_client import Lifeline
+from servoid.hw.dynamixel.motors import DynamixelMotors
+from servoid.hw.dynamixel.port import Port, SerialPort
+from servoid.hw.dynamixel.register_check import Difference, as_table, compare, correct, find_board, find_servos
+from servoid.hw.dynamixel.sensors import DynamixelSensors, present
+from servoid.hw.dynamixel.servo_monitor import Watch
+from servoid.hw.dynamixel.units import Units
+from servoid.hw.imu.serial_imu import SerialImu
+from servoid.hw.robot.description import Robot
 
 
 class DynamixelBackend:

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
-from hw.clock import WallClock
-from hw.dynamixel import codec
-from hw.dynamixel.codec import MAX_ID, OVERHEAD, Packet, Parser, Reset, Status, as_status, parse_fast
-from hw.dynamixel.group import GroupRead, Request
-from hw.dynamixel.port import Port, SerialPort, drain
-from hw.dynamixel.tables import Item
-from hw.hal import Clock
+from servoid.hw.clock import WallClock
+from servoid.hw.contracts.body import Clock
+from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.codec import MAX_ID, OVERHEAD, Packet, Parser, Reset, Status, as_status, parse_fast
+from servoid.hw.dynamixel.group_read import GroupRead, Request
+from servoid.hw.dynamixel.port import Port, SerialPort, drain
+from servoid.hw.dynamixel.tables import Item
 
 MARGIN = 0.0035  # s after the predicted end: a USB adapter's latency timer of 1 ms, and what may hold up host or servo
 LONGEST_RETURN_DELAY = 254 * 2e-6  # s that a servo may be set to wait before it answers

@@ -1,6 +1,6 @@
 """The guardian: a process that outlives the controller by as long as it takes to brake the servos and let them go.
 
-    python -I -S hw/dynamixel/guardian.py      (started by hw.dynamixel.lifeline, never by hand)
+    python -I -S hw/dynamixel/guardian.py      (started by servoid.hw.dynamixel.guardian_client, never by hand)
 
 It inherits the controller's open port, with its lock and its baud rate, and the reading end of a pipe. The first line
 on that pipe is the plan: every packet that it may have to send, and every answer that proves torque is off, assembled

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.dynamixel.tables import ControlTable
-from hw.faults import IMU_DEAD, IMU_FROZEN, IMU_SILENT
-from hw.imu.mounting import Mounting
-from hw.imu.reading import Reading
+from servoid.hw.dynamixel.tables import ControlTable
+from servoid.hw.faults import IMU_DEAD, IMU_FROZEN, IMU_SILENT
+from servoid.hw.imu.mounting import Mounting
+from servoid.hw.imu.reading import Reading
 
 FROZEN = 3  # equal samples in a row that a living sensor, which has noise, does not give
 BUTTONS = {"mode": 1, "start": 2, "user": 4}  # bits of the button register

@@ -7,16 +7,16 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from hw.dynamixel import codec
-from hw.dynamixel.bus import Bus
-from hw.dynamixel.codec import SyncWriter
-from hw.dynamixel.group import GroupRead
-from hw.dynamixel.lifeline import Lifeline
-from hw.dynamixel.survey import Found
-from hw.dynamixel.units import Units
-from hw.dynamixel.watch import Watch
-from hw.faults import describe
-from hw.hal import Array, BackendError, Command, Mode
+from servoid.hw.contracts.body import Array, BackendError, Command, Mode
+from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.bus import Bus
+from servoid.hw.dynamixel.codec import SyncWriter
+from servoid.hw.dynamixel.group_read import GroupRead
+from servoid.hw.dynamixel.guardian_client import Lifeline
+from servoid.hw.dynamixel.register_check import Found
+from servoid.hw.dynamixel.servo_monitor import Watch
+from servoid.hw.dynamixel.units import Units
+from servoid.hw.faults import describe
 
 WATCHDOG = 4  # of 20 ms: a servo that hears nothing for so long stops by itself
 TRIES = 4  # to switch torque, at least, before it is an error

@@ -17,7 +17,7 @@ from typing import Protocol
 
 import serial
 
-from hw.hal import BackendError, Clock
+from servoid.hw.contracts.body import BackendError, Clock
 
 WRITE_SECONDS = 0.02  # that an adapter may take to accept a packet: 40 times what the longest needs at 2 Mbit/s
 _POLL_NS = 50_000  # between looks while a line is drained

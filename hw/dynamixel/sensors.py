@@ -6,18 +6,18 @@ from collections import deque
 
 import numpy as np
 
-from hw.dynamixel.bus import Bus
-from hw.dynamixel.group import GroupRead
-from hw.dynamixel.imu import BUTTONS, BoardImu
-from hw.dynamixel.survey import Found
-from hw.dynamixel.tables import table
-from hw.dynamixel.units import Units
-from hw.dynamixel.watch import Watch
-from hw.faults import LATE
-from hw.hal import Observation
-from hw.imu.mounting import Mounting
-from hw.imu.serial_imu import SerialImu
-from hw.robot import Robot
+from servoid.hw.contracts.body import Observation
+from servoid.hw.dynamixel.bus import Bus
+from servoid.hw.dynamixel.group_read import GroupRead
+from servoid.hw.dynamixel.imu import BUTTONS, BoardImu
+from servoid.hw.dynamixel.register_check import Found
+from servoid.hw.dynamixel.servo_monitor import Watch
+from servoid.hw.dynamixel.tables import table
+from servoid.hw.dynamixel.units import Units
+from servoid.hw.faults import LATE
+from servoid.hw.imu.mounting import Mounting
+from servoid.hw.imu.serial_imu import SerialImu
+from servoid.hw.robot.description import Robot
 
 # Of the last ticks, answers came late in so many, or something was still missing after the second request in so many:
 # that is no accident. An adapter that batches may let every sample through just before it counts as old.

@@ -11,7 +11,7 @@ from functools import cache
 from types import MappingProxyType
 from typing import Any
 
-from hw.config import CONFIGS, ConfigError, load_marked, nearest
+from servoid.hw.config import CONFIGS, ConfigError, load_marked, nearest
 
 WIDTHS = (1, 2, 4)
 

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hw.dynamixel.tables import ControlTable
-from hw.hal import Array
-from hw.robot import Robot
+from servoid.hw.contracts.body import Array
+from servoid.hw.dynamixel.tables import ControlTable
+from servoid.hw.robot.description import Robot
 
 GAIN_MAX = 16383
 _TURN = 2.0 * np.pi

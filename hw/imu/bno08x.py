@@ -18,9 +18,9 @@ from __future__ import annotations
 import math
 import struct
 
-from hw.imu.frames import Scan, scan
-from hw.imu.reading import GRAVITY, UNKNOWN, Sample
-from hw.imu.rotations import Quaternion, Vector, about, multiply, turn_between
+from servoid.hw.imu.frames import Scan, scan
+from servoid.hw.imu.reading import GRAVITY, UNKNOWN, Sample
+from servoid.hw.imu.rotations import Quaternion, Vector, about, multiply, turn_between
 
 HEAD = b"\xaa\xaa"
 SIZE = 19

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.hal import Array
-from hw.imu.rotations import IDENTITY, Quaternion, conjugate, multiply, yaw_pitch_roll
+from servoid.hw.contracts.body import Array
+from servoid.hw.imu.rotations import IDENTITY, Quaternion, conjugate, multiply, yaw_pitch_roll
 
 # A half turn about each axis is what negating the other two amounts to.
 _HALF_TURNS: dict[tuple[float, float, float], Quaternion] = {

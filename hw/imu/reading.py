@@ -7,8 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
-from hw.hal import Array
-from hw.imu.rotations import Quaternion, Vector
+from servoid.hw.contracts.body import Array
+from servoid.hw.imu.rotations import Quaternion, Vector
 
 GRAVITY = 9.80665  # m/s2 of the unit g of data sheets
 UNKNOWN: Vector = (float("nan"), float("nan"), float("nan"))
@@ -31,7 +31,7 @@ def _nothing() -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """The newest that is known, in the base frame. Not valid is NaN; `fault` says why, as bits of hw.faults."""
+    """The newest that is known, in the base frame. Not valid is NaN; `fault` says why, as bits of servoid.hw.faults."""
 
     time_ns: int | None = None  # when that was sampled; None: never
     fault: int = 0

@@ -8,15 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hw.clock import WallClock
-from hw.dynamixel.port import Port, SerialPort
-from hw.faults import IMU_DEAD, IMU_FROZEN, IMU_SILENT
-from hw.hal import BackendError, Clock
-from hw.imu.bno08x import Bno08x
-from hw.imu.mounting import Mounting
-from hw.imu.reading import Decoder, Reading, Sample
-from hw.imu.witmotion import WitMotion
-from hw.robot import Imu
+from servoid.hw.clock import WallClock
+from servoid.hw.contracts.body import BackendError, Clock
+from servoid.hw.dynamixel.port import Port, SerialPort
+from servoid.hw.faults import IMU_DEAD, IMU_FROZEN, IMU_SILENT
+from servoid.hw.imu.bno08x import Bno08x
+from servoid.hw.imu.mounting import Mounting
+from servoid.hw.imu.reading import Decoder, Reading, Sample
+from servoid.hw.imu.witmotion import WitMotion
+from servoid.hw.robot.description import Imu
 
 FROZEN_SECONDS = 0.08  # of equal samples that a living sensor, which has noise, does not give; 4 ticks of 20 ms
 FROZEN_SAMPLES = 4  # and at least so many repetitions

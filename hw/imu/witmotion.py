@@ -13,9 +13,9 @@ import math
 import struct
 from dataclasses import replace
 
-from hw.imu.frames import Scan, scan
-from hw.imu.reading import GRAVITY, Sample
-from hw.imu.rotations import Quaternion, yaw_pitch_roll
+from servoid.hw.imu.frames import Scan, scan
+from servoid.hw.imu.reading import GRAVITY, Sample
+from servoid.hw.imu.rotations import Quaternion, yaw_pitch_roll
 
 HEAD = b"\x55"
 SIZE = 11

@@ -6,17 +6,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from hw.hal import Array
-from hw.robot import Robot
-from policy import checkpoint
-from policy.checkpoint import CheckpointError
-from policy.latent.actions import LatentActions
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
+from servoid.policy import checkpoint
+from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.latent.actions import LatentActions
 
 PREFIX = "latent"  # of the tensors of latent actions in a diffusion checkpoint, and the key of its header
 
 
 class ActionSpace(Protocol):
-    """Joint targets [rad] <-> actions of a plan. Rows are raw ones (`policy.diffusion.features.raw_layout`)."""
+    """Joint targets [rad] <-> actions of a plan. Rows are raw ones (`servoid.policy.diffusion.features.raw_layout`)."""
 
     def encode(self, rows: Array, targets: Array, /) -> Array:
         """Actions `(..., action size)` that joint targets `(..., n_joints)` are in states `(..., raw size)`."""

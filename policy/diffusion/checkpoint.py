@@ -10,15 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hw.hal import Array
-from hw.robot import Robot
-from policy import checkpoint
-from policy.checkpoint import CheckpointError
-from policy.diffusion.actions import JOINT_TARGETS, PREFIX, ActionSpace, latents_in
-from policy.diffusion.config import KIND, DenoiserConfig, check_fit
-from policy.diffusion.denoiser import Denoiser
-from policy.diffusion.features import Normaliser, raw_layout, token_layout
-from policy.latent.actions import LatentActions
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
+from servoid.policy import checkpoint
+from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.diffusion.actions import JOINT_TARGETS, PREFIX, ActionSpace, latents_in
+from servoid.policy.diffusion.config import KIND, DenoiserConfig, check_fit
+from servoid.policy.diffusion.denoiser import Denoiser
+from servoid.policy.diffusion.features import Normaliser, raw_layout, token_layout
+from servoid.policy.latent.actions import LatentActions
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from hw.config import ConfigError
-from hw.hal import Array
-from hw.robot import Robot
-from policy import checkpoint
-from policy.checkpoint import CheckpointError
-from policy.diffusion.features import raw_layout, token_layout
-from policy.diffusion.masks import check_mask
-from policy.text.encoder import code_size
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
+from servoid.policy import checkpoint
+from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.diffusion.features import raw_layout, token_layout
+from servoid.policy.diffusion.masks import check_mask
+from servoid.policy.text.encoder import code_size
 
 KIND = "diffusion"  # of a checkpoint
 

@@ -16,16 +16,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hw.config import ConfigError
-from hw.hal import Array
-from hw.mirror import Mirror
-from hw.robot import Robot
-from policy.checkpoint import difference
-from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.features import Emphasis, Normaliser, raw_mirror, recorded_names, to_tokens
-from policy.latent.actions import LatentActions
-from policy.text.captions import MOTIONS, mirrored, motion_of
-from policy.text.encoder import load_encoder
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
+from servoid.hw.robot.mirror import Mirror
+from servoid.policy.checkpoint import difference
+from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.features import Emphasis, Normaliser, raw_mirror, recorded_names, to_tokens
+from servoid.policy.latent.actions import LatentActions
+from servoid.policy.text.captions import MOTIONS, mirrored, motion_of
+from servoid.policy.text.encoder import load_encoder
 
 COLUMNS = ("observation.state", "action", "action_applied", "command", "episode_index", "frame_index")
 

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.masks import attention_mask
+from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.masks import attention_mask
 
 
 def _attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hw.config import ConfigError, nearest
-from hw.hal import Array
+from servoid.hw.config import ConfigError, nearest
+from servoid.hw.contracts.body import Array
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from policy.diffusion.denoiser import Denoiser
+    from servoid.policy.diffusion.denoiser import Denoiser
 
 # The call of a Denoiser: (states, actions, state levels, action levels, text, told) -> clean states, clean actions
 Engine = Callable[..., "tuple[Tensor, Tensor]"]
@@ -72,7 +72,7 @@ def load_engine(name: str, denoiser: Denoiser) -> Engine:
     check_engine(name)
     if name == REFERENCE:
         return denoiser
-    from policy.diffusion.export import exported, quantised
+    from servoid.policy.diffusion.export import exported, quantised
 
     graph = exported(denoiser)
     if name == "onnx-int8":

@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from policy.diffusion.denoiser import Denoiser
+from servoid.policy.diffusion.denoiser import Denoiser
 
 OPSET = 18
 OUTPUTS = ("clean_states", "clean_actions")

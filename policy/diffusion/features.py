@@ -15,9 +15,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from hw.hal import Array, State
-from hw.mirror import Mirror
-from hw.robot import Robot
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import State
+from servoid.hw.robot.description import Robot
+from servoid.hw.robot.mirror import Mirror
 
 AnyArray = Any  # a numpy array or a torch tensor
 
@@ -51,7 +52,7 @@ class Layout:
 
 
 def raw_layout(n_joints: int) -> Layout:
-    """A tick as it is recorded: odometry frame, SI units (see `hw.hal.State`)."""
+    """A tick as it is recorded: odometry frame, SI units (see `servoid.hw.contracts.control.State`)."""
     return Layout(
         (
             ("displacement", 3),  # m, z above the ground

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hw.hal import Array, Keyframes
-from policy.diffusion.features import Normaliser, raw_layout, to_tokens
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Keyframes
+from servoid.policy.diffusion.features import Normaliser, raw_layout, to_tokens
 
 
 def keyframe_tokens(keyframes: Keyframes, present: Array, n_joints: int) -> tuple[Array, Array]:

@@ -10,8 +10,8 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from hw.config import ConfigError
-from hw.hal import Array
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
 
 
 def full(state_ticks: Array, action_ticks: Array) -> Array:

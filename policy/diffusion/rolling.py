@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hw.hal import Array
-from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.features import Normaliser, joints_seen, to_tokens
-from policy.diffusion.schedule import DenoisingMatrix
+from servoid.hw.contracts.body import Array
+from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.features import Normaliser, joints_seen, to_tokens
+from servoid.policy.diffusion.schedule import DenoisingMatrix
 
 _FRAME = 2**31  # sets the noise of frames apart from what is drawn for a plan
 

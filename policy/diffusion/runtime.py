@@ -16,20 +16,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hw.hal import Array, Instruction, Plan, PlanRequest
-from hw.robot import Robot
-from policy.checkpoint import resolve
-from policy.diffusion.checkpoint import Model, load
-from policy.diffusion.engines import Engine, load_engine
-from policy.diffusion.features import Trajectory, joints_seen, raw_layout, to_raw, to_tokens
-from policy.diffusion.keyframes import imputation, keyframe_tokens
-from policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise, seeded
-from policy.diffusion.sampler import Diverged, Guidance, Known, Sampler, classifier_free
-from policy.diffusion.schedule import DenoisingMatrix, cosine_signal
-from policy.diffusion.settings import DiffusionSettings
-from policy.text.captions import MOTIONS, caption, motion_of
-from policy.text.encoder import load_encoder
-from policy.text.understanding import Phrasebook
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, Plan, PlanRequest
+from servoid.hw.robot.description import Robot
+from servoid.policy.checkpoint import resolve
+from servoid.policy.diffusion.checkpoint import Model, load
+from servoid.policy.diffusion.engines import Engine, load_engine
+from servoid.policy.diffusion.features import Trajectory, joints_seen, raw_layout, to_raw, to_tokens
+from servoid.policy.diffusion.keyframes import imputation, keyframe_tokens
+from servoid.policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise, seeded
+from servoid.policy.diffusion.sampler import Diverged, Guidance, Known, Sampler, classifier_free
+from servoid.policy.diffusion.schedule import DenoisingMatrix, cosine_signal
+from servoid.policy.diffusion.settings import DiffusionSettings
+from servoid.policy.text.captions import MOTIONS, caption, motion_of
+from servoid.policy.text.encoder import load_encoder
+from servoid.policy.text.nearest_phrase import Phrasebook
 
 # (trajectory, instruction) -> cost (batch,), as tasks define it
 Cost = Callable[[Trajectory, Instruction], Any]

@@ -15,9 +15,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from hw.config import ConfigError
-from hw.hal import Array
-from policy.diffusion.schedule import DenoisingMatrix
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.policy.diffusion.schedule import DenoisingMatrix
 
 # (states, actions, state levels, action levels) -> clean states, clean actions
 Predictor = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.hal import Array
+from servoid.hw.contracts.body import Array
 
 PYRAMID = "pyramid"
 TRAPEZOID = "trapezoid"

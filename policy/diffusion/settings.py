@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from hw.config import ConfigError, load_yaml, nearest, resolve
-from hw.hal import Array
-from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.engines import ENGINES, REFERENCE, check_engine
-from policy.diffusion.schedule import (
+from servoid.hw.config import ConfigError, load_yaml, nearest, resolve
+from servoid.hw.contracts.body import Array
+from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.engines import ENGINES, REFERENCE, check_engine
+from servoid.policy.diffusion.schedule import (
     PYRAMID,
     TRAPEZOID,
     DenoisingMatrix,
@@ -30,7 +30,7 @@ SHAPES = (PYRAMID, TRAPEZOID)
 
 @dataclass(frozen=True)
 class GuidanceSettings:
-    """Loss guidance: see `policy.diffusion.sampler.Guidance`. A weight of 0 turns it off."""
+    """Loss guidance: see `servoid.policy.diffusion.sampler.Guidance`. A weight of 0 turns it off."""
 
     weight: float = 4000.0
     clip: float = 12.0  # longest step over a window; both are in the network's inputs, projected where it has emphasis
@@ -55,7 +55,7 @@ class GuidanceSettings:
 
 @dataclass(frozen=True)
 class Autoregressive:
-    """See `policy.diffusion.schedule.autoregressive`."""
+    """See `servoid.policy.diffusion.schedule.autoregressive`."""
 
     block: int = 4  # frames
 
@@ -66,7 +66,7 @@ class Autoregressive:
 
 @dataclass(frozen=True)
 class Gradual:
-    """See `policy.diffusion.schedule.gradual`."""
+    """See `servoid.policy.diffusion.schedule.gradual`."""
 
     spread: int = 5  # calls by which the last frame is later than the first
     shape: str = PYRAMID
@@ -80,7 +80,7 @@ class Gradual:
 
 @dataclass(frozen=True)
 class Rolling:
-    """See `policy.diffusion.schedule.rolling`. Levels are those of a network with 20, as in Diffuse-CLoC."""
+    """See `servoid.policy.diffusion.schedule.rolling`. Levels are those of a network with 20, as in Diffuse-CLoC."""
 
     state_level: int = 14
     action_level: int = 4
@@ -111,7 +111,7 @@ class DiffusionSettings:
     stabilise: int = 0  # noise level that clean tokens are shown with
     text_weight: float = 1.0  # classifier-free guidance by the instruction; 0: unread, 1: as trained
     text_nearest: bool = True  # a sentence is read as the nearest one of the training; False: by its own code
-    engine: str = REFERENCE  # what runs the network: see `policy.diffusion.engines`
+    engine: str = REFERENCE  # what runs the network: see `servoid.policy.diffusion.engines`
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
 
     def __post_init__(self) -> None:

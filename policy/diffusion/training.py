@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from hw.config import ConfigError
-from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.denoiser import Denoiser
+from servoid.hw.config import ConfigError
+from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.denoiser import Denoiser
 
 UNTOLD = 0.1  # share of windows without an instruction
 _TOGETHER = 2 / 3  # of the windows that are not for Diffusion Forcing, the share whose tokens go down together

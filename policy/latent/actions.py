@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from hw.config import ConfigError
-from hw.hal import Array
-from hw.robot import Robot
-from policy import checkpoint
-from policy.checkpoint import CheckpointError
-from policy.latent.proprioception import proprioception, proprioception_layout
-from policy.mlp import Mlp
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
+from servoid.policy import checkpoint
+from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.latent.proprioception import proprioception, proprioception_layout
+from servoid.policy.mlp import Mlp
 
 KIND = "latent"  # of a checkpoint
 LAYOUT = "state_layout"  # key of a header: the fields of what latents are conditioned on

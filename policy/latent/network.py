@@ -8,11 +8,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from hw.hal import Array
-from policy.diffusion.features import Normaliser
-from policy.latent.actions import LatentActions, LatentConfig
-from policy.latent.proprioception import proprioception
-from policy.mlp import Mlp
+from servoid.hw.contracts.body import Array
+from servoid.policy.diffusion.features import Normaliser
+from servoid.policy.latent.actions import LatentActions, LatentConfig
+from servoid.policy.latent.proprioception import proprioception
+from servoid.policy.mlp import Mlp
 
 _LOG_VARIANCE = 10.0  # at most this far from 0: exp() of more than that is nothing to learn from
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.hal import Array
+from servoid.hw.contracts.body import Array
 
 Twist = tuple[float, float, float]
 

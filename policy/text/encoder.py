@@ -10,9 +10,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from hw.config import ConfigError, nearest
-from hw.hal import Array
-from policy.text.lexicon import FLAGS, flags, words
+from servoid.hw.config import ConfigError, nearest
+from servoid.hw.contracts.body import Array
+from servoid.policy.text.lexicon import FLAGS, flags, words
 
 
 class TextEncoder(Protocol):

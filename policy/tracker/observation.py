@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.hal import Array, ReferenceFrames, State
-from hw.mirror import Mirror
-from hw.robot import Robot
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import ReferenceFrames, State
+from servoid.hw.robot.description import Robot
+from servoid.hw.robot.mirror import Mirror
 
 AHEAD = np.array([0, 3, 8])  # ticks ahead that the tracker sees of its reference
 RESIDUAL = 0.3  # rad of joint target for an action of one

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.hal import Array
+from servoid.hw.contracts.body import Array
 
 
 @dataclass(frozen=True, slots=True)

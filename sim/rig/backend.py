@@ -12,17 +12,19 @@ from functools import partial
 
 import numpy as np
 
-from hw.dynamixel.backend import DynamixelBackend
-from hw.dynamixel.motors import DynamixelMotors
-from hw.dynamixel.sensors import DynamixelSensors
-from hw.hal import Array, BackendError, Clock, Percept, Scene, State, Truth
-from hw.robot import Robot
-from sim.rig.control import Control, LockedClock, RigProcess, RigTruth
-from sim.scene import Stage
+from servoid.hw.contracts.body import Array, BackendError, Clock
+from servoid.hw.contracts.control import State
+from servoid.hw.contracts.world import Percept, Scene, Truth
+from servoid.hw.dynamixel.backend import DynamixelBackend
+from servoid.hw.dynamixel.motors import DynamixelMotors
+from servoid.hw.dynamixel.sensors import DynamixelSensors
+from servoid.hw.robot.description import Robot
+from servoid.sim.rig.control import Control, LockedClock, RigProcess, RigTruth
+from servoid.sim.scene import Stage
 
 
 class VirtualBackend:
-    """A robot of emulated servos, the same draw as `sim.backend.SimBackend` makes of a seed.
+    """A robot of emulated servos, the same draw as `servoid.sim.backend.SimBackend` makes of a seed.
 
     `truth`, `push` and `stage`, the scene in play, are for evaluation alone; they go over the rig's control socket and
     never over its bus.
@@ -75,7 +77,7 @@ class VirtualBackend:
         self._clock.requests.append(partial(Control.push, velocity=np.array(velocity, dtype=float)))
 
     def look(self, state: State) -> Percept:
-        """What the robot sees of the scene (see `hw.hal.Surroundings`)."""
+        """What the robot sees of the scene (see `servoid.hw.contracts.world.Surroundings`)."""
         assert self.stage is not None, "there is no scene"
         return self.stage.look(state)
 

@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hw.dynamixel.codec import StatusError
-from hw.dynamixel.tables import Item, table
-from hw.imu.mounting import Mounting
-from sim.rig.device import Device
-from sim.rig.motors import Motors
+from servoid.hw.dynamixel.codec import StatusError
+from servoid.hw.dynamixel.tables import Item, table
+from servoid.hw.imu.mounting import Mounting
+from servoid.sim.rig.device import Device
+from servoid.sim.rig.motors import Motors
 
 FIRMWARE = 17
 AXES = "xyz"

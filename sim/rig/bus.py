@@ -7,12 +7,12 @@ import operator
 import struct
 from collections.abc import Iterator, Sequence
 
-from hw.dynamixel import codec
-from hw.dynamixel.codec import Instruction, Packet, Parser, Status
-from hw.dynamixel.crc import crc16
-from sim.rig.device import Device
-from sim.rig.faults import MISSPOKEN, STATUS_KINDS, Chunk, Dice
-from sim.rig.wire import FRAME_BITS, Wire, same_baud
+from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.codec import Instruction, Packet, Parser, Status
+from servoid.hw.dynamixel.crc import crc16
+from servoid.sim.rig.device import Device
+from servoid.sim.rig.faults import MISSPOKEN, STATUS_KINDS, Chunk, Dice
+from servoid.sim.rig.wire import FRAME_BITS, Wire, same_baud
 
 TURNAROUND_NS = 2_000  # from the last byte of a request to the first of the reply, at return delay 0
 _SILENCE_NS = 5_000_000  # a packet that stops for so long is given up

@@ -13,12 +13,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hw.hal import Array, BackendError, Scene
-from hw.robot import Robot, load_robot, save_robot
-from sim.model import build
-from sim.rig.delivery import Delivery
-from sim.scene import plain, scene_sensors
-from sim.truth import Truth
+from servoid.hw.contracts.body import Array, BackendError
+from servoid.hw.contracts.world import Scene
+from servoid.hw.robot.description import Robot, load_robot, save_robot
+from servoid.sim.model import build
+from servoid.sim.rig.factory_state import Delivery
+from servoid.sim.scene import plain, scene_sensors
+from servoid.sim.truth import Truth
 
 _START_SECONDS = 60.0
 _ANSWER_SECONDS = 60.0
@@ -86,7 +87,7 @@ class Control:
         self.call("press", buttons=buttons)
 
     def inject(self, kind: str, **fault: Any) -> None:
-        """Inject a fault of `sim.rig.faults`, its times counted from now."""
+        """Inject a fault of `servoid.sim.rig.faults`, its times counted from now."""
         self.call("inject", fault={"kind": kind, **fault})
 
     def accepted(self) -> list[dict[str, Any]]:
@@ -175,7 +176,7 @@ class RigProcess:
             sys.executable,
             "-P",  # or a file in the present folder could stand for a module
             "-m",
-            "sim.rig.server",
+            "servoid.sim.rig.server",
             "--robot",
             str(robot),
             "--clock",

@@ -17,10 +17,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from hw.config import ConfigError, load_yaml, nearest
-from hw.dynamixel import codec
-from hw.faults import ENCODER, INPUT_VOLTAGE, OVERHEATING, OVERLOAD, SHOCK
-from hw.robot import Robot
+from servoid.hw.config import ConfigError, load_yaml, nearest
+from servoid.hw.dynamixel import codec
+from servoid.hw.faults import ENCODER, INPUT_VOLTAGE, OVERHEATING, OVERLOAD, SHOCK
+from servoid.hw.robot.description import Robot
 
 Kind = Literal[
     "drop", "late", "truncate", "duplicate", "wrong_id", "corrupt", "error_status", "stuffed",

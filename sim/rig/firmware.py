@@ -1,7 +1,7 @@
 """What runs inside the servos several hundred times a second: profiles, control laws, limits and protections.
 
 All servos of a rig at once, arrays `(n,)` in the robot's joint order, in the servos' own frame: angle 0 at the centre
-tick, counting as the encoder does. Registers are the business of `sim.rig.servo`, physics that of `sim.rig.plant`.
+tick, counting as the encoder does. Registers are the business of `servo`, physics that of `plant`.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.faults import INPUT_VOLTAGE, OVERHEATING, OVERLOAD
-from hw.hal import Array
-from hw.robot import Servo
-from sim.model import TIMESTEP
+from servoid.hw.contracts.body import Array
+from servoid.hw.faults import INPUT_VOLTAGE, OVERHEATING, OVERLOAD
+from servoid.hw.robot.description import Servo
+from servoid.sim.model import TIMESTEP
 
 CURRENT, VELOCITY, POSITION, EXTENDED, CURRENT_POSITION, PWM = 0, 1, 3, 4, 5, 16
 

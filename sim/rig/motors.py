@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hw.hal import Array
-from hw.robot import Robot
-from sim.model import TIMESTEP
-from sim.rig.firmware import Firmware
-from sim.rig.plant import Plant
-from sim.rig.wire import FRAME_BITS
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
+from servoid.sim.model import TIMESTEP
+from servoid.sim.rig.firmware import Firmware
+from servoid.sim.rig.plant import Plant
+from servoid.sim.rig.wire import FRAME_BITS
 
 BATTERY_RESISTANCE = 0.04  # Ohm: a 3S pack of the size that fits such a robot, with its wires
 STEP_NS = round(TIMESTEP * 1e9)

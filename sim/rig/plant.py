@@ -1,7 +1,7 @@
 """The body that a virtual rig's motors move: the simulated backend's model, driven by voltages and read by encoders.
 
-The motor is the actuator of `sim.model`. Its controller makes a voltage of `gain * (control - angle)`; here the gain is
-one volt a radian and the control is `angle + voltage`, so that firmware of any operating mode can drive the very same
+The motor is the actuator of `sim/model.py`. Its controller makes a voltage of `gain * (control - angle)`; here the gain
+is one volt a radian and the control is `angle + voltage`, so that firmware of any operating mode can drive the very same
 motor: in position mode with a P gain alone, the torque is that of the simulated backend to the last bit but rounding.
 """
 
@@ -10,14 +10,15 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from hw.hal import Array, Scene
-from hw.legs import Legs
-from hw.robot import Robot
-from sim.model import TIMESTEP, build
-from sim.randomise import Body, draw
-from sim.scene import robot_bodies, scene_sensors
-from sim.truth import Truth
-from sim.worlds import NOISE_ROWS, VELOCITY_NOISE, with_errors
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.world import Scene
+from servoid.hw.robot.description import Robot
+from servoid.hw.robot.legs import Legs
+from servoid.sim.model import TIMESTEP, build
+from servoid.sim.randomise import Body, draw
+from servoid.sim.scene import robot_bodies, scene_sensors
+from servoid.sim.truth import Truth
+from servoid.sim.worlds import NOISE_ROWS, VELOCITY_NOISE, with_errors
 
 CLEARANCE = 0.05  # m between the soles and the floor while the robot is held
 _R, _K, _KP, _VMAX = 0, 1, 4, 7  # indices in a dcmotor's gainprm
@@ -60,8 +61,8 @@ class Plant:
     def reset(self, seed: int, *, randomise: bool = False) -> None:
         """Hold the robot at home, every draw from the stream of this seed.
 
-        The stream is that of `sim.backend`, used as `sim.worlds` uses it: the same seed is the same robot with the same
-        noise.
+        The stream is that of the simulated backend, used as its worlds use it: the same seed is the same robot with
+        the same noise.
         """
         self._rng = np.random.default_rng([seed, 0])
         randomise = self._rng.random() < float(randomise)

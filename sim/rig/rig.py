@@ -14,18 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from hw.hal import Array
-from hw.imu.mounting import Mounting
-from hw.robot import Robot
-from sim.rig.board import Board
-from sim.rig.bus import Bus
-from sim.rig.delivery import Delivery
-from sim.rig.faults import ALERTS, Dice, Fault, Scenario
-from sim.rig.motors import STEP_NS, Motors
-from sim.rig.plant import Plant
-from sim.rig.servo import VirtualServo
-from sim.rig.spare import Spare
-from sim.rig.wire import Wire
+from servoid.hw.contracts.body import Array
+from servoid.hw.imu.mounting import Mounting
+from servoid.hw.robot.description import Robot
+from servoid.sim.rig.board import Board
+from servoid.sim.rig.bus import Bus
+from servoid.sim.rig.duplicate_id import Spare
+from servoid.sim.rig.factory_state import Delivery
+from servoid.sim.rig.faults import ALERTS, Dice, Fault, Scenario
+from servoid.sim.rig.motors import STEP_NS, Motors
+from servoid.sim.rig.plant import Plant
+from servoid.sim.rig.servo import VirtualServo
+from servoid.sim.rig.wire import Wire
 
 BROWN_OUT, BOARD_BROWN_OUT = 6.0, 4.5  # V below which a servo and the board lose power
 _LONGEST_BROWN_OUT = 0.05  # s, when the scenario does not say

@@ -1,6 +1,6 @@
 """A virtual rig in a process of its own: its serial port, its control socket, and its time.
 
-    python -m sim.rig.server --robot op3 --link /tmp/rig --control /tmp/rig.sock --clock locked
+    python -m servoid.sim.rig.server --robot op3 --link /tmp/rig --control /tmp/rig.sock --clock locked
 
 The first line of standard output is a JSON object with `port` and `control`. Time is the machine's, or stands still
 until the control connection that locked it advances it. When that connection closes, the rig goes on at the machine's
@@ -25,15 +25,15 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Literal
 
-from hw.clock import wake_sharply
-from hw.config import ConfigError
-from hw.robot import load_robot
-from sim.rig import operations
-from sim.rig.delivery import Delivery, add_delivery_arguments
-from sim.rig.faults import Scenario, load_scenario
-from sim.rig.operations import Connection
-from sim.rig.rig import Rig
-from sim.rig.terminal import Terminal
+from servoid.hw.clock import wake_sharply
+from servoid.hw.config import ConfigError
+from servoid.hw.robot.description import load_robot
+from servoid.sim.rig import control_requests as operations
+from servoid.sim.rig.control_requests import Connection
+from servoid.sim.rig.factory_state import Delivery, add_delivery_arguments
+from servoid.sim.rig.faults import Scenario, load_scenario
+from servoid.sim.rig.pty import Terminal
+from servoid.sim.rig.rig import Rig
 
 ClockKind = Literal["real", "locked"]
 PICK_UP_SECONDS = 3.0  # without torque anywhere, before somebody picks a free-running robot up
@@ -275,7 +275,7 @@ def build(args: argparse.Namespace, *, linger: float | None = None) -> Server:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="sim.rig.server")
+    parser = argparse.ArgumentParser(prog="servoid.sim.rig.server")
     add_arguments(parser)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--randomise", action="store_true")

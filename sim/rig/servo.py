@@ -6,12 +6,12 @@ import math
 import struct
 from collections.abc import Callable
 
-from hw.dynamixel.codec import StatusError
-from hw.dynamixel.tables import Item, table
-from sim.rig.delivery import ticks_per_turn
-from sim.rig.device import Device
-from sim.rig.firmware import CURRENT, CURRENT_POSITION, EXTENDED, FULL_PWM, POSITION, PWM
-from sim.rig.motors import Motors
+from servoid.hw.dynamixel.codec import StatusError
+from servoid.hw.dynamixel.tables import Item, table
+from servoid.sim.rig.device import Device
+from servoid.sim.rig.factory_state import ticks_per_turn
+from servoid.sim.rig.firmware import CURRENT, CURRENT_POSITION, EXTENDED, FULL_PWM, POSITION, PWM
+from servoid.sim.rig.motors import Motors
 
 FIRMWARE = 52  # the newest that changed anything in the tables
 _HOMING_RANGE = 1024  # ticks that count in position mode

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from hw.config import ConfigError, load_yaml, nearest, resolve
-from hw.hal import Task
-from hw.overrides import override
-from hw.robot import Robot
-from stack.tasks.base import BaseTask, Settings
-from stack.tasks.cross import Cross
-from stack.tasks.forest import Forest
-from stack.tasks.goal import Goal
-from stack.tasks.inbetween import Inbetween
-from stack.tasks.obstacle import Obstacle
-from stack.tasks.path import Path
-from stack.tasks.stand import Stand
-from stack.tasks.steer import Steer
-from stack.tasks.survive import Survive
-from stack.tasks.text import Text
-from stack.tasks.velocity import Velocity
-from stack.tasks.walk import Walk
+from servoid.hw.config import ConfigError, load_yaml, nearest, resolve
+from servoid.hw.contracts.task import Task
+from servoid.hw.overrides import override
+from servoid.hw.robot.description import Robot
+from servoid.stack.tasks.base import BaseTask, Settings
+from servoid.stack.tasks.cross import Cross
+from servoid.stack.tasks.forest import Forest
+from servoid.stack.tasks.goal import Goal
+from servoid.stack.tasks.inbetween import Inbetween
+from servoid.stack.tasks.obstacle import Obstacle
+from servoid.stack.tasks.path import Path
+from servoid.stack.tasks.stand import Stand
+from servoid.stack.tasks.steer import Steer
+from servoid.stack.tasks.survive import Survive
+from servoid.stack.tasks.text import Text
+from servoid.stack.tasks.velocity import Velocity
+from servoid.stack.tasks.walk import Walk
 
 _CLASSES: tuple[type[BaseTask], ...] = (
     Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Cross, Inbetween, Survive, Text, Steer,

@@ -7,9 +7,12 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from hw.hal import Array, Instruction, Percept, Scene, State, Trace
-from hw.robot import Robot
-from stack.tasks.guidance import Trajectory, Weights, total_cost
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.world import Percept, Scene
+from servoid.hw.robot.description import Robot
+from servoid.stack.tasks.guidance import Trajectory, Weights, total_cost
 
 Range = tuple[float, float]
 

@@ -8,12 +8,15 @@ from typing import Annotated
 
 import numpy as np
 
-from hw.hal import Array, Instruction, Percept, Scene, State, Trace
-from stack.tasks import measures
-from stack.tasks.approach import Approach, approach
-from stack.tasks.base import BaseTask, Settings, require_positive
-from stack.tasks.frames import to_heading, turned
-from stack.tasks.passing import Motion, Passing, way
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.world import Percept, Scene
+from servoid.stack.navigation.collision_avoidance import Motion, Passing, way
+from servoid.stack.navigation.frames import to_heading, turned
+from servoid.stack.navigation.go_to_point import Approach, approach
+from servoid.stack.tasks import metrics as measures
+from servoid.stack.tasks.base import BaseTask, Settings, require_positive
 
 _FEWEST, _MOST = 2, 4
 _ROOM = 0.7  # m between neighbours at the start and at the end: none is in the way of another who stands

@@ -7,13 +7,16 @@ from typing import Annotated
 
 import numpy as np
 
-from hw.config import ConfigError
-from hw.hal import Array, Instruction, Percept, Scene, State, Trace
-from stack.tasks import measures
-from stack.tasks.approach import Approach, approach
-from stack.tasks.base import BaseTask, Settings, require_positive
-from stack.tasks.field import Field, FieldSettings
-from stack.tasks.frames import ahead, moving, to_heading
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.world import Percept, Scene
+from servoid.stack.navigation.frames import ahead, moving, to_heading
+from servoid.stack.navigation.go_to_point import Approach, approach
+from servoid.stack.navigation.potential_field import Field, FieldSettings
+from servoid.stack.tasks import metrics as measures
+from servoid.stack.tasks.base import BaseTask, Settings, require_positive
 
 Pillar = tuple[float, float, float]
 _RENEWAL = 0.5  # s after which a field is drawn anew where pillars are seen elsewhere: odometry drifts

@@ -9,14 +9,17 @@ from typing import Annotated
 
 import numpy as np
 
-from hw.config import ConfigError
-from hw.hal import Array, Instruction, Percept, Scene, State, Trace
-from policy.text.captions import twist_of
-from stack.tasks import measures
-from stack.tasks.approach import Approach, approach
-from stack.tasks.base import BaseTask, Range, Settings, require_positive, require_ranges
-from stack.tasks.frames import to_heading
-from stack.tasks.sentences import require_words, understood
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.world import Percept, Scene
+from servoid.policy.text.captions import twist_of
+from servoid.stack.navigation.frames import to_heading
+from servoid.stack.navigation.go_to_point import Approach, approach
+from servoid.stack.tasks import metrics as measures
+from servoid.stack.tasks.base import BaseTask, Range, Settings, require_positive, require_ranges
+from servoid.stack.tasks.sentences import require_words, understood
 
 
 @dataclass(frozen=True)

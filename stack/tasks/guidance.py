@@ -10,7 +10,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from hw.hal import Array, Instruction
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction
 
 _STANDING = 1e-3  # m/s and rad/s: an instructed twist below it means to stand
 _SLOW = 0.05  # m/s below which the direction of a motion says little

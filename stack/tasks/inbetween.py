@@ -9,13 +9,16 @@ from typing import Annotated
 
 import numpy as np
 
-from hw.config import ConfigError
-from hw.hal import Array, Instruction, Keyframes, Percept, State, Trace
-from hw.robot import Robot
-from policy.diffusion.features import Layout, raw_layout
-from stack.flightlog import FlightLog, read_log
-from stack.tasks.base import BaseTask, Settings, require_positive
-from stack.tasks.frames import to_heading, turned
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, Keyframes, State
+from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.world import Percept
+from servoid.hw.robot.description import Robot
+from servoid.policy.diffusion.features import Layout, raw_layout
+from servoid.stack.log.flightlog import FlightLog, read_log
+from servoid.stack.navigation.frames import to_heading, turned
+from servoid.stack.tasks.base import BaseTask, Settings, require_positive
 
 _SOON = 0.2  # s: nearer keyframes are not hurried to
 _FASTEST = np.array([0.25, 0.1, 0.8])  # m/s forward and to the left, rad/s, of the asked velocity
@@ -124,7 +127,7 @@ class Inbetween(BaseTask):
         base = np.linalg.norm(trace.displacement[ticks] - self._places[seen], axis=1).mean()
         joints = float("nan")
         if self._robot is not None and trace.joints is not None:
-            from sim.kinematics import joint_places
+            from servoid.sim.kinematics import joint_places
 
             wanted = self._frames[seen][:, self._layout.slice("position")]
             apart = joint_places(self._robot, trace.joints[ticks]) - joint_places(self._robot, wanted)

@@ -8,10 +8,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from hw.hal import Array, Instruction, Percept, Scene, State, Trace
-from stack.tasks import measures
-from stack.tasks.base import BaseTask, Settings, require_positive
-from stack.tasks.frames import to_heading
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.world import Percept, Scene
+from servoid.stack.navigation.frames import to_heading
+from servoid.stack.tasks import metrics as measures
+from servoid.stack.tasks.base import BaseTask, Settings, require_positive
 
 Point = tuple[float, float]
 _SPACING = 0.01  # m between the points of a path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from hw.config import ConfigError
+from servoid.hw.config import ConfigError
 
 
 def require_words(settings: Mapping[str, str], name: str) -> None:
@@ -15,8 +15,8 @@ def require_words(settings: Mapping[str, str], name: str) -> None:
 
 def understood(name: str, sentence: str) -> int:
     """Number of the motion that the setting `name` asks for. Raises ConfigError where that is in no known words."""
-    from policy.text.encoder import load_encoder
-    from policy.text.understanding import Phrasebook
+    from servoid.policy.text.encoder import load_encoder
+    from servoid.policy.text.nearest_phrase import Phrasebook
 
     try:
         return Phrasebook(load_encoder()).understand(sentence)

@@ -7,8 +7,10 @@ from typing import Annotated
 
 import numpy as np
 
-from hw.hal import Instruction, Percept, State, Trace
-from stack.tasks.base import BaseTask, Settings, require_positive
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.world import Percept
+from servoid.stack.tasks.base import BaseTask, Settings, require_positive
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from hw.hal import Array, Instruction, Percept, State, Trace
-from stack.steering import Recorded, Steering, Wish, open_steering
-from stack.tasks import measures
-from stack.tasks.base import BaseTask, Settings, require_positive
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.world import Percept
+from servoid.stack.control.operator import Recorded, Steering, Wish, open_steering
+from servoid.stack.tasks import metrics as measures
+from servoid.stack.tasks.base import BaseTask, Settings, require_positive
 
 
 @dataclass(frozen=True)

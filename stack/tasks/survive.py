@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-from hw.hal import Instruction, Percept, State, Trace
-from policy.text.captions import caption
-from stack.tasks.walk import Walk, WalkSettings
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.world import Percept
+from servoid.policy.text.captions import caption
+from servoid.stack.tasks.walk import Walk, WalkSettings
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from hw.hal import Instruction, Percept, State, Trace
-from policy.text.captions import MOTIONS, followed, twist_of
-from stack.tasks import measures
-from stack.tasks.base import BaseTask, Settings, require_positive
-from stack.tasks.sentences import require_words, understood
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.world import Percept
+from servoid.policy.text.captions import MOTIONS, followed, twist_of
+from servoid.stack.tasks import metrics as measures
+from servoid.stack.tasks.base import BaseTask, Settings, require_positive
+from servoid.stack.tasks.sentences import require_words, understood
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,13 @@ from typing import Annotated
 
 import numpy as np
 
-from hw.hal import Array, Instruction, Percept, State, Trace
-from stack.tasks import measures
-from stack.tasks.base import BaseTask, Range, Settings, require_positive, require_ranges
-from stack.tasks.frames import turned
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.world import Percept
+from servoid.stack.navigation.frames import turned
+from servoid.stack.tasks import metrics as measures
+from servoid.stack.tasks.base import BaseTask, Range, Settings, require_positive, require_ranges
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from hw.config import CONFIGS, ConfigError, load_marked, load_yaml, resolve
-from hw.overrides import override
+from servoid.hw.config import CONFIGS, ConfigError, load_marked, load_yaml, resolve
+from servoid.hw.overrides import override
 
 
 @dataclass(frozen=True)

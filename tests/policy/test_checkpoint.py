@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from hw.robot import Robot, load_robot
-from policy import checkpoint
-from policy.checkpoint import CheckpointError
+from servoid.hw.robot.description import Robot, load_robot
+from servoid.policy import checkpoint
+from servoid.policy.checkpoint import CheckpointError
 
 ROBOT = load_robot()
 

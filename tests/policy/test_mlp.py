@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import nn
 
-from hw.robot import load_robot
-from policy import checkpoint
-from policy.checkpoint import CheckpointError
-from policy.mlp import Mlp
+from servoid.hw.robot.description import load_robot
+from servoid.policy import checkpoint
+from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.mlp import Mlp
 
 ROBOT = load_robot()
 

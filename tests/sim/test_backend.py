@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hw.hal import Command, Mode
-from hw.robot import load_robot
-from sim.backend import SimBackend
+from servoid.hw.contracts.body import Command, Mode
+from servoid.hw.robot.description import load_robot
+from servoid.sim.backend import SimBackend
 
 ROBOT = load_robot()
 TICK = 20_000_000  # ns

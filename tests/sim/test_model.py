@@ -7,10 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from hw.config import ConfigError
-from hw.legs import LegInverse, Legs
-from hw.robot import load_robot
-from sim.model import TIMESTEP, _add_servo, build
+from servoid.hw.config import ConfigError
+from servoid.hw.robot.description import load_robot
+from servoid.hw.robot.legs import LegInverse, Legs
+from servoid.sim.model import TIMESTEP, _add_servo, build
 
 # body: parent, offset, joint axis, mass, centre of mass, sorted principal moments (left side and middle)
 TABLE = {

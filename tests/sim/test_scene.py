@@ -11,13 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hw.hal import Array, Command, Mode, Scene, State
-from hw.robot import Robot, load_robot
-from sim.backend import SimBackend
-from sim.model import build
-from sim.render import Frame, render
-from sim.rig.plant import Plant
-from sim.scene import from_plain, plain, robot_bodies
+from servoid.hw.contracts.body import Array, Command, Mode
+from servoid.hw.contracts.control import State
+from servoid.hw.contracts.world import Scene
+from servoid.hw.robot.description import Robot, load_robot
+from servoid.sim.backend import SimBackend
+from servoid.sim.model import build
+from servoid.sim.render import Frame, render
+from servoid.sim.rig.plant import Plant
+from servoid.sim.scene import from_plain, plain, robot_bodies
 
 NOTHING = np.zeros((0, 3)), np.zeros((0, 4))
 TICK = 20_000_000
@@ -132,7 +134,7 @@ def test_a_scene_survives_its_way_to_a_rig() -> None:
 def test_pillars_and_spheres_are_drawn() -> None:
     """In a process of its own: MuJoCo chooses how to draw when it is first imported."""
     here = Path(__file__)
-    found = os.pathsep.join([str(here.parents[2]), str(here.parent)])
+    found = os.pathsep.join([str(here.parents[2] / "src"), str(here.parent)])
     environment = os.environ | {"MUJOCO_GL": "egl", "PYTHONPATH": found}
     command = [sys.executable, "-c", "import test_scene; test_scene.draw()"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import yaml
 
-import sim.worlds
-from hw.config import ConfigError
-from hw.hal import Command, Mode, Observation
-from hw.robot import Robot, load_robot
-from sim.model import TIMESTEP, build
-from sim.randomise import (
+import servoid.sim.worlds
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Command, Mode, Observation
+from servoid.hw.robot.description import Robot, load_robot
+from servoid.sim.model import TIMESTEP, build
+from servoid.sim.randomise import (
     BACKLASH,
     COMMAND_DELAY,
     FRICTION,
@@ -27,8 +27,8 @@ from sim.randomise import (
     ZERO,
     draw,
 )
-from sim.truth import Truth
-from sim.worlds import Worlds
+from servoid.sim.truth import Truth
+from servoid.sim.worlds import Worlds
 
 ROBOT = load_robot()
 PLAIN_IMU = replace(ROBOT, imu=replace(ROBOT.imu, average=0.0))  # no filter: single samples can be compared
@@ -38,7 +38,7 @@ HEAD, ARM, KNEE = (ROBOT.names.index(name) for name in ("head_pan", "l_sho_roll"
 
 def make(monkeypatch: pytest.MonkeyPatch, n: int = 1, robot: Any = ROBOT, **changes: Any) -> Worlds:
     """Worlds of nominal robots with some of what is drawn replaced."""
-    monkeypatch.setattr(sim.worlds, "draw", lambda *args: replace(draw(*args), **changes))
+    monkeypatch.setattr(servoid.sim.worlds, "draw", lambda *args: replace(draw(*args), **changes))
     return started(Worlds(robot, n, threads=1))
 
 

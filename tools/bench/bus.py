@@ -16,10 +16,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from hw.config import ConfigError
-from hw.hal import BackendError
-from tools import exit_codes
-from tools.output import Report, add_json_argument, reporting
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import BackendError
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import Report, add_json_argument, reporting
 
 BAUDS = (1_000_000, 2_000_000, 3_000_000, 4_000_000)
 SERVOS, BOARD_ID = 20, 200
@@ -57,8 +57,8 @@ COLUMNS = ("client", "mode", "baud", "median_ms", "p99_ms", "cpu_us", "failed", 
 
 def measure(report: Report, bauds: tuple[int, ...], cycles: int) -> list[dict[str, Any]]:
     """A row for each client, mode and baud, the wire's own among them."""
-    from stack.steady import steady
-    from tools.bench.clients import CLIENTS
+    from servoid.stack.runtime.realtime import steady
+    from servoid.tools.bench.clients import CLIENTS
 
     rows = []
     with responder() as port, steady(False, report.line):
@@ -91,7 +91,7 @@ class Run:
         """Time so many cycles after a warm-up, and close the client."""
         import numpy as np
 
-        from tools.bench.responder import CURRENT, VELOCITY
+        from servoid.tools.bench.responder import CURRENT, VELOCITY
 
         try:
             for i in range(-WARM_UP, cycles):
@@ -120,9 +120,9 @@ class Run:
 
 def wire_ms(mode: str, baud: int) -> float:
     """Time that the bytes of a cycle take on a wire, without any pause between them."""
-    from hw.dynamixel.bus import BITS
-    from hw.dynamixel.group import GroupRead
-    from tools.bench.clients import BOARD, BOARD_BYTES, GOAL_BYTES, PRESENT, PRESENT_BYTES
+    from servoid.hw.dynamixel.bus import BITS
+    from servoid.hw.dynamixel.group_read import GroupRead
+    from servoid.tools.bench.clients import BOARD, BOARD_BYTES, GOAL_BYTES, PRESENT, PRESENT_BYTES
 
     present = GroupRead([(id, PRESENT, PRESENT_BYTES) for id in range(SERVOS)], fast=mode == "fast").begin()
     board = GroupRead([(BOARD_ID, BOARD, BOARD_BYTES)]).begin()
@@ -134,7 +134,7 @@ def wire_ms(mode: str, baud: int) -> float:
 @contextmanager
 def responder() -> Iterator[str]:
     """The servos, in a process of their own; their port."""
-    command = [sys.executable, "-m", "tools.bench.responder"]
+    command = [sys.executable, "-m", "servoid.tools.bench.responder"]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdin is not None
     assert process.stdout is not None

@@ -8,12 +8,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from hw.clock import WallClock
-from hw.dynamixel.bus import Bus
-from hw.dynamixel.codec import SyncWriter
-from hw.dynamixel.group import GroupRead
-from hw.dynamixel.port import SerialPort
-from hw.hal import Array
+from servoid.hw.clock import WallClock
+from servoid.hw.contracts.body import Array
+from servoid.hw.dynamixel.bus import Bus
+from servoid.hw.dynamixel.codec import SyncWriter
+from servoid.hw.dynamixel.group_read import GroupRead
+from servoid.hw.dynamixel.port import SerialPort
 
 GOAL, GOAL_BYTES = 116, 4
 PRESENT, PRESENT_BYTES = 126, 10  # current, velocity, position

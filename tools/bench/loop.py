@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 
-from hw.robot import load_robot
-from stack.loop import TickRecord
-from stack.session import Settings, run
-from tools import exit_codes
-from tools.output import add_json_argument, reporting
-from tools.run import positive
+from servoid.hw.robot.description import load_robot
+from servoid.stack.log.tick import TickRecord
+from servoid.stack.runtime.run import Settings, run
+from servoid.tools.commands.run import positive
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import add_json_argument, reporting
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

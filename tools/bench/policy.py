@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tools.output import Report, add_json_argument, reporting
+from servoid.tools.common.output import Report, add_json_argument, reporting
 
 if TYPE_CHECKING:
     import torch
 
-    from hw.hal import PlanRequest
-    from hw.robot import Robot
-    from policy.diffusion.checkpoint import Model
-    from policy.diffusion.engines import Engine
-    from policy.diffusion.runtime import Runtime
-    from policy.diffusion.settings import DiffusionSettings
+    from servoid.hw.contracts.control import PlanRequest
+    from servoid.hw.robot.description import Robot
+    from servoid.policy.diffusion.checkpoint import Model
+    from servoid.policy.diffusion.engines import Engine
+    from servoid.policy.diffusion.runtime import Runtime
+    from servoid.policy.diffusion.settings import DiffusionSettings
 
 RANDOM = "random"
 NONE = "none"
@@ -80,10 +80,10 @@ class Network:
 
 
 def _run(args: argparse.Namespace, report: Report) -> None:
-    from hw.config import ConfigError
-    from hw.robot import load_robot
-    from policy.diffusion.engines import ENGINES, check_engine, load_engine
-    from policy.diffusion.settings import load_settings
+    from servoid.hw.config import ConfigError
+    from servoid.hw.robot.description import load_robot
+    from servoid.policy.diffusion.engines import ENGINES, check_engine, load_engine
+    from servoid.policy.diffusion.settings import load_settings
 
     if args.plans < 1:
         raise ConfigError(f"--plans must be at least 1, not {args.plans}")
@@ -144,9 +144,9 @@ def _time(
 
     `call_ms` are times of single calls, which are the same in all of them.
     """
-    from policy.diffusion.engines import REFERENCE
-    from policy.diffusion.runtime import Runtime
-    from stack.tasks import load_task
+    from servoid.policy.diffusion.engines import REFERENCE
+    from servoid.policy.diffusion.runtime import Runtime
+    from servoid.stack.tasks import load_task
 
     cost = load_task("walk", dt=robot.dt).cost
     request = _request(robot, network.model, settings.delay)
@@ -183,11 +183,11 @@ def _time(
 
 def _networks(args: argparse.Namespace, robot: Robot) -> list[Network]:
     """The checkpoint, or one with random weights without it, and the network of `--shape`."""
-    from policy.checkpoint import CheckpointError, resolve
-    from policy.diffusion.checkpoint import load
-    from policy.diffusion.config import DenoiserConfig
-    from policy.diffusion.features import Normaliser, token_layout
-    from policy.diffusion.settings import load_settings
+    from servoid.policy.checkpoint import CheckpointError, resolve
+    from servoid.policy.diffusion.checkpoint import load
+    from servoid.policy.diffusion.config import DenoiserConfig
+    from servoid.policy.diffusion.features import Normaliser, token_layout
+    from servoid.policy.diffusion.settings import load_settings
 
     name, model = RANDOM, None
     if args.checkpoint != RANDOM:
@@ -218,7 +218,7 @@ def _networks(args: argparse.Namespace, robot: Robot) -> list[Network]:
 
 def _shape(text: str) -> tuple[int, int, int]:
     """Past states, states and actions to come. Raises ConfigError."""
-    from hw.config import ConfigError
+    from servoid.hw.config import ConfigError
 
     try:
         past, states, actions = (int(part) for part in text.split(","))
@@ -231,8 +231,8 @@ def _made_up(config: Any, states: Any, actions: Any) -> Model:
     """A network of this shape with random weights, the same every time."""
     import torch
 
-    from policy.diffusion.checkpoint import Model
-    from policy.diffusion.denoiser import Denoiser
+    from servoid.policy.diffusion.checkpoint import Model
+    from servoid.policy.diffusion.denoiser import Denoiser
 
     torch.manual_seed(0)
     return Model(Denoiser(config).eval().requires_grad_(False), states, actions, {})
@@ -240,8 +240,8 @@ def _made_up(config: Any, states: Any, actions: Any) -> Model:
 
 def _request(robot: Robot, model: Model, delay: int) -> PlanRequest:
     """A robot that stands at home."""
-    from hw.hal import Instruction, PlanRequest
-    from policy.diffusion.features import raw_layout
+    from servoid.hw.contracts.control import Instruction, PlanRequest
+    from servoid.policy.diffusion.features import raw_layout
 
     layout = raw_layout(len(robot.joints))
     row = np.zeros(layout.size, dtype=np.float32)
@@ -274,7 +274,7 @@ def _call_times(engine: Engine, model: Model, calls: int) -> list[float]:
     """Milliseconds of single network calls for one robot."""
     import torch
 
-    from policy.diffusion.runtime import one_thread
+    from servoid.policy.diffusion.runtime import one_thread
 
     inputs, times = _inputs(model), []
     with one_thread(), torch.inference_mode():
@@ -317,7 +317,7 @@ def peak_gflops(size: int = PEAK_SIZE, repeats: int = 12) -> float:
     """The best rate, 1e9 operations a second, of a float32 matrix product on one thread: this machine, as it is now."""
     import torch
 
-    from policy.diffusion.runtime import one_thread
+    from servoid.policy.diffusion.runtime import one_thread
 
     a = torch.randn(size, size, generator=torch.Generator().manual_seed(0))
     out = torch.empty_like(a)

@@ -1,6 +1,6 @@
 """Servos for timing a client: answers on a pty when the last byte of an answer would have come over a wire.
 
-    python -m tools.bench.responder
+    python -m servoid.tools.bench.responder
 
 The first line of standard output is the port. It knows sync writes of goals, the plain and the fast sync read, and the
 read of one device: as little as a control cycle needs, so that what is timed is the client. A goal that was written is
@@ -17,11 +17,11 @@ import struct
 import sys
 import time
 
-from hw.dynamixel import codec
-from hw.dynamixel.bus import BITS
-from hw.dynamixel.codec import Instruction
-from sim.rig.terminal import Terminal
-from stack.steady import steady
+from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.bus import BITS
+from servoid.hw.dynamixel.codec import Instruction
+from servoid.sim.rig.pty import Terminal
+from servoid.stack.runtime.realtime import steady
 
 CURRENT, VELOCITY = 7, -11  # raw values that every servo reports
 ALERT_SECONDS = 0.02  # after a packet, in which the next is watched for and not slept for

@@ -10,7 +10,7 @@ import argparse
 import os
 import time
 
-from tools.output import add_json_argument, reporting
+from servoid.tools.common.output import add_json_argument, reporting
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,11 +34,11 @@ def measure(robot_name: str, worlds: int, ticks: int) -> dict[str, float]:
     import numpy as np
     from mujoco.batch import Batch
 
-    from hw.robot import load_robot
-    from policy.checkpoint import CheckpointError
-    from stack.odometry import load_odometry
-    from tools.train.settings import load_settings
-    from tools.train.tracking import Tracking
+    from servoid.hw.robot.description import load_robot
+    from servoid.policy.checkpoint import CheckpointError
+    from servoid.stack.estimation.odometry import load_odometry
+    from servoid.tools.learn.envs.tracking import Tracking
+    from servoid.tools.learn.settings import load_settings
 
     robot = load_robot(robot_name)
     try:

@@ -14,19 +14,19 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
-from hw.config import ConfigError, nearest
-from hw.hal import Array, BackendError
-from hw.robot import Robot, load_robot
-from tools import exit_codes
-from tools.bringup.line import Line, add_line_arguments, is_virtual, open_line
-from tools.output import Report, reporting
-from tools.prompt import confirm
+from servoid.hw.config import ConfigError, nearest
+from servoid.hw.contracts.body import Array, BackendError
+from servoid.hw.robot.description import Robot, load_robot
+from servoid.tools.bringup.line import Line, add_line_arguments, is_virtual, open_line
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import Report, reporting
+from servoid.tools.common.prompt import confirm
 
 if TYPE_CHECKING:
-    from hw.calibration import Calibration, JointCalibration
-    from hw.dynamixel.survey import Found
-    from tools.bringup.encoders import Encoders
-    from tools.bringup.hands import Hands
+    from servoid.hw.dynamixel.register_check import Found
+    from servoid.hw.robot.calibration import Calibration, JointCalibration
+    from servoid.tools.bringup.encoders import Encoders
+    from servoid.tools.bringup.hands import Hands
 
 MOVED = 0.15  # rad that a joint has to be turned by
 BEYOND = 0.1  # rad beyond its range at which a joint cannot be
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
-        from hw.calibration import apply, calibration_path, save_calibration
+        from servoid.hw.robot.calibration import apply, calibration_path, save_calibration
 
         robot = load_robot(args.robot)
         virtual = is_virtual(args)
@@ -71,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
         reference = _reference(args.pose, robot)
         delivery = None
         if virtual:
-            from sim.rig.delivery import Delivery
+            from servoid.sim.rig.factory_state import Delivery
 
             delivery = Delivery(assembly="random")
         with open_line(args, robot, delivery=delivery, seed=args.seed) as line:
@@ -104,11 +104,11 @@ def _measure(
     """Zeros [rad] and directions `(n_joints,)`."""
     import numpy as np
 
-    from hw.dynamixel.bus import LONGEST_RETURN_DELAY
-    from hw.dynamixel.discovery import BAUDS, power_on
-    from hw.dynamixel.survey import find_servos
-    from tools.bringup.encoders import Encoders, short
-    from tools.bringup.hands import Person, VirtualHands
+    from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY
+    from servoid.hw.dynamixel.bus_scan import BAUDS, power_on
+    from servoid.hw.dynamixel.register_check import find_servos
+    from servoid.tools.bringup.encoders import Encoders, short
+    from servoid.tools.bringup.hands import Person, VirtualHands
 
     power_on(line.bus, robot.bus.board_id, [robot.bus.baud, *BAUDS])
     if line.bus.port.baud != robot.bus.baud:
@@ -150,7 +150,7 @@ def directions_of(
     """Direction of each chosen joint, by number, from turns by hand, each away from the nearer end of its range."""
     import numpy as np
 
-    from tools.bringup.turning import describe_turns
+    from servoid.tools.bringup.turning import describe_turns
 
     signs = np.where(robot.upper - reference >= reference - robot.lower, 1, -1)
     texts = describe_turns(robot, reference, signs)
@@ -177,7 +177,7 @@ def turned(encoders: Encoders, start: Array, i: int, robot: Robot) -> float | No
     """
     import numpy as np
 
-    from tools.bringup.encoders import PERIOD_NS, short
+    from servoid.tools.bringup.encoders import PERIOD_NS, short
 
     ticks, others = round(PATIENCE * 1e9 / PERIOD_NS), 0
     for _ in range(ticks):
@@ -245,7 +245,7 @@ def _earlier(path: Path | None, robot: Robot, chosen: list[int], keep: bool) -> 
     whole = len(chosen) == len(robot.joints)
     if path is None or (whole and not (keep and path.exists())):
         return {}
-    from hw.calibration import load_calibration
+    from servoid.hw.robot.calibration import load_calibration
 
     if not path.exists():
         raise ConfigError(f"{path}: no such calibration yet: calibrate all joints first, without --joint")
@@ -265,7 +265,7 @@ def _calibration(
     earlier: Mapping[str, JointCalibration],
     pose: str,
 ) -> Calibration:
-    from hw.calibration import Calibration, JointCalibration
+    from servoid.hw.robot.calibration import Calibration, JointCalibration
 
     joints = {}
     for i, (joint, servo) in enumerate(zip(robot.joints, robot.servos, strict=True)):

@@ -9,9 +9,9 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 
-from tools import exit_codes
-from tools.bringup.line import add_line_arguments, assembled, open_line
-from tools.output import reporting
+from servoid.tools.bringup.line import add_line_arguments, assembled, open_line
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import reporting
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,8 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
-        from hw.dynamixel.bus import LONGEST_RETURN_DELAY
-        from hw.dynamixel.survey import as_table, compare, correct, find_board, find_servos
+        from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY
+        from servoid.hw.dynamixel.register_check import as_table, compare, correct, find_board, find_servos
 
         robot = assembled(args, report)
         with open_line(args, robot) as line:

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hw.dynamixel.bus import Bus
-from hw.dynamixel.group import GroupRead
-from hw.dynamixel.survey import Found
-from hw.hal import Array, BackendError, Clock
-from hw.robot import Robot
+from servoid.hw.contracts.body import Array, BackendError, Clock
+from servoid.hw.dynamixel.bus import Bus
+from servoid.hw.dynamixel.group_read import GroupRead
+from servoid.hw.dynamixel.register_check import Found
+from servoid.hw.robot.description import Robot
 
 STILL = 0.02  # rad that an angle may change by within WINDOW samples and yet be still: above a hand's tremor
 WINDOW = 15

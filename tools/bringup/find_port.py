@@ -12,12 +12,12 @@ import sys
 import time
 from dataclasses import asdict
 
-from hw.hal import BackendError
-from tools import exit_codes
-from tools.bringup.line import VIRTUAL, add_line_arguments
-from tools.bringup.ports import PortInfo, usb_ports
-from tools.output import Report, reporting
-from tools.run import positive
+from servoid.hw.contracts.body import BackendError
+from servoid.tools.bringup.line import VIRTUAL, add_line_arguments
+from servoid.tools.bringup.ports import PortInfo, usb_ports
+from servoid.tools.commands.run import positive
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import Report, reporting
 
 PATIENCE = 60.0  # s
 _POLL = 0.2  # s
@@ -101,8 +101,8 @@ def _change(before: dict[str, PortInfo], seconds: float, *, coming: bool = False
 
 def _virtual(args: argparse.Namespace, report: Report) -> int:
     """Start a rig, and show where it would be found."""
-    from hw.robot import load_robot
-    from sim.rig.control import RigProcess
+    from servoid.hw.robot.description import load_robot
+    from servoid.sim.rig.control import RigProcess
 
     robot = load_robot(args.robot)
     with RigProcess(robot) as rig:

@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping
 from typing import Protocol
 
-from hw.robot import Robot
-from sim.rig.control import Control
-from tools.output import Report
-from tools.prompt import confirm
+from servoid.hw.robot.description import Robot
+from servoid.sim.rig.control import Control
+from servoid.tools.common.output import Report
+from servoid.tools.common.prompt import confirm
 
 TURN = 0.35  # rad that the virtual rig's hands turn a joint by
 

@@ -12,17 +12,17 @@ import sys
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, TextIO
 
-from hw.config import ConfigError, nearest
-from hw.hal import Array, Backend, BackendError, Sensors
-from hw.robot import Robot
-from tools import exit_codes
-from tools.bringup.line import add_line_arguments, assembled, is_virtual
-from tools.output import Report, Screen, reporting
-from tools.prompt import confirm
+from servoid.hw.config import ConfigError, nearest
+from servoid.hw.contracts.body import Array, Backend, BackendError, Sensors
+from servoid.hw.robot.description import Robot
+from servoid.tools.bringup.line import add_line_arguments, assembled, is_virtual
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import Report, Screen, reporting
+from servoid.tools.common.prompt import confirm
 
 if TYPE_CHECKING:
-    from stack.loop import TickRecord
-    from stack.safety import Guard
+    from servoid.stack.log.tick import TickRecord
+    from servoid.stack.safety.guard import Guard
 
 _READS = 25  # of a first pose: half a second
 _SHOW_EVERY = 5  # ticks
@@ -37,8 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
-        from stack.backends import make_backend
-        from tools.bringup.jogging import SPAN
+        from servoid.stack.runtime.backends import make_backend
+        from servoid.tools.bringup.jogging import SPAN
 
         robot = assembled(args, report)
         if args.joint not in robot.names:
@@ -65,12 +65,12 @@ def _jog(
 ) -> dict[str, Any]:
     import numpy as np
 
-    from stack.clock import RealTime, Schedule, WallClock
-    from stack.estimator import Estimator
-    from stack.interrupt import Interrupt, Stops
-    from stack.loop import Loop
-    from stack.safety import Guard
-    from tools.bringup.jogging import SPEED, JogPilot, Keys, There, reach, restrict
+    from servoid.stack.estimation.estimator import Estimator
+    from servoid.stack.runtime.clock import RealTime, Schedule, WallClock
+    from servoid.stack.runtime.interrupt import Interrupt, Stops
+    from servoid.stack.runtime.loop import Loop
+    from servoid.stack.safety.guard import Guard
+    from servoid.tools.bringup.jogging import SPEED, JogPilot, Keys, There, reach, restrict
 
     i = robot.names.index(args.joint)
     clock = body.clock
@@ -119,7 +119,7 @@ def _jog(
 
 def _pose(sensors: Sensors, clock: Any, robot: Robot) -> Array:
     """Where every joint is [rad], the newest of several reads. Raises BackendError naming a joint that is silent."""
-    from stack.coast import Coast, missing
+    from servoid.stack.estimation.sample_hold import Coast, missing
 
     coast = Coast()
     for _ in range(_READS):
@@ -135,8 +135,8 @@ def _announce(
 ) -> None:
     import numpy as np
 
-    from tools.bringup.jogging import SPEED
-    from tools.bringup.turning import describe_turns
+    from servoid.tools.bringup.jogging import SPEED
+    from servoid.tools.bringup.turning import describe_turns
 
     joint = robot.joints[i]
     report.line(

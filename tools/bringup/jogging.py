@@ -16,11 +16,12 @@ from dataclasses import replace
 from enum import Enum
 from typing import Any, Protocol
 
-from hw.hal import Array, Observation, State
-from hw.robot import Robot
-from stack.coast import missing
-from stack.loop import Proposal
-from stack.safety import Guard, Phase
+from servoid.hw.contracts.body import Array, Observation
+from servoid.hw.contracts.control import State
+from servoid.hw.robot.description import Robot
+from servoid.stack.estimation.sample_hold import missing
+from servoid.stack.log.tick import Proposal
+from servoid.stack.safety.guard import Guard, Phase
 
 SPEED = 0.25  # rad/s
 SPAN = 0.35  # rad that the joint may go from where it was found, either way

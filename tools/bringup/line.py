@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hw.config import ConfigError
-from hw.hal import Clock
-from hw.robot import Robot, load_robot
-from tools.output import Report, add_json_argument
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Clock
+from servoid.hw.robot.description import Robot, load_robot
+from servoid.tools.common.output import Report, add_json_argument
 
 if TYPE_CHECKING:
-    from hw.dynamixel.bus import Bus
-    from sim.rig.control import Control
-    from sim.rig.delivery import Delivery
+    from servoid.hw.dynamixel.bus import Bus
+    from servoid.sim.rig.control import Control
+    from servoid.sim.rig.factory_state import Delivery
 
 VIRTUAL = "virtual"
 
@@ -44,7 +44,7 @@ def add_line_arguments(parser: argparse.ArgumentParser) -> None:
 def is_virtual(args: argparse.Namespace) -> bool:
     """Whether the verb has a virtual rig of its own. Raises ConfigError when no port was given."""
     if args.port is None:
-        from tools.bringup.ports import usb_ports
+        from servoid.tools.bringup.ports import usb_ports
 
         there = ", ".join(usb_ports()) or "none is plugged in"
         raise ConfigError(f"say which port with --port PATH (USB ports here: {there}), or --port {VIRTUAL} to practise")
@@ -55,7 +55,7 @@ def assembled(args: argparse.Namespace, report: Report) -> Robot:
     """The robot as its file says or, where there is hardware and it was calibrated, as it was measured."""
     robot = load_robot(args.robot)
     if not is_virtual(args):
-        from hw.calibration import calibrated
+        from servoid.hw.robot.calibration import calibrated
 
         robot, text = calibrated(robot)
         report.line(text)
@@ -70,21 +70,21 @@ def open_line(
 
     `delivery` is of a virtual rig. Raises BackendError with the remedy.
     """
-    from hw.clock import WallClock
-    from hw.dynamixel.bus import MARGIN, Bus
-    from hw.dynamixel.discovery import PATIENCE
-    from hw.dynamixel.port import SerialPort
+    from servoid.hw.clock import WallClock
+    from servoid.hw.dynamixel.bus import MARGIN, Bus
+    from servoid.hw.dynamixel.bus_scan import PATIENCE
+    from servoid.hw.dynamixel.port import SerialPort
 
     with ExitStack() as stack:
         clock: Clock = WallClock()
         path, control = str(args.port), None
         if is_virtual(args):
-            from sim.rig.control import LockedClock, RigProcess
+            from servoid.sim.rig.control import LockedClock, RigProcess
 
             rig = stack.enter_context(RigProcess(robot, delivery=delivery, seed=seed))
             path, control, clock = rig.port, rig.control, LockedClock(rig.control)
         elif Path(path + ".control").is_socket():  # where `servoid virtual --link` puts it
-            from sim.rig.control import Control
+            from servoid.sim.rig.control import Control
 
             control = Control(path + ".control")
             stack.callback(control.close)

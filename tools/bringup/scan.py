@@ -10,15 +10,15 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from hw.config import ConfigError
-from hw.hal import BackendError
-from hw.robot import Robot, load_robot
-from tools import exit_codes
-from tools.bringup.line import add_line_arguments, open_line
-from tools.output import Report, reporting
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import BackendError
+from servoid.hw.robot.description import Robot, load_robot
+from servoid.tools.bringup.line import add_line_arguments, open_line
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import Report, reporting
 
 if TYPE_CHECKING:
-    from hw.dynamixel.discovery import Census, Device
+    from servoid.hw.dynamixel.bus_scan import Census, Device
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
-        from hw.dynamixel.discovery import BAUDS, census, power_on
+        from servoid.hw.dynamixel.bus_scan import BAUDS, census, power_on
 
         robot = load_robot(args.robot)
         for baud in args.baud:
@@ -71,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
 
 def check_baud(baud: int) -> None:
     """Raise ConfigError for a baud that no servo has."""
-    from hw.dynamixel.discovery import BAUDS
+    from servoid.hw.dynamixel.bus_scan import BAUDS
 
     if baud not in BAUDS:
         raise ConfigError(f"--baud {baud}: Dynamixel servos have {', '.join(map(str, BAUDS))} bit/s")
@@ -92,7 +92,7 @@ def absent(found: Census, robot: Robot) -> list[str]:
 
 def misfits(device: Device, robot: Robot) -> list[str]:
     """What a person should mend about a device, with the remedy."""
-    from hw.faults import describe, remedy
+    from servoid.hw.faults import describe, remedy
 
     if device.is_board:
         return []
@@ -120,7 +120,7 @@ def misfits(device: Device, robot: Robot) -> list[str]:
 
 def described(device: Device, robot: Robot) -> dict[str, Any]:
     """A device as JSON values."""
-    from hw.faults import describe
+    from servoid.hw.faults import describe
 
     torque = device.get("torque_enable")
     return {

@@ -10,19 +10,19 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from hw.config import ConfigError, nearest
-from hw.hal import BackendError
-from hw.robot import Robot, load_robot
-from hw.robot_checks import MAX_ID
-from tools import exit_codes
-from tools.bringup.line import add_line_arguments, is_virtual, open_line
-from tools.bringup.scan import check_baud
-from tools.output import Report, reporting
-from tools.prompt import confirm
+from servoid.hw.config import ConfigError, nearest
+from servoid.hw.contracts.body import BackendError
+from servoid.hw.robot.checks import MAX_ID
+from servoid.hw.robot.description import Robot, load_robot
+from servoid.tools.bringup.line import add_line_arguments, is_virtual, open_line
+from servoid.tools.bringup.scan import check_baud
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import Report, reporting
+from servoid.tools.common.prompt import confirm
 
 if TYPE_CHECKING:
-    from hw.dynamixel.bus import Bus
-    from hw.dynamixel.discovery import Device
+    from servoid.hw.dynamixel.bus import Bus
+    from servoid.hw.dynamixel.bus_scan import Device
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +39,7 @@ def main(args: argparse.Namespace) -> int:
         id, baud, model = _wanted(args, robot)
         delivery = None
         if is_virtual(args):
-            from sim.rig.delivery import Delivery
+            from servoid.sim.rig.factory_state import Delivery
 
             alone = (args.joint or robot.joints[0].name,)
             delivery = Delivery(fresh=alone, only=alone)
@@ -55,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
                 report.line(f"will be written: {', '.join(changes)}")
                 if not args.yes:
                     confirm("It is kept without power")
-                from hw.dynamixel.discovery import assign
+                from servoid.hw.dynamixel.bus_scan import assign
 
                 after = assign(line.bus, device, id, baud)
                 report.line(f"done: {after} answers and reads back")
@@ -76,7 +76,7 @@ def main(args: argparse.Namespace) -> int:
 
 def find_one(bus: Bus, robot: Robot, baud: int, report: Report) -> Device:
     """The only servo on the bus. Raises BackendError when there is none, or more than one."""
-    from hw.dynamixel.discovery import BAUDS, FACTORY_BAUD, census, power_on
+    from servoid.hw.dynamixel.bus_scan import BAUDS, FACTORY_BAUD, census, power_on
 
     power = power_on(bus, robot.bus.board_id, [robot.bus.baud, *BAUDS])
     report.line(power or f"no board with ID {robot.bus.board_id}: the servo needs a supply of its own")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.hal import Array
-from hw.robot import Robot
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
 
 _LEVER = 0.015  # m: what lies closer to the axis hardly moves
 _WORDS = (("forward", "backward"), ("left", "right"), ("up", "down"))  # of the base's axes
@@ -18,7 +18,7 @@ def describe_turns(robot: Robot, pose: Array, signs: Array) -> list[str]:
     """
     import mujoco
 
-    from sim.model import build
+    from servoid.sim.model import build
 
     model = build(robot)
     data = mujoco.MjData(model)

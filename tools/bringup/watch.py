@@ -12,16 +12,16 @@ from collections import deque
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
-from hw.robot import Robot
-from tools import exit_codes
-from tools.bringup.line import Line, add_line_arguments, assembled, is_virtual, open_line
-from tools.output import Report, reporting
-from tools.run import positive
+from servoid.hw.robot.description import Robot
+from servoid.tools.bringup.line import Line, add_line_arguments, assembled, is_virtual, open_line
+from servoid.tools.commands.run import positive
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import Report, reporting
 
 if TYPE_CHECKING:
-    from hw.dynamixel.bus import Counters
-    from hw.hal import Observation
-    from hw.imu.serial_imu import SerialImu
+    from servoid.hw.contracts.body import Observation
+    from servoid.hw.dynamixel.bus import Counters
+    from servoid.hw.imu.serial_imu import SerialImu
 
 RATE = 20  # reads a second
 SHOW_SECONDS = 0.5  # between tables on a terminal
@@ -40,7 +40,7 @@ def main(args: argparse.Namespace) -> int:
         with open_line(args, robot, patient=False) as line, ExitStack() as stack:
             imu = None
             if robot.imu.kind != "opencr" and not is_virtual(args):  # a virtual rig has it on its board
-                from hw.imu.serial_imu import SerialImu
+                from servoid.hw.imu.serial_imu import SerialImu
 
                 imu = SerialImu(robot.imu, robot.rate, clock=line.clock)
                 stack.callback(imu.close)
@@ -59,13 +59,13 @@ class Watched:
 
     def __init__(self, line: Line, robot: Robot, imu: SerialImu | None = None) -> None:
         """Raises BackendError when a servo or the board does not answer."""
-        from hw.dynamixel.bus import LONGEST_RETURN_DELAY
-        from hw.dynamixel.sensors import DynamixelSensors, present
-        from hw.dynamixel.survey import find_board, find_servos
-        from hw.dynamixel.units import Units
-        from hw.dynamixel.watch import Watch
-        from stack.clock import RealTime, WallClock
-        from stack.coast import Coast
+        from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY
+        from servoid.hw.dynamixel.register_check import find_board, find_servos
+        from servoid.hw.dynamixel.sensors import DynamixelSensors, present
+        from servoid.hw.dynamixel.servo_monitor import Watch
+        from servoid.hw.dynamixel.units import Units
+        from servoid.stack.estimation.sample_hold import Coast
+        from servoid.stack.runtime.clock import RealTime, WallClock
 
         bus = line.bus
         bus.return_delay = LONGEST_RETURN_DELAY  # until the servos' own is known
@@ -88,7 +88,7 @@ class Watched:
         """Read for so long, or until KeyboardInterrupt; with a report, show a table now and then."""
         import numpy as np
 
-        from stack.clock import Schedule
+        from servoid.stack.runtime.clock import Schedule
 
         schedule, tick, every = Schedule(self._clock, RATE), -1, round(SHOW_SECONDS * RATE)
         while seconds is None or tick + 1 <= seconds * RATE:
@@ -132,7 +132,7 @@ class Watched:
     def _imu(self) -> str:
         import numpy as np
 
-        from hw.faults import IMU, describe
+        from servoid.hw.faults import IMU, describe
 
         o = self._newest
         assert o is not None
@@ -146,7 +146,7 @@ class Watched:
         return f"IMU: force {force} m/s2, turning {turning} rad/s"
 
     def _rows(self) -> list[dict[str, Any]]:
-        from hw.faults import ROBOT, describe
+        from servoid.hw.faults import ROBOT, describe
 
         o = self._newest
         assert o is not None

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hw.config import ConfigError
-from tools.output import to_json
+from servoid.hw.config import ConfigError
+from servoid.tools.common.output import to_json
 
 
 def key(spec: Mapping[str, Any]) -> str:

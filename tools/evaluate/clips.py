@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from hw.config import ConfigError
-from tools.evaluate.cache import key
-from tools.evaluate.code import code
+from servoid.hw.config import ConfigError
+from servoid.tools.evaluate.cache import key
+from servoid.tools.evaluate.code_hash import code
 
 SECONDS = 10.0
 SEED = 7_000_000  # of the first clip; demonstrations come from other streams
@@ -18,10 +18,10 @@ def recipe(robot: str) -> dict[str, Any]:
     """What clips depend on beside their number. Raises ConfigError for an unknown robot."""
     from dataclasses import asdict
 
-    from hw.robot import load_robot
-    from policy.checkpoint import resolve
-    from policy.gait import load_gait
-    from stack.provenance import fingerprint, sha256
+    from servoid.hw.robot.description import load_robot
+    from servoid.policy.checkpoint import resolve
+    from servoid.policy.references.gait import load_gait
+    from servoid.stack.log.provenance import fingerprint, sha256
 
     return {
         "expert": sha256(resolve("expert")),
@@ -38,7 +38,7 @@ def record_clips(folder: Path, robot: str, number: int) -> list[Path]:
 
     Raises ConfigError where the expert falls too often.
     """
-    from stack.session import Settings, run
+    from servoid.stack.runtime.run import Settings, run
 
     place, clips = folder / key(recipe(robot)), []
     for seed in range(SEED, SEED + _TRIES * number):

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hw.hal import Array, Trace
-from tools.exit_codes import explain
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.task import Trace
+from servoid.tools.common.exit_codes import explain
 
 if TYPE_CHECKING:
-    from stack.session import Settings
+    from servoid.stack.runtime.run import Settings
 
 PATH_STEP = 0.2  # s between the points of a path that is kept
 _STREAM = 20_250_417  # any number but 0: the episodes are not those of `servoid rollout`, on which settings are tried
@@ -54,9 +55,9 @@ def do(job: Job) -> Done:
 
 def record(settings: Settings) -> dict[str, Any]:
     """Do an episode and keep what any row could ask of it. Raises ConfigError."""
-    from hw.robot import load_robot
-    from tools.motion import quality
-    from tools.rollout import judge
+    from servoid.hw.robot.description import load_robot
+    from servoid.tools.commands.rollout import judge
+    from servoid.tools.common.motion_quality import quality
 
     judged = judge(settings)
     trace, task = judged.trace, judged.task

@@ -12,14 +12,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hw.config import ConfigError
-from tools.evaluate.rows import Row, select
-from tools.evaluate.session import Options, evaluate
-from tools.evaluate.summary import Measured, table
-from tools.evaluate.table import LEFT_OUT, ROWS
-from tools.evaluate.write import HEAD, as_csv, cells, markdown
-from tools.output import Report, add_json_argument, reporting
-from tools.parser import check_seed
+from servoid.hw.config import ConfigError
+from servoid.tools.common.output import Report, add_json_argument, reporting
+from servoid.tools.common.parser import check_seed
+from servoid.tools.evaluate.runner import Options, evaluate
+from servoid.tools.evaluate.spec import Row, select
+from servoid.tools.evaluate.summary import Measured, table
+from servoid.tools.evaluate.table import LEFT_OUT, ROWS
+from servoid.tools.evaluate.write import HEAD, as_csv, cells, markdown
 
 QUICK_EPISODES = 2
 QUICK_MINUTES = 9.0  # one more is for the start and for drawing
@@ -94,10 +94,10 @@ def main(args: argparse.Namespace) -> int:
 
 def encoder_accuracy() -> dict[str, Any]:
     """Share of the held-out phrasings whose nearest training phrasing names the same motion: no robot in it."""
-    from policy.text.captions import MOTIONS
-    from policy.text.encoder import load_encoder
-    from policy.text.understanding import Phrasebook
-    from tools.intervals import wilson
+    from servoid.policy.text.captions import MOTIONS
+    from servoid.policy.text.encoder import load_encoder
+    from servoid.policy.text.nearest_phrase import Phrasebook
+    from servoid.tools.common.confidence import wilson
 
     pairs = [(number, text) for number, motion in enumerate(MOTIONS) for text in motion.held_out]
     read = Phrasebook(load_encoder()).nearest([text for _, text in pairs])
@@ -145,7 +145,7 @@ def _write(
 
     Raises ConfigError.
     """
-    from stack.policies import policy_fingerprint
+    from servoid.stack.control.policies import policy_fingerprint
 
     if not any(result.records for result in measured.values()):
         report.line(f"nothing was measured: no page is written in {options.out}")
@@ -174,7 +174,7 @@ def _write(
 
 def _draw(out: Path, rows: Sequence[Row], measured: Mapping[str, Measured], report: Report) -> list[Path]:
     """A picture of each run that went anywhere, once where rows share it."""
-    from tools.evaluate.draw import draw_paths
+    from servoid.tools.evaluate.plots import draw_paths
 
     pictures: list[Path] = []
     drawn: list[Measured] = []

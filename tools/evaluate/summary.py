@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from tools.evaluate.rows import Beside, Row, cut_short
-from tools.intervals import LEAST, bootstrap, wilson
+from servoid.tools.common.confidence import LEAST, bootstrap, wilson
+from servoid.tools.evaluate.spec import Beside, Row, cut_short
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from tools.evaluate.rows import Beside, Metric, Network, Row, Run
+from servoid.tools.evaluate.spec import Beside, Metric, Network, Row, Run
 
 UNIPHYS, CLOC, OURS = "UniPhys", "Diffuse-CLoC", "Servoid"
 

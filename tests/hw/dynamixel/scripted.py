@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from hw.dynamixel import codec
-from hw.dynamixel.codec import BROADCAST, Instruction, Packet, Parser
-from hw.dynamixel.tables import ControlTable, table
-from hw.hal import BackendError
+from servoid.hw.contracts.body import BackendError
+from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.codec import BROADCAST, Instruction, Packet, Parser
+from servoid.hw.dynamixel.tables import ControlTable, table
 
 BYTE_NS = 5000  # at 2 Mbit/s
 

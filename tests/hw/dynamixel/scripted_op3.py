@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from scripted import Memory, ScriptedBus
 
-from hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
-from hw.dynamixel.motors import DynamixelMotors
-from hw.hal import Command, Mode, Observation
-from hw.robot import load_robot
+from servoid.hw.contracts.body import Command, Mode, Observation
+from servoid.hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
+from servoid.hw.dynamixel.motors import DynamixelMotors
+from servoid.hw.robot.description import load_robot
 
 ROBOT = load_robot("op3")
 TICK_NS = 20_000_000

@@ -10,12 +10,12 @@ import pytest
 from scripted import Memory
 from scripted_op3 import ROBOT, Robot, active, run
 
-from hw.config import CONFIGS
-from hw.dynamixel import codec
-from hw.dynamixel.backend import DynamixelBackend
-from hw.dynamixel.codec import Instruction
-from hw.dynamixel.survey import as_table
-from hw.hal import BackendError, Command, Mode
+from servoid.hw.config import CONFIGS
+from servoid.hw.contracts.body import BackendError, Command, Mode
+from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.backend import DynamixelBackend
+from servoid.hw.dynamixel.codec import Instruction
+from servoid.hw.dynamixel.register_check import as_table
 
 
 @pytest.fixture

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scripted_op3 import ROBOT, TICK_NS, Robot, active, run
 
-from hw.dynamixel.backend import DynamixelBackend
-from hw.faults import (
+from servoid.hw.contracts.body import BackendError
+from servoid.hw.dynamixel.backend import DynamixelBackend
+from servoid.hw.faults import (
     IMU_DEAD,
     IMU_FROZEN,
     IMU_SILENT,
@@ -20,7 +21,6 @@ from hw.faults import (
     WATCHDOG,
     describe,
 )
-from hw.hal import BackendError
 
 
 @pytest.fixture

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scripted_op3 import ROBOT, Robot, run
 
-from hw.dynamixel import backend as module
-from hw.dynamixel.backend import DynamixelBackend
-from hw.faults import IMU_FROZEN, STOP_BUTTON
-from hw.hal import BackendError
-from hw.imu.reading import Reading
+from servoid.hw.contracts.body import BackendError
+from servoid.hw.dynamixel import backend as module
+from servoid.hw.dynamixel.backend import DynamixelBackend
+from servoid.hw.faults import IMU_FROZEN, STOP_BUTTON
+from servoid.hw.imu.reading import Reading
 
 OWN = replace(ROBOT, imu=replace(ROBOT.imu, kind="witmotion", port="/dev/imu", signs=(1.0, 1.0, 1.0)))
 

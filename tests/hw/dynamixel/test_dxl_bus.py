@@ -7,11 +7,11 @@ import struct
 import pytest
 from scripted import BYTE_NS, Memory, ScriptedBus
 
-from hw.dynamixel import codec
-from hw.dynamixel.bus import GAP_NS, Bus
-from hw.dynamixel.codec import Instruction
-from hw.dynamixel.group import GroupRead
-from hw.hal import BackendError
+from servoid.hw.contracts.body import BackendError
+from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.bus import GAP_NS, Bus
+from servoid.hw.dynamixel.codec import Instruction
+from servoid.hw.dynamixel.group_read import GroupRead
 
 IDS = list(range(1, 21))
 PRESENT = [(id, 126, 10) for id in IDS]

@@ -17,12 +17,12 @@ from pathlib import Path
 import pytest
 from scripted import Memory
 
-from hw.dynamixel import codec, guardian
-from hw.dynamixel.codec import Instruction, Packet, Parser
-from hw.dynamixel.lifeline import Lifeline
-from hw.dynamixel.port import SerialPort
-from hw.dynamixel.tables import table
-from hw.hal import BackendError
+from servoid.hw.contracts.body import BackendError
+from servoid.hw.dynamixel import codec, guardian
+from servoid.hw.dynamixel.codec import Instruction, Packet, Parser
+from servoid.hw.dynamixel.guardian_client import Lifeline
+from servoid.hw.dynamixel.port import SerialPort
+from servoid.hw.dynamixel.tables import table
 
 IDS = (1, 2, 3, 14)
 TORQUE = table("xm430-w350").item("torque_enable").address
@@ -257,9 +257,9 @@ def test_a_guardian_that_cannot_be_replaced_does_not_keep_torque_on(
 
 CONTROLLER = """
 import os, sys, time
-from hw.dynamixel.lifeline import Lifeline
-from hw.dynamixel.port import SerialPort
-from hw.dynamixel.tables import table
+from servoid.hw.dynamixel.guardian_client import Lifeline
+from servoid.hw.dynamixel.port import SerialPort
+from servoid.hw.dynamixel.tables import table
 line = Lifeline(SerialPort(sys.argv[1], 2_000_000), (1, 2, 3, 14), table("xm430-w350"), 0.0)
 line.hold()
 if os.fork() == 0:  # a child that keeps everything open, the pipe among it

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from hw.clock import WallClock
-from hw.dynamixel.port import SerialPort, drain
-from hw.hal import BackendError
+from servoid.hw.clock import WallClock
+from servoid.hw.contracts.body import BackendError
+from servoid.hw.dynamixel.port import SerialPort, drain
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from hw.dynamixel.backend import DynamixelBackend
-from hw.hal import BackendError, Command, Mode
-from hw.robot import load_robot
+from servoid.hw.contracts.body import BackendError, Command, Mode
+from servoid.hw.dynamixel.backend import DynamixelBackend
+from servoid.hw.robot.description import load_robot
 
 ROBOT = load_robot("op3")
 
@@ -20,7 +20,9 @@ ROBOT = load_robot("op3")
 @pytest.fixture
 def port() -> Iterator[str]:
     server = subprocess.Popen(
-        [sys.executable, "-m", "sim.rig.server", "--robot", "op3", "--linger", "30"], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-m", "servoid.sim.rig.server", "--robot", "op3", "--linger", "30"],
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert server.stdout is not None
     try:

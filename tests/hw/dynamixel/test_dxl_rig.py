@@ -7,14 +7,14 @@ import contextlib
 import numpy as np
 import pytest
 
-from hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
-from hw.dynamixel.motors import DynamixelMotors
-from hw.faults import LATE, TORQUE_LOST, WATCHDOG
-from hw.hal import Command, Mode, Observation
-from hw.robot import load_robot
-from sim.rig.faults import Fault
-from sim.rig.local import LocalLine
-from sim.rig.rig import Rig
+from servoid.hw.contracts.body import Command, Mode, Observation
+from servoid.hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
+from servoid.hw.dynamixel.motors import DynamixelMotors
+from servoid.hw.faults import LATE, TORQUE_LOST, WATCHDOG
+from servoid.hw.robot.description import load_robot
+from servoid.sim.rig.faults import Fault
+from servoid.sim.rig.in_process import LocalLine
+from servoid.sim.rig.rig import Rig
 
 ROBOT = load_robot("op3")
 TICK_NS = 20_000_000

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hw.config import ConfigError
-from hw.dynamixel.tables import models, table
+from servoid.hw.config import ConfigError
+from servoid.hw.dynamixel.tables import models, table
 
 easy_sdk = pytest.importorskip("dynamixel_easy_sdk")
 SHIPPED = Path(easy_sdk.__file__).parent / "control_table"

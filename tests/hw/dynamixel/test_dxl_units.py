@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hw.dynamixel.tables import table
-from hw.dynamixel.units import Units
-from hw.robot import Robot, load_robot
+from servoid.hw.dynamixel.tables import table
+from servoid.hw.dynamixel.units import Units
+from servoid.hw.robot.description import Robot, load_robot
 
 ROBOT = load_robot("op3")
 TICK = 2 * np.pi / 4096

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from imu_bytes import rvc, wit, wit_sample
 
-from hw.imu import bno08x, witmotion
-from hw.imu.bno08x import Bno08x
-from hw.imu.reading import Decoder
-from hw.imu.rotations import conjugate, multiply
-from hw.imu.witmotion import WitMotion
+from servoid.hw.imu import bno08x, witmotion
+from servoid.hw.imu.bno08x import Bno08x
+from servoid.hw.imu.reading import Decoder
+from servoid.hw.imu.rotations import conjugate, multiply
+from servoid.hw.imu.witmotion import WitMotion
 
 G = 9.80665
 # The example of the BNO080 data sheet, 1.3.5.2: yaw 0.01, pitch -1.10, roll 20.85 degrees; -371, -20, 977 mg.

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from hw.imu.mounting import Mounting
-from hw.imu.rotations import conjugate, multiply, turn_between, yaw_pitch_roll
+from servoid.hw.imu.mounting import Mounting
+from servoid.hw.imu.rotations import conjugate, multiply, turn_between, yaw_pitch_roll
 
 QUARTER = math.pi / 2
 

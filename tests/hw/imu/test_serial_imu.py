@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from imu_bytes import rvc, wit_sample
 
-from hw.faults import IMU_DEAD, IMU_FROZEN, IMU_SILENT
-from hw.hal import BackendError
-from hw.imu.serial_imu import SerialImu
-from hw.robot import Imu, load_robot
+from servoid.hw.contracts.body import BackendError
+from servoid.hw.faults import IMU_DEAD, IMU_FROZEN, IMU_SILENT
+from servoid.hw.imu.serial_imu import SerialImu
+from servoid.hw.robot.description import Imu, load_robot
 
 OP3 = load_robot().imu
 

@@ -11,13 +11,13 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from hw.mirror import Mirror
-from hw.robot import load_robot
-from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.dataset import DatasetError, Windows, read_recording
-from policy.diffusion.features import Emphasis, Normaliser, raw_mirror, token_layout
-from policy.text.captions import MOTIONS, motion_of
-from policy.text.encoder import load_encoder
+from servoid.hw.robot.description import load_robot
+from servoid.hw.robot.mirror import Mirror
+from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.dataset import DatasetError, Windows, read_recording
+from servoid.policy.diffusion.features import Emphasis, Normaliser, raw_mirror, token_layout
+from servoid.policy.text.captions import MOTIONS, motion_of
+from servoid.policy.text.encoder import load_encoder
 
 ROBOT = load_robot()
 CONFIG = DenoiserConfig(54, 20, width=16)

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hw.config import CONFIGS, ConfigError, load_yaml
-from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.settings import DiffusionSettings, GuidanceSettings, Rolling, load_settings
+from servoid.hw.config import CONFIGS, ConfigError, load_yaml
+from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings, Rolling, load_settings
 
 NETWORK = DenoiserConfig(108, 20)
 

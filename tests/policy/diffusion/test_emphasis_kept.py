@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from test_runtime import ROBOT, model
 
-from hw.hal import Array
-from policy.checkpoint import resolve
-from policy.diffusion import checkpoint
-from policy.diffusion.features import Emphasis, Normaliser, token_layout
+from servoid.hw.contracts.body import Array
+from servoid.policy.checkpoint import resolve
+from servoid.policy.diffusion import checkpoint
+from servoid.policy.diffusion.features import Emphasis, Normaliser, token_layout
 
 SIZE = token_layout(20).size
 

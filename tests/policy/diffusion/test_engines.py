@@ -13,17 +13,17 @@ import pytest
 import torch
 from test_runtime import ROBOT, model, request, speed_cost
 
-from hw.config import ConfigError, load_yaml
-from policy.diffusion import engines, export
-from policy.diffusion.checkpoint import Model
-from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.denoiser import Denoiser
-from policy.diffusion.engines import ENGINES, REFERENCE, check_engine, deviation, load_engine
-from policy.diffusion.masks import MASKS
-from policy.diffusion.runtime import Runtime
-from policy.diffusion.sampler import classifier_free
-from policy.diffusion.settings import DiffusionSettings, GuidanceSettings
-from policy.text.encoder import load_encoder
+from servoid.hw.config import ConfigError, load_yaml
+from servoid.policy.diffusion import engines, export
+from servoid.policy.diffusion.checkpoint import Model
+from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.denoiser import Denoiser
+from servoid.policy.diffusion.engines import ENGINES, REFERENCE, check_engine, deviation, load_engine
+from servoid.policy.diffusion.masks import MASKS
+from servoid.policy.diffusion.runtime import Runtime
+from servoid.policy.diffusion.sampler import classifier_free
+from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings
+from servoid.policy.text.encoder import load_encoder
 
 OTHERS = tuple(name for name in ENGINES if name != REFERENCE)
 TEXT = 12  # size of an encoded instruction

@@ -6,9 +6,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hw.hal import Array, State
-from hw.robot import load_robot
-from policy.diffusion.features import (
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import State
+from servoid.hw.robot.description import load_robot
+from servoid.policy.diffusion.features import (
     Normaliser,
     Trajectory,
     raw_layout,

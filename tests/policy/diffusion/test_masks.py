@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hw.config import ConfigError
-from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.denoiser import Denoiser
-from policy.diffusion.masks import attention_mask
+from servoid.hw.config import ConfigError
+from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.denoiser import Denoiser
+from servoid.policy.diffusion.masks import attention_mask
 
 
 def leaks(layers: int, mask: str = "state_full_action_causal") -> tuple[Denoiser, torch.Tensor, torch.Tensor]:

@@ -7,14 +7,14 @@ import pytest
 import torch
 from test_runtime import ROBOT, model, moved, request, speed_cost
 
-from hw.config import ConfigError
-from hw.hal import Instruction, Keyframes, Plan
-from policy.diffusion.features import Emphasis, Normaliser, raw_layout
-from policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise, seeded
-from policy.diffusion.runtime import Runtime
-from policy.diffusion.sampler import Diverged, Known, Sampler
-from policy.diffusion.schedule import cosine_signal, rolling
-from policy.diffusion.settings import DiffusionSettings, GuidanceSettings
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.control import Instruction, Keyframes, Plan
+from servoid.policy.diffusion.features import Emphasis, Normaliser, raw_layout
+from servoid.policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise, seeded
+from servoid.policy.diffusion.runtime import Runtime
+from servoid.policy.diffusion.sampler import Diverged, Known, Sampler
+from servoid.policy.diffusion.schedule import cosine_signal, rolling
+from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 
 ROLLING = DiffusionSettings(schedule="rolling", steps=3, lead=1, replan=1, delay=1)
 

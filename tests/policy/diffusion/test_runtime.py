@@ -9,19 +9,20 @@ import pytest
 import torch
 from synthetic_recording import episode
 
-from hw.config import ConfigError
-from hw.hal import Array, Instruction, PlanRequest
-from hw.robot import load_robot
-from policy.checkpoint import CheckpointError
-from policy.diffusion import checkpoint
-from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.denoiser import Denoiser
-from policy.diffusion.features import Normaliser, Trajectory, raw_layout
-from policy.diffusion.runtime import Runtime
-from policy.diffusion.settings import DiffusionSettings, GuidanceSettings, load_settings
-from policy.text.captions import MOTIONS, NAMES, caption
-from policy.text.encoder import code_size, load_encoder
-from policy.text.understanding import Phrasebook
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, PlanRequest
+from servoid.hw.robot.description import load_robot
+from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.diffusion import checkpoint
+from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.denoiser import Denoiser
+from servoid.policy.diffusion.features import Normaliser, Trajectory, raw_layout
+from servoid.policy.diffusion.runtime import Runtime
+from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings, load_settings
+from servoid.policy.text.captions import MOTIONS, NAMES, caption
+from servoid.policy.text.encoder import code_size, load_encoder
+from servoid.policy.text.nearest_phrase import Phrasebook
 
 ROBOT = load_robot()
 SETTINGS = DiffusionSettings(steps=4, delay=2)

@@ -5,12 +5,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from hw.config import ConfigError
-from policy.diffusion.config import DenoiserConfig
-from policy.diffusion.denoiser import Denoiser
-from policy.diffusion.sampler import Diverged, Guidance, Known, Sampler, classifier_free
-from policy.diffusion.schedule import autoregressive, cosine_signal, full_sequence, rolling
-from policy.diffusion.training import losses
+from servoid.hw.config import ConfigError
+from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.denoiser import Denoiser
+from servoid.policy.diffusion.sampler import Diverged, Guidance, Known, Sampler, classifier_free
+from servoid.policy.diffusion.schedule import autoregressive, cosine_signal, full_sequence, rolling
+from servoid.policy.diffusion.training import losses
 
 LEVELS = 100
 SIGNAL = torch.as_tensor(cosine_signal(LEVELS), dtype=torch.float32)

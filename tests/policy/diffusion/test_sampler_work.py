@@ -7,10 +7,10 @@ import torch
 from test_runtime import model
 from torch import Tensor
 
-from policy.diffusion import rolling
-from policy.diffusion.rolling import frame_noise
-from policy.diffusion.sampler import Guidance, Known, Sampler, draw_noise
-from policy.diffusion.schedule import DenoisingMatrix, cosine_signal, full_sequence
+from servoid.policy.diffusion import rolling
+from servoid.policy.diffusion.rolling import frame_noise
+from servoid.policy.diffusion.sampler import Guidance, Known, Sampler, draw_noise
+from servoid.policy.diffusion.schedule import DenoisingMatrix, cosine_signal, full_sequence
 
 LEVELS = 20
 SIGNAL = cosine_signal(LEVELS)

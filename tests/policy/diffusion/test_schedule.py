@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from policy.diffusion.schedule import (
+from servoid.policy.diffusion.schedule import (
     DenoisingMatrix,
     autoregressive,
     cosine_signal,

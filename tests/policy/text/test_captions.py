@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from policy.text.captions import MOTIONS, NAMES, caption, followed, mirrored, motion_of, twist_of
+from servoid.policy.text.captions import MOTIONS, NAMES, caption, followed, mirrored, motion_of, twist_of
 
 TWIST = st.tuples(st.floats(-0.15, 0.6), st.floats(-0.13, 0.13), st.floats(-1.2, 1.2))
 FLIP = np.array([1.0, -1.0, -1.0])

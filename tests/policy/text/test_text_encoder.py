@@ -9,11 +9,11 @@ import sys
 import numpy as np
 import pytest
 
-from hw.config import ConfigError
-from policy.text.captions import MOTIONS, mirrored
-from policy.text.encoder import WordEncoder, load_encoder
-from policy.text.lexicon import FLAGS, flags
-from policy.text.understanding import Phrasebook
+from servoid.hw.config import ConfigError
+from servoid.policy.text.captions import MOTIONS, mirrored
+from servoid.policy.text.encoder import WordEncoder, load_encoder
+from servoid.policy.text.lexicon import FLAGS, flags
+from servoid.policy.text.nearest_phrase import Phrasebook
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_loading_asks_no_network_and_leaves_logging_alone() -> None:
     """In a process of its own: wordllama sets up the root logger when it is first imported, and it can download."""
     code = """
 import logging, socket, sys
-from policy.text.encoder import load_encoder
+from servoid.policy.text.encoder import load_encoder
 assert "wordllama" not in sys.modules, "loaded before it is needed"
 def refuse(*arguments):
     raise AssertionError("a network connection was asked for")

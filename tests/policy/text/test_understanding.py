@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from hw.config import ConfigError
-from policy.text.captions import MOTIONS, NAMES
-from policy.text.encoder import WordEncoder
-from policy.text.understanding import Phrasebook
+from servoid.hw.config import ConfigError
+from servoid.policy.text.captions import MOTIONS, NAMES
+from servoid.policy.text.encoder import WordEncoder
+from servoid.policy.text.nearest_phrase import Phrasebook
 
 
 @pytest.fixture(scope="module")

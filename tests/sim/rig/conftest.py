@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from rig_host import Host
 
-from hw.robot import Robot, load_robot
-from sim.rig.faults import Scenario
-from sim.rig.rig import Rig
+from servoid.hw.robot.description import Robot, load_robot
+from servoid.sim.rig.faults import Scenario
+from servoid.sim.rig.rig import Rig
 
 
 @pytest.fixture(scope="session")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hw.dynamixel import codec
-from hw.dynamixel.codec import Instruction, Parser, Status, StatusError
-from hw.dynamixel.tables import table
-from hw.robot import Robot
-from sim.rig.rig import Rig
+from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.codec import Instruction, Parser, Status, StatusError
+from servoid.hw.dynamixel.tables import table
+from servoid.hw.robot.description import Robot
+from servoid.sim.rig.rig import Rig
 
 XM430 = table("xm430-w350")
 BOARD = 200

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hw.dynamixel.backend import DynamixelBackend
-from hw.hal import BackendError, Command, Mode, Scene
-from hw.robot import load_robot
-from sim.backend import SimBackend
-from sim.rig import control
-from sim.rig.backend import VirtualBackend
-from sim.rig.control import RigProcess
+from servoid.hw.contracts.body import BackendError, Command, Mode
+from servoid.hw.contracts.world import Scene
+from servoid.hw.dynamixel.backend import DynamixelBackend
+from servoid.hw.robot.description import load_robot
+from servoid.sim.backend import SimBackend
+from servoid.sim.rig import control
+from servoid.sim.rig.backend import VirtualBackend
+from servoid.sim.rig.control import RigProcess
 
 ROBOT = load_robot()
 TICK = 20_000_000  # ns

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from hw.config import ConfigError
-from hw.robot import Robot
-from sim.rig.rig import Rig
+from servoid.hw.config import ConfigError
+from servoid.hw.robot.description import Robot
+from servoid.sim.rig.rig import Rig
 
 
 def test_a_baud_that_servos_have_not_is_refused(robot: Robot) -> None:

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from rig_host import BOARD, Host
 
-from hw.config import ConfigError
-from hw.dynamixel import codec
-from hw.dynamixel.codec import parse_fast
-from hw.robot import Robot
-from sim.rig.faults import EXPECTED, KINDS, Fault, Outcome, load_scenario
-from sim.rig.rig import Rig
+from servoid.hw.config import ConfigError
+from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.codec import parse_fast
+from servoid.hw.robot.description import Robot
+from servoid.sim.rig.faults import EXPECTED, KINDS, Fault, Outcome, load_scenario
+from servoid.sim.rig.rig import Rig
 
 
 def inject(rig: Rig, kind: str, **values: object) -> None:

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hw.robot import Robot
-from sim.rig.local import LocalBackend
-from sim.rig.rig import Rig
+from servoid.hw.robot.description import Robot
+from servoid.sim.rig.in_process import LocalBackend
+from servoid.sim.rig.rig import Rig
 
 
 def test_a_robot_whose_imu_has_a_port_of_its_own_has_it_on_the_board(robot: Robot) -> None:

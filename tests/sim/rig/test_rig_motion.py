@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from rig_host import BOARD, Host
 
-from hw.dynamixel import codec
-from hw.dynamixel.tables import table
-from hw.hal import Array, Command, Mode
-from hw.imu.mounting import Mounting
-from hw.legs import Legs
-from hw.robot import Robot
-from sim.rig.board import Board
-from sim.rig.plant import Plant
-from sim.rig.rig import Rig
-from sim.worlds import Worlds
+from servoid.hw.contracts.body import Array, Command, Mode
+from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.tables import table
+from servoid.hw.imu.mounting import Mounting
+from servoid.hw.robot.description import Robot
+from servoid.hw.robot.legs import Legs
+from servoid.sim.rig.board import Board
+from servoid.sim.rig.plant import Plant
+from servoid.sim.rig.rig import Rig
+from servoid.sim.worlds import Worlds
 
 PAN = 19  # the head: it turns freely while the robot is held
 TICK = 2 * math.pi / 4096

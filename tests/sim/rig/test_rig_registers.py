@@ -7,14 +7,14 @@ import math
 import pytest
 from rig_host import BOARD, XM430, Host
 
-import sim.rig.rig
-from hw.dynamixel import codec
-from hw.dynamixel.codec import Reset, StatusError
-from hw.dynamixel.tables import models
-from hw.robot import Robot
-from sim.rig import operations
-from sim.rig.rig import Rig
-from sim.rig.servo import VirtualServo
+import servoid.sim.rig.rig
+from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.codec import Reset, StatusError
+from servoid.hw.dynamixel.tables import models
+from servoid.hw.robot.description import Robot
+from servoid.sim.rig import control_requests as operations
+from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.servo import VirtualServo
 
 
 def test_servos_are_silent_until_the_board_gives_them_power(rig: Rig, robot: Robot) -> None:
@@ -257,7 +257,7 @@ def test_older_firmware_stays_silent_on_fast_reads(host: Host) -> None:
 def test_what_was_forgotten_is_told_once(host: Host, monkeypatch: pytest.MonkeyPatch) -> None:
     """A long walk that nobody asked about must not spoil all that comes after."""
     ask = operations.find("accepted", host.rig)
-    monkeypatch.setattr(sim.rig.rig, "_REMEMBERED", 3)
+    monkeypatch.setattr(servoid.sim.rig.rig, "_REMEMBERED", 3)
     host.rig.reset(0)
     host.start()
     for _ in range(2):

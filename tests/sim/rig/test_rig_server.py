@@ -15,12 +15,12 @@ import pytest
 import serial
 from rig_host import BOARD, XM430
 
-from hw.dynamixel import codec
-from hw.hal import BackendError
-from hw.robot import Robot, load_robot
-from sim.rig.control import Control, LockedClock, RigProcess
-from sim.rig.rig import Rig
-from sim.rig.server import Server
+from servoid.hw.contracts.body import BackendError
+from servoid.hw.dynamixel import codec
+from servoid.hw.robot.description import Robot, load_robot
+from servoid.sim.rig.control import Control, LockedClock, RigProcess
+from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.server import Server
 
 MS = 1_000_000
 
@@ -149,7 +149,7 @@ def test_a_clock_step_and_a_vanishing_port() -> None:
 
 def test_an_unused_rig_ends_by_itself(tmp_path: Path) -> None:
     control = tmp_path / "control"
-    command = [sys.executable, "-m", "sim.rig.server", "--control", str(control), "--linger", "0.5"]
+    command = [sys.executable, "-m", "servoid.sim.rig.server", "--control", str(control), "--linger", "0.5"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stdout.readline()
@@ -160,7 +160,7 @@ def test_an_unused_rig_ends_by_itself(tmp_path: Path) -> None:
 
 _STARTED = """
 import sys, time
-from sim.rig.control import LockedClock, RigProcess
+from servoid.sim.rig.control import LockedClock, RigProcess
 rig = RigProcess(linger=float(sys.argv[1]))
 clock = LockedClock(rig.control)
 print(rig.process.pid, rig.port, rig._folder.name, flush=True)
@@ -195,7 +195,7 @@ def test_a_rig_whose_controller_was_killed_lives_on_and_then_leaves_nothing_behi
 def test_a_rig_whose_controller_was_killed_before_it_had_begun_leaves_nothing_behind(tmp_path: Path) -> None:
     folder = tmp_path / "rig"
     folder.mkdir()
-    command = [sys.executable, "-m", "sim.rig.server", "--linger", "60", "--folder", str(folder)]
+    command = [sys.executable, "-m", "servoid.sim.rig.server", "--linger", "60", "--folder", str(folder)]
     process = subprocess.Popen([*command, "--control", str(folder / "control")], stdout=subprocess.PIPE)
     assert process.stdout is not None
     process.stdout.close()

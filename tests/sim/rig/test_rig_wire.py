@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 from rig_host import BOARD, XM430, Host
 
-from hw.dynamixel import codec
-from hw.dynamixel.codec import parse_fast
-from sim.rig.bus import TURNAROUND_NS
-from sim.rig.rig import Rig
-from sim.rig.wire import Wire
+from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.codec import parse_fast
+from servoid.sim.rig.bus import TURNAROUND_NS
+from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.wire import Wire
 
 
 def when(rig: Rig, packet: bytes, count: int, limit: float = 0.05) -> float:

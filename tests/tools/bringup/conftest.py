@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-import sim.rig.backend
-import sim.rig.control
-from hw.robot import load_robot
-from sim.rig.control import RigProcess
-from tools.cli import main
+import servoid.sim.rig.backend
+import servoid.sim.rig.control
+from servoid.hw.robot.description import load_robot
+from servoid.sim.rig.control import RigProcess
+from servoid.tools.cli import main
 
 
 class Lent:
@@ -44,8 +44,8 @@ def rig(one_rig: RigProcess, monkeypatch: pytest.MonkeyPatch) -> RigProcess:
     one_rig.control.reset(0)
     one_rig.control.call("accepted")
     Lent.rig = one_rig
-    monkeypatch.setattr(sim.rig.control, "RigProcess", Lent)
-    monkeypatch.setattr(sim.rig.backend, "RigProcess", Lent)
+    monkeypatch.setattr(servoid.sim.rig.control, "RigProcess", Lent)
+    monkeypatch.setattr(servoid.sim.rig.backend, "RigProcess", Lent)
     return one_rig
 
 

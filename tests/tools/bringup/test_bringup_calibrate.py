@@ -13,7 +13,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from hw.calibration import (
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array, BackendError
+from servoid.hw.robot.calibration import (
     Calibration,
     JointCalibration,
     calibrated,
@@ -21,18 +23,16 @@ from hw.calibration import (
     load_calibration,
     save_calibration,
 )
-from hw.config import ConfigError
-from hw.hal import Array, BackendError
-from hw.robot import load_robot
-from sim.model import build
-from sim.rig.control import LockedClock, RigProcess
-from sim.rig.delivery import Delivery
-from tools.bringup import calibrate
-from tools.bringup.calibrate import MOVED, check_range, directions_of, turned
-from tools.bringup.encoders import Encoders
-from tools.bringup.hands import Person
-from tools.bringup.turning import describe_turns
-from tools.output import Report
+from servoid.hw.robot.description import load_robot
+from servoid.sim.model import build
+from servoid.sim.rig.control import LockedClock, RigProcess
+from servoid.sim.rig.factory_state import Delivery
+from servoid.tools.bringup import calibrate
+from servoid.tools.bringup.calibrate import MOVED, check_range, directions_of, turned
+from servoid.tools.bringup.encoders import Encoders
+from servoid.tools.bringup.hands import Person
+from servoid.tools.bringup.turning import describe_turns
+from servoid.tools.common.output import Report
 
 ROBOT = load_robot()
 TICK = math.tau / 4096
@@ -53,7 +53,7 @@ def test_it_finds_the_assembly_of_a_rig_on_a_serial_port_and_check_then_uses_it(
         link.symlink_to(rig.port)
         link.with_name("rig.control").symlink_to(rig.control_path)
         # In the rig's time, so that a busy machine does not matter.
-        monkeypatch.setattr("hw.clock.WallClock", lambda: LockedClock(rig.control))
+        monkeypatch.setattr("servoid.hw.clock.WallClock", lambda: LockedClock(rig.control))
         code, answer, err = bringup("calibrate", "--port", str(link), "--yes")
         assert code == 0, err
         found = calibrated(ROBOT)[0]
@@ -252,7 +252,7 @@ def test_a_joint_beyond_its_range_is_refused_by_name() -> None:
 def test_the_reference_pose_must_be_within_every_range() -> None:
     from dataclasses import replace
 
-    from tools.bringup.calibrate import _reference
+    from servoid.tools.bringup.calibrate import _reference
 
     bent = replace(ROBOT, joints=(replace(ROBOT.joints[0], range=(0.2, 1.0)), *ROBOT.joints[1:]))
     with pytest.raises(ConfigError, match="head_pan cannot be at 0: give --pose home"):

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from tools.bringup import find_port, ports
-from tools.cli import main
+from servoid.tools.bringup import find_port, ports
+from servoid.tools.cli import main
 
 U2D2 = SimpleNamespace(device="/dev/ttyUSB0", vid=0x0403, pid=0x6014, description="USB <-> Serial Converter")
 OTHER = SimpleNamespace(device="/dev/ttyUSB1", vid=0x10C4, pid=0xEA60, description="CP2102")

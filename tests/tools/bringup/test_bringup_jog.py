@@ -13,17 +13,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from hw.dynamixel.bus import Bus
-from hw.hal import Observation
-from hw.robot import load_robot
-from sim.model import build
-from sim.rig.control import RigProcess
-from sim.rig.local import LocalLine
-from sim.rig.rig import Rig
-from tools.bringup import watch
-from tools.bringup.jogging import IDLE_SECONDS, KEY_SECONDS, SPAN, SPEED, There, Wish, reach, restrict
-from tools.bringup.line import Line
-from tools.cli import main
+from servoid.hw.contracts.body import Observation
+from servoid.hw.dynamixel.bus import Bus
+from servoid.hw.robot.description import load_robot
+from servoid.sim.model import build
+from servoid.sim.rig.control import RigProcess
+from servoid.sim.rig.in_process import LocalLine
+from servoid.sim.rig.rig import Rig
+from servoid.tools.bringup import watch
+from servoid.tools.bringup.jogging import IDLE_SECONDS, KEY_SECONDS, SPAN, SPEED, There, Wish, reach, restrict
+from servoid.tools.bringup.line import Line
+from servoid.tools.cli import main
 
 ROBOT = load_robot()
 KNEE = ROBOT.names.index("l_knee")
@@ -212,7 +212,7 @@ def test_a_motion_there_and_back_has_an_end_whatever_the_joint_does() -> None:
 
 def test_a_burst_of_keys_moves_no_further_than_one_and_idleness_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """Thirty repeats that a slow line held up and delivered at once must not become a second of motion."""
-    from tools.bringup import jogging
+    from servoid.tools.bringup import jogging
 
     master, slave = os.openpty()
     monkeypatch.setattr("sys.stdin", os.fdopen(slave, "r", closefd=False))

@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from hw.dynamixel.bus import Bus
-from hw.dynamixel.discovery import power_on
-from hw.dynamixel.port import SerialPort
-from hw.dynamixel.tables import table
-from hw.robot import load_robot
-from sim.rig.control import LockedClock, RigProcess
-from sim.rig.delivery import Delivery
+from servoid.hw.dynamixel.bus import Bus
+from servoid.hw.dynamixel.bus_scan import power_on
+from servoid.hw.dynamixel.port import SerialPort
+from servoid.hw.dynamixel.tables import table
+from servoid.hw.robot.description import load_robot
+from servoid.sim.rig.control import LockedClock, RigProcess
+from servoid.sim.rig.factory_state import Delivery
 
 ROBOT = load_robot()
 XM430 = table("xm430-w350")

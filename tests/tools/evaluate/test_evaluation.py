@@ -9,19 +9,21 @@ from typing import Any
 
 import pytest
 
-from hw.config import CONFIGS, ConfigError
-from hw.hal import BackendError
-from policy.checkpoint import resolve
-from stack.session import Settings
-from tools import rollout
-from tools.cli import main
-from tools.evaluate import clips, code, session
-from tools.evaluate.cache import EpisodeCache, key
-from tools.evaluate.code import digest
-from tools.evaluate.episode import Done, Job
-from tools.evaluate.pilots import Pilots, spec
-from tools.evaluate.rows import Metric, Row, Run
-from tools.evaluate.session import Options, evaluate
+from servoid.hw.config import CONFIGS, ConfigError
+from servoid.hw.contracts.body import BackendError
+from servoid.policy.checkpoint import resolve
+from servoid.stack.runtime.run import Settings
+from servoid.tools.cli import main
+from servoid.tools.commands import rollout
+from servoid.tools.evaluate import clips
+from servoid.tools.evaluate import code_hash as code
+from servoid.tools.evaluate import runner as session
+from servoid.tools.evaluate.cache import EpisodeCache, key
+from servoid.tools.evaluate.code_hash import digest
+from servoid.tools.evaluate.episode import Done, Job
+from servoid.tools.evaluate.policies import Pilots, spec
+from servoid.tools.evaluate.runner import Options, evaluate
+from servoid.tools.evaluate.spec import Metric, Row, Run
 
 NEAR = Row("t/near", "T", "Near", Run("goal-near", episodes=4), Metric("success", share=True))
 FALLS = Row("t/falls", "T", "Falls", Run("goal-near", episodes=4), Metric("fell", share=True))
@@ -108,14 +110,14 @@ def test_quick_cuts_the_longest_episodes_and_does_not_mistake_them_for_whole_one
 @pytest.mark.parametrize(
     "name",
     [
-        "hw/legs.py",
+        "hw/robot/legs.py",
         "sim/rig/servo.py",
         "policy/diffusion/sampler.py",
-        "stack/trim.py",
+        "stack/control/trim.py",
         "configs/servos/xm430-w350.yaml",
-        "tools/witness.py",
-        "tools/motion.py",
-        "tools/rollout.py",
+        "tools/common/ground_truth.py",
+        "tools/common/motion_quality.py",
+        "tools/commands/rollout.py",
         "tools/evaluate/episode.py",
     ],
 )
@@ -142,8 +144,8 @@ def test_changed_code_changes_what_episodes_and_clips_depend_on(
         return key(spec(Run("goal-near"), Pilots("gait", tmp_path), "op3", 0, None, None)), key(clips.recipe("op3"))
 
     before = keys()
-    monkeypatch.setattr("tools.evaluate.pilots.code", lambda: "other")
-    monkeypatch.setattr("tools.evaluate.clips.code", lambda: "other")
+    monkeypatch.setattr("servoid.tools.evaluate.policies.code", lambda: "other")
+    monkeypatch.setattr("servoid.tools.evaluate.clips.code", lambda: "other")
     assert not set(before) & set(keys())
 
 
@@ -174,7 +176,7 @@ def test_what_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch:
         lambda job: Path(job.settings.policy).write_text("steps: 3\n"),
         lambda job: module.write_text("edited = True\n"),
     ]
-    monkeypatch.setattr("hw.config.CONFIGS", tmp_path / "configs")
+    monkeypatch.setattr("servoid.hw.config.CONFIGS", tmp_path / "configs")
     for number, change in enumerate(changes):
 
         def do(job: Job, change: Any = change) -> Done:
@@ -189,7 +191,7 @@ def test_what_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch:
 
 
 def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from policy.diffusion.settings import load_settings
+    from servoid.policy.diffusion.settings import load_settings
 
     mine = tmp_path / "mine.yaml"
     mine.write_text("checkpoint: diffusion\nreplan: 6\n")
@@ -224,7 +226,7 @@ def test_an_error_of_one_run_does_not_stop_the_others(
             raise error
         return {"success": True}
 
-    monkeypatch.setattr("tools.evaluate.episode.record", record)
+    monkeypatch.setattr("servoid.tools.evaluate.episode.record", record)
     measured = evaluate([FAR, NEAR], options(tmp_path), quiet)
     assert str(error) in (measured["t/far"].refused or "")
     assert len(measured["t/near"].records) == 4
@@ -265,7 +267,7 @@ def test_an_episode_that_ctrl_c_ended_is_not_kept(tmp_path: Path, monkeypatch: p
     def judge(settings: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tools.rollout.judge", judge)
+    monkeypatch.setattr("servoid.tools.commands.rollout.judge", judge)
     with pytest.raises(KeyboardInterrupt):
         evaluate([NEAR], options(tmp_path), quiet)
     assert not any('"episode"' in path.read_text() for path in (tmp_path / "episodes").glob("*.jsonl"))
@@ -332,8 +334,8 @@ def test_bad_choices_are_refused(words: list[str], named: str, tmp_path: Path, c
 
 
 def test_the_text_encoder_is_measured_apart() -> None:
-    from policy.text.captions import MOTIONS
-    from tools.evaluate.papers import encoder_accuracy
+    from servoid.policy.text.captions import MOTIONS
+    from servoid.tools.evaluate.papers import encoder_accuracy
 
     result = encoder_accuracy()
     assert result["phrasings"] == sum(len(motion.held_out) for motion in MOTIONS)

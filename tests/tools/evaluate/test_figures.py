@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from policy.diffusion.settings import load_settings as load_policy
-from stack.tasks import load_settings
-from tools.evaluate.rows import Row
-from tools.evaluate.table import ROWS
+from servoid.policy.diffusion.settings import load_settings as load_policy
+from servoid.stack.tasks import load_settings
+from servoid.tools.evaluate.spec import Row
+from servoid.tools.evaluate.table import ROWS
 
 LENGTH, TIME = 0.275, 0.524
 BY_NAME: dict[str, Row] = {row.name: row for row in ROWS}

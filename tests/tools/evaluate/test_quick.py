@@ -9,13 +9,14 @@ from typing import Any
 
 import pytest
 
-from tools.cli import main
-from tools.evaluate import papers, session
-from tools.evaluate.episode import Done, Job
-from tools.evaluate.rows import Row, select
-from tools.evaluate.session import Options, evaluate
-from tools.evaluate.summary import Measured
-from tools.evaluate.table import ROWS
+from servoid.tools.cli import main
+from servoid.tools.evaluate import papers
+from servoid.tools.evaluate import runner as session
+from servoid.tools.evaluate.episode import Done, Job
+from servoid.tools.evaluate.runner import Options, evaluate
+from servoid.tools.evaluate.spec import Row, select
+from servoid.tools.evaluate.summary import Measured
+from servoid.tools.evaluate.table import ROWS
 
 MAIN = {
     "uniphys/length", "uniphys/goal-near", "uniphys/goal-far", "uniphys/velocity", "uniphys/obstacle",

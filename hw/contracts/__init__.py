@@ -1,0 +1,1 @@
+"""The contracts of the hardware abstraction layer: body, control, world and task."""

@@ -1,0 +1,109 @@
+"""What a controller knows, is asked, and answers: state, instruction, reference, policy and plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from servoid.hw.contracts.body import Array
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """What a policy may know, made by the estimator from observations alone.
+
+    The odometry frame has its origin under the base and its x axis along the heading at reset; z is up and zero on
+    the ground. The heading frame is the base frame turned upright.
+    """
+
+    time_ns: int
+    orientation: Array  # (..., 4) quaternion w x y z, base in the odometry frame
+    gravity: Array  # (..., 3) unit vector along gravity, base frame
+    yaw: Array  # (...,) rad, heading in the odometry frame, unwrapped
+    angular_velocity: Array  # (..., 3) rad/s, base frame
+    velocity: Array  # (..., 3) m/s of the base, heading frame
+    displacement: Array  # (..., 3) m, base in the odometry frame; z is the height above the soles
+    position: Array  # (..., n_joints) rad
+    joint_velocity: Array  # (..., n_joints) rad/s
+    contact: Array  # (..., n_feet) 0..1, how much a foot carries
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceFrames:
+    """Frames of a motion to track, `k` of them along the axis before the last."""
+
+    position: Array  # (..., k, n_joints) rad
+    velocity: Array  # (..., k, 2) m/s of the base, heading frame
+    yaw_rate: Array  # (..., k) rad/s
+    height: Array  # (..., k) m of the base above the ground
+    contact: Array  # (..., k, n_feet) 0..1, planned
+
+
+class Reference(Protocol):
+    """A motion that a tracker follows: a gait, a clip, or a planner's output."""
+
+    def frames(self, ahead: Array) -> ReferenceFrames:
+        """Frames `ahead` ticks from now, `(k,)` integers, 0 being the frame to be in at the next tick."""
+        ...
+
+    def advance(self) -> None:
+        """Go on by one tick."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframes:
+    """States to be in at given times. A planner takes them as known: inpainted at zero noise."""
+
+    ticks: Array  # (k,) int, ahead of now, at least 1 and rising
+    states: Array  # (k, state features): rows like those of `PlanRequest.states`, in the odometry frame; NaN: free
+
+
+@dataclass(frozen=True, slots=True)
+class Instruction:
+    """What a task asks of a policy at a tick."""
+
+    velocity: Array  # (..., 3) m/s forward, m/s left, rad/s: base, heading frame
+    goal: Array | None = None  # (..., 2) m in the heading frame, from the base
+    text: str | None = None  # a sentence that says what to do; None: go by the velocity; empty: by neither
+    path: Array | None = None  # (n, 2) m in the heading frame: where to be at the next n ticks
+    obstacles: Array | None = None  # (n, 5) in the heading frame: x, y, radius m, velocity m/s; to be kept clear of
+    keyframes: Keyframes | None = None
+    ground: Array | None = None  # (2,) m/s over the ground in the heading frame, where the task asks for one
+
+
+class Policy(Protocol):
+    """A controller. `applied` is what the guard really sent last, so that a policy never believes its own wishes."""
+
+    def reset(self, seed: int) -> None: ...
+
+    def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
+        """Joint targets `(..., n_joints)` rad for the next tick."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class PlanRequest:
+    """What a planner is asked at `tick`: the newest `history` of features and the actions that run meanwhile."""
+
+    tick: int
+    states: Array  # (history, state features), oldest first, the last one being now
+    actions: Array  # (history - 1 + delay, action size) of each past state's tick, then those yet to run; as in a Plan
+    instruction: Instruction
+    previous: Plan | None = None  # the plan that runs, for planners that go on from it
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A plan indexed by tick: `actions[i]` belongs to tick `tick + i`.
+
+    Actions are joint targets [rad] or, where the planner's model has them, latents, which whoever runs the plan decodes
+    with the state of their own tick.
+    """
+
+    tick: int
+    actions: Array  # (horizon, action size), action size: n_joints, or that of a latent
+    states: Array  # (horizon, state features)
+    path: Array  # (horizon, 2) m: predicted displacement in the heading frame of `tick`, to be drawn and logged
+    seconds: float  # how long planning took
+    error: str = ""  # why there is no plan, where there is none: its arrays are NaN then

@@ -1,0 +1,116 @@
+"""A simulated world: its bodies, what stands on its floor, what the robot sees of it, and its truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from servoid.hw.contracts.body import Array, Command, Observation
+from servoid.hw.contracts.control import State
+
+
+@dataclass(frozen=True, slots=True)
+class Percept:
+    """What else a task may know, in the odometry frame, with its age and where it came from.
+
+    `robots` are the others that share the floor, as a camera sees them: where their bases are and where they face. How
+    fast they go, a task tells from where they were before.
+    """
+
+    source: str  # "task", "scene", or the name of an external feed
+    age: float  # s
+    goal: Array | None = None  # (2,) m
+    obstacles: Array | None = None  # (n, 3) m: x, y, radius
+    robots: Array | None = None  # (n, 3): x, y m and heading rad
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What a task puts into a simulated world, on its floor, in the frame that the robot starts in: x ahead.
+
+    In a percept, obstacles are the pillars followed by the spheres.
+    """
+
+    pillars: Array  # (n, 3) m: x, y, radius; they stand where they are
+    spheres: Array  # (m, 4): x, y, radius m and speed m/s; they roll straight toward the robot
+    goal: Array | None = None  # (2,) m, a mark on the floor that the robot sees
+    robots: Array | None = None  # (n, 5): where the other robots start, x, y m and heading rad, and their goals, x, y m
+
+
+class Surroundings(Protocol):
+    """The scene of a simulated world as a camera on the robot shows it, without what lies outside the scene."""
+
+    def look(self, state: State) -> Percept:
+        """What is around the base, in the odometry frame of `state`. At each call, what moves goes on by a tick."""
+        ...
+
+
+class Truth(Protocol):
+    """What a simulation knows of its bodies. Rewards and evaluation read it; policies, estimators and tasks never do.
+
+    Arrays are `(n, ...)`, world frame unless said otherwise.
+    """
+
+    @property
+    def position(self) -> Array:
+        """Base position `(n, 3)` m."""
+        ...
+
+    @property
+    def yaw(self) -> Array:
+        """Heading `(n,)` rad in -pi..pi."""
+        ...
+
+    @property
+    def gravity(self) -> Array:
+        """Unit vector along gravity in the base frame `(n, 3)`."""
+        ...
+
+    @property
+    def velocity(self) -> Array:
+        """Base velocity `(n, 3)` m/s in the heading frame."""
+        ...
+
+    @property
+    def angular_velocity(self) -> Array:
+        """Base angular velocity `(n, 3)` rad/s in the base frame."""
+        ...
+
+    @property
+    def fallen(self) -> Array:
+        """Whether each body has fallen `(n,)`."""
+        ...
+
+    @property
+    def joints(self) -> Array:
+        """Joint positions `(n, n_joints)` rad."""
+        ...
+
+    @property
+    def touching(self) -> Array:
+        """Whether each body touches an obstacle of the scene, or another robot, or did within the last tick `(n,)`."""
+        ...
+
+
+class World(Protocol):
+    """Many simulated bodies. An episode draws from its own random stream, so it does not depend on its neighbours."""
+
+    n: int
+
+    @property
+    def truth(self) -> Truth: ...
+
+    def reset(self, ids: Array, rngs: Sequence[np.random.Generator], joints: Array | None = None) -> None:
+        """Start new episodes in the worlds `ids`, drawing their robots anew, at a pose `(len(ids), n_joints)` rad."""
+        ...
+
+    def observe(self) -> Observation: ...
+
+    def step(self, command: Command) -> None: ...
+
+    def push(self, velocity: Array) -> None:
+        """Change the bases' velocity by `(n, 2)` m/s, world frame."""
+        ...

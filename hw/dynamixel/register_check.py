@@ -1,0 +1,193 @@
+"""Who is on the bus, and whether each servo is what the robot's file says. Nothing here moves a motor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import BackendError
+from servoid.hw.dynamixel.bus import Bus
+from servoid.hw.dynamixel.tables import ControlTable, table
+from servoid.hw.dynamixel.units import Units
+from servoid.hw.robot.description import Joint, Robot, Servo
+
+POSITION_MODE = 3
+EEPROM_BYTES, RAM_BYTES = 64, 83  # in two reads: all that is compared, and what is measured
+POWER_SECONDS = 2.0  # that servos may take to answer after power-on
+RETRY_SECONDS = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A register that is not as the robot's file wants it. A robot with one that is `grave` is not driven."""
+
+    joint: str
+    id: int
+    register: str
+    found: int
+    wanted: int
+    grave: bool
+
+
+@dataclass(frozen=True)
+class Found:
+    """A servo that answered: its table, and its registers as read."""
+
+    joint: Joint
+    table: ControlTable
+    firmware: int
+    memory: bytes
+
+    def get(self, register: str) -> int:
+        item = self.table.item(register)
+        return item.decode(self.memory[item.address : item.end])
+
+
+def model_name(servo: Servo) -> str:
+    """Name of a robot's servo in the control tables. Raises BackendError where there is none."""
+    try:
+        return table(servo.model_number).name
+    except ConfigError as error:
+        raise BackendError(f"servo '{servo.name}' is not a Dynamixel that is known here: {error}") from error
+
+
+def find_board(bus: Bus, robot: Robot) -> None:
+    """Find the board and switch the servos' power on. Raises BackendError with the remedy."""
+    id, board = robot.bus.board_id, table("opencr")
+    ping = bus.ping(id, tries=3)
+    if ping is None:
+        raise BackendError(
+            f"{bus.port.name}: the board (ID {id}) does not answer at {bus.port.baud} bit/s: check the cable, the "
+            f"battery's switch and bus.baud in the robot's file{_garbled(bus)}"
+        )
+    if ping.model != board.number:
+        raise BackendError(f"ID {id} is not the board but {_model(ping.model)}: check bus.board_id in the robot's file")
+    if not bus.write_item(id, board.item("dynamixel_power"), 1):
+        raise BackendError(f"the board (ID {id}) does not switch the servos' power on: restart it")
+
+
+def find_servos(bus: Bus, robot: Robot) -> list[Found]:
+    """Find every servo of the robot and read it. Raises BackendError that names the ones missing or wrong."""
+    deadline = bus.clock.now_ns() + round(POWER_SECONDS * 1e9)
+    waiting = list(range(len(robot.joints)))
+    pings = {}
+    while waiting:
+        for i in list(waiting):
+            ping = bus.ping(robot.joints[i].id, tries=1)
+            if ping is not None:
+                pings[i] = ping
+                waiting.remove(i)
+        if not waiting or bus.clock.now_ns() >= deadline:
+            break
+        bus.clock.sleep_until(bus.clock.now_ns() + round(RETRY_SECONDS * 1e9))
+    if waiting:
+        names = ", ".join(f"{robot.joints[i].name} (ID {robot.joints[i].id})" for i in waiting)
+        raise BackendError(
+            f"{bus.port.name}: no answer from {names}: check their cables, IDs and baud rate{_garbled(bus)}"
+        )
+    found = []
+    for i, (joint, servo) in enumerate(zip(robot.joints, robot.servos, strict=True)):
+        if pings[i].model != servo.model_number:
+            raise BackendError(
+                f"{joint.name} (ID {joint.id}) is {_model(pings[i].model)}, but the robot's file says "
+                f"{model_name(servo)}: change the servo, or the file"
+            )
+        found.append(_read(bus, joint, pings[i].firmware))
+    _check_voltage(found, robot.servos)
+    return found
+
+
+def compare(robot: Robot, found: Sequence[Found]) -> list[Difference]:
+    """Every register that matters and differs from what the robot's file asks for, grave ones first."""
+    units = Units(robot, [servo.table for servo in found])
+    if seam := units.across_the_seam():
+        raise BackendError(
+            f"{', '.join(seam)}: the range crosses the servo's 0/{robot.servos[0].ticks_per_turn - 1} seam, beyond "
+            "which it cannot go in position mode: mount the horn half a turn round and set 'zero' in the robot's file"
+        )
+    lows, highs = units.limits()
+    margin = int(robot.limits.margin * robot.servos[0].ticks_per_turn / math.tau)  # ticks that the guard keeps off
+    differences: list[Difference] = []
+    for servo, model, low, high in zip(found, robot.servos, lows.tolist(), highs.tolist(), strict=True):
+        wanted: dict[str, tuple[int, bool]] = {
+            "operating_mode": (POSITION_MODE, True),
+            "drive_mode": (0, True),
+            "homing_offset": (0, True),
+            "status_return_level": (2, True),
+            "min_position_limit": (low, servo.get("min_position_limit") > low + margin),
+            "max_position_limit": (high, servo.get("max_position_limit") < high - margin),
+            "return_delay_time": (0, False),
+            "temperature_limit": (round(model.max_temperature), False),
+        }
+        for register in ("shutdown", "pwm_limit", "current_limit", "min_voltage_limit", "max_voltage_limit"):
+            default = servo.table.items[register].default if register in servo.table else None
+            if default is not None:
+                wanted[register] = (default, False)
+        for register, (value, grave) in wanted.items():
+            if servo.get(register) != value:
+                differences.append(
+                    Difference(servo.joint.name, servo.joint.id, register, servo.get(register), value, grave)
+                )
+    return sorted(differences, key=lambda difference: not difference.grave)
+
+
+def as_table(differences: Sequence[Difference]) -> str:
+    """Differences as a person reads them."""
+    rows = [("joint", "ID", "register", "found", "wanted", "")]
+    rows += [
+        (d.joint, str(d.id), d.register, str(d.found), str(d.wanted), "must be changed" if d.grave else "")
+        for d in differences
+    ]
+    widths = [max(len(row[i]) for row in rows) for i in range(6)]
+    return "\n".join("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+
+
+def correct(bus: Bus, found: Sequence[Found], differences: Sequence[Difference]) -> None:
+    """Write what is wanted, and read it back. Raises BackendError naming the joint that did not take it, or that has
+    torque on: its EEPROM is locked then, and only a person may let a robot go limp."""
+    servos = {servo.joint.id: servo for servo in found}
+    for id in {d.id for d in differences}:
+        if servos[id].get("torque_enable"):
+            raise BackendError(f"{servos[id].joint.name} has torque on: hold the robot and switch it off first")
+    for d in differences:
+        item = servos[d.id].table.item(d.register)
+        if not bus.write_item(d.id, item, d.wanted) or bus.read_item(d.id, item) != d.wanted:
+            raise BackendError(f"{d.joint} (ID {d.id}) does not take {d.register} = {d.wanted}: restart it")
+
+
+def _read(bus: Bus, joint: Joint, firmware: int) -> Found:
+    memory = b""
+    for address, length in ((0, EEPROM_BYTES), (EEPROM_BYTES, RAM_BYTES)):
+        status = bus.read(joint.id, address, length)
+        if status is None or status.error:
+            raise BackendError(f"{joint.name} (ID {joint.id}) answers a ping, but cannot be read{_garbled(bus)}")
+        memory += status.data
+    number = int.from_bytes(memory[:2], "little")
+    return Found(joint, table(number, firmware), firmware, memory)
+
+
+def _check_voltage(found: Sequence[Found], servos: Sequence[Servo]) -> None:
+    for servo, model in zip(found, servos, strict=True):
+        volts = servo.get("present_input_voltage") * model.voltage_unit
+        low, high = model.voltage_range
+        if not low <= volts <= high:
+            raise BackendError(
+                f"{servo.joint.name} (ID {servo.joint.id}) has {volts:.1f} V, outside {low:g} to {high:g} V: "
+                "check the battery and the supply"
+            )
+
+
+def _model(number: int) -> str:
+    try:
+        return f"a {table(number).name}"
+    except ConfigError:
+        return f"a device of model number {number}"
+
+
+def _garbled(bus: Bus) -> str:
+    counters = bus.counters
+    if counters.bad_crc or counters.garbage:
+        return " (something answers, but garbled: two servos may have the same ID, or another baud rate)"
+    return ""

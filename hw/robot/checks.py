@@ -1,0 +1,207 @@
+"""Checks of a robot's or servo's file that need more than types: each failure names the file, the line and the key."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from servoid.hw.config import Marks, available, nearest
+
+if TYPE_CHECKING:
+    from servoid.hw.robot.description import Robot, Servo
+
+MAX_ID = 252  # protocol 2.0: 253 is reserved and 254 is broadcast
+
+
+def check_robot(robot: Robot, marks: Marks) -> None:
+    """Raise ConfigError for the first thing in a robot's file that cannot be true."""
+    if not robot.joints:
+        raise marks.error("joints", "a robot needs at least one joint")
+    _check_numbers(robot, marks)
+    _check_identity(robot, marks)
+    _check_angles(robot, marks)
+    _check_mirror(robot, marks)
+    _check_legs(robot, marks)
+
+
+def check_servo(servo: Servo, marks: Marks) -> None:
+    """Raise ConfigError for the first thing in a servo's file that cannot be true."""
+    positive = (
+        *("ticks_per_turn", "velocity_unit", "current_unit", "torque_per_ampere", "voltage_unit", "position_p_gain"),
+        *("voltage", "stiffness", "stall_torque", "no_load_speed", "braking_torque", "max_temperature"),
+    )
+    for key in positive:
+        _require_positive(getattr(servo, key), key, marks)
+    for key in ("damping", "friction", "armature", "command_delay", "position_latency"):
+        _require_not_negative(getattr(servo, key), key, marks)
+    if not 0 <= servo.center_tick < servo.ticks_per_turn:
+        raise marks.error("center_tick", f"{servo.center_tick} is outside 0..{servo.ticks_per_turn - 1}")
+    low, high = servo.voltage_range
+    if low >= high:
+        raise marks.error("voltage_range", f"upside down: {low:g} is not below {high:g}; write [lowest, highest]")
+    if not low <= servo.voltage <= high:
+        raise marks.error("voltage", f"{servo.voltage:g} V is outside voltage_range {low:g}..{high:g} V")
+
+
+def _check_numbers(robot: Robot, marks: Marks) -> None:
+    _require_positive(robot.rate, "rate", marks)
+    _require_positive(robot.standing_height, "standing_height", marks)
+    _require_positive(robot.bus.baud, "bus.baud", marks)
+    _require_id(robot.bus.board_id, "bus.board_id", marks)
+    for key in ("joint_speed", "homing_speed", "tilt", "stale", "temperature"):
+        _require_positive(getattr(robot.limits, key), f"limits.{key}", marks)
+    _require_not_negative(robot.limits.margin, "limits.margin", marks)
+    _require_radians(robot.limits.tilt, "limits.tilt", marks)
+    _check_derating(robot, marks)
+    _check_imu(robot, marks)
+
+
+def _check_derating(robot: Robot, marks: Marks) -> None:
+    """Gains go down before the limit is reached, from the right side."""
+    limits = robot.limits
+    if limits.derate_temperature is not None and not 0 < limits.derate_temperature < limits.temperature:
+        raise marks.error(
+            "limits.derate_temperature",
+            f"{limits.derate_temperature:g} is not between 0 and limits.temperature ({limits.temperature:g})",
+        )
+    if limits.voltage is not None:
+        _require_positive(limits.voltage, "limits.voltage", marks)
+    if limits.derate_voltage is not None and limits.derate_voltage <= (limits.voltage or 0.0):
+        raise marks.error(
+            "limits.derate_voltage", f"{limits.derate_voltage:g} V is not above limits.voltage: gains go down first"
+        )
+
+
+def _check_imu(robot: Robot, marks: Marks) -> None:
+    imu = robot.imu
+    for key in ("gyro_noise", "gyro_bias", "accelerometer_noise", "accelerometer_bias", "average", "latency"):
+        _require_not_negative(getattr(imu, key), f"imu.{key}", marks)
+    _require_positive(imu.baud, "imu.baud", marks)
+    for i, sign in enumerate((*imu.signs, imu.yaw_sign)):
+        if sign not in (1.0, -1.0):
+            raise marks.error(f"imu.signs[{i}]" if i < 3 else "imu.yaw_sign", f"must be 1 or -1, not {sign:g}")
+    for i, angle in enumerate(imu.mounting):
+        _require_radians(angle, f"imu.mounting[{i}]", marks)
+    if imu.kind == "opencr":
+        if imu.port is not None:
+            raise marks.error(
+                "imu.port", "the board's IMU is on the servo bus: drop the port, or name another imu.kind"
+            )
+        return
+    if not imu.port:
+        raise marks.error("imu.kind", f"a {imu.kind} has a serial port of its own: name it as imu.port")
+    if math.prod(imu.signs) < 0:
+        raise marks.error("imu.signs", f"a {imu.kind} has right-handed axes: negate two of them or none")
+
+
+def _check_identity(robot: Robot, marks: Marks) -> None:
+    """Names and servo IDs are unique, IDs exist on the bus, servo models are known."""
+    names: dict[str, int] = {}
+    ids = {robot.bus.board_id: "the board (bus.board_id)"}
+    for i, joint in enumerate(robot.joints):
+        if joint.name in names:
+            first = marks.lines.get(f"joints[{names[joint.name]}]")
+            raise marks.error(f"joints[{i}].name", f"duplicate joint name '{joint.name}', first on line {first}")
+        names[joint.name] = i
+        _require_id(joint.id, f"joints[{i}].id", marks)
+        if joint.id in ids:
+            raise marks.error(
+                f"joints[{i}].id", f"duplicate servo ID {joint.id}: {joint.name} and {ids[joint.id]} have it"
+            )
+        ids[joint.id] = joint.name
+        known = available("servos")
+        if joint.servo.endswith((".yaml", ".yml")):
+            if not (marks.path.parent / joint.servo).is_file():
+                raise marks.error(f"joints[{i}].servo", f"no file {joint.servo} in {marks.path.parent}")
+        elif joint.servo not in known:
+            raise marks.error(f"joints[{i}].servo", f"unknown servo '{joint.servo}'; {nearest(joint.servo, known)}")
+
+
+def _check_angles(robot: Robot, marks: Marks) -> None:
+    for i, joint in enumerate(robot.joints):
+        key = f"joints[{i}]"
+        if joint.direction not in (1, -1):
+            raise marks.error(f"{key}.direction", f"{joint.name}: must be 1 or -1, not {joint.direction}")
+        for end, value in enumerate(joint.range):
+            _require_radians(value, f"{key}.range[{end}]", marks, joint.name)
+        _require_radians(joint.home, f"{key}.home", marks, joint.name)
+        _require_radians(joint.zero, f"{key}.zero", marks, joint.name)
+        low, high = joint.range
+        if low >= high:
+            raise marks.error(
+                f"{key}.range", f"{joint.name}: upside down: {low:g} is not below {high:g}; write [lowest, highest]"
+            )
+        if 2.0 * robot.limits.margin >= high - low:
+            raise marks.error(f"{key}.range", f"{joint.name}: narrower than twice limits.margin")
+        if not low <= joint.home <= high:
+            raise marks.error(f"{key}.home", f"{joint.name}: {joint.home:g} is outside the range {low:g}..{high:g}")
+
+
+def _check_mirror(robot: Robot, marks: Marks) -> None:
+    """Mirroring twice must give the pose back."""
+    joints = {joint.name: joint for joint in robot.joints}
+    for i, joint in enumerate(robot.joints):
+        key = f"joints[{i}].mirror"
+        if joint.mirror_sign not in (1, -1):
+            raise marks.error(f"{key}_sign", f"{joint.name}: must be 1 or -1, not {joint.mirror_sign}")
+        if joint.mirror not in joints:
+            raise marks.error(key, f"{joint.name}: unknown joint '{joint.mirror}'; {nearest(joint.mirror, joints)}")
+        other = joints[joint.mirror]
+        if other.mirror != joint.name:
+            raise marks.error(
+                key, f"{joint.name} names {other.name} as its mirror, but {other.name} names {other.mirror}"
+            )
+        if other.mirror_sign != joint.mirror_sign:
+            raise marks.error(f"{key}_sign", f"{joint.name} and {other.name} must have the same sign")
+
+
+def _check_legs(robot: Robot, marks: Marks) -> None:
+    names = set(robot.names)
+    if not robot.legs:
+        raise marks.error("legs", "a robot needs at least one leg")
+    length = len(next(iter(robot.legs.values())))
+    used: set[str] = set()
+    for side, leg in robot.legs.items():
+        if side not in robot.feet:
+            raise marks.error(f"legs.{side}", f"no foot of that name; {nearest(side, robot.feet)}")
+        if len(leg) != length or not leg:
+            raise marks.error(f"legs.{side}", f"has {len(leg)} joints; every leg needs as many as the first ({length})")
+        for i, link in enumerate(leg):
+            key = f"legs.{side}[{i}]"
+            if link.joint not in names:
+                raise marks.error(f"{key}.joint", f"unknown joint '{link.joint}'; {nearest(link.joint, names)}")
+            if link.joint in used:
+                raise marks.error(f"{key}.joint", f"'{link.joint}' is in the legs twice")
+            used.add(link.joint)
+            if abs(math.hypot(*link.axis) - 1.0) > 1e-6:
+                raise marks.error(f"{key}.axis", f"{link.joint}: must be a unit vector, its length is not 1")
+            if max(map(abs, link.offset)) > 2.0:
+                raise marks.error(f"{key}.offset", f"{link.joint}: lengths are in m, {list(link.offset)} is too far")
+    for side, foot in robot.feet.items():
+        if side not in robot.legs:
+            raise marks.error(f"feet.{side}", f"no leg of that name; {nearest(side, robot.legs)}")
+        if not foot.geoms:
+            raise marks.error(f"feet.{side}.geoms", "name at least one collision geom of the MJCF")
+        if min(foot.half_size) <= 0.0:
+            raise marks.error(f"feet.{side}.half_size", "must be positive, in metres")
+
+
+def _require_positive(value: float, key: str, marks: Marks) -> None:
+    if value <= 0:
+        raise marks.error(key, f"must be positive, not {value:g}")
+
+
+def _require_not_negative(value: float, key: str, marks: Marks) -> None:
+    if value < 0:
+        raise marks.error(key, f"must not be negative, not {value:g}")
+
+
+def _require_id(value: int, key: str, marks: Marks) -> None:
+    if not 0 <= value <= MAX_ID:
+        raise marks.error(key, f"servo IDs are 0..{MAX_ID}, not {value}")
+
+
+def _require_radians(value: float, key: str, marks: Marks, joint: str = "") -> None:
+    if abs(value) > 2.0 * math.pi:
+        name = f"{joint}: " if joint else ""
+        raise marks.error(key, f"{name}{value:g} is more than a turn: angles are in radians, not degrees")

@@ -1,0 +1,216 @@
+"""The robot description: joints, servos, legs and limits, loaded from `configs/robots/*.yaml`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import yaml
+
+from servoid.hw.config import ConfigError, load_marked, resolve
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.checks import check_robot, check_servo
+
+
+@dataclass(frozen=True)
+class Servo:
+    """A servo model. Torques N m, speeds rad/s, times s, at `voltage`; stiffness is that of gain scale 1."""
+
+    name: str
+    model_number: int
+    ticks_per_turn: int
+    center_tick: int
+    velocity_unit: float  # rad/s
+    current_unit: float  # A
+    torque_per_ampere: float  # N m/A
+    voltage_unit: float  # V
+    position_p_gain: int
+    voltage: float
+    stiffness: float
+    stall_torque: float
+    no_load_speed: float
+    braking_torque: float
+    damping: float
+    friction: float
+    armature: float
+    command_delay: float
+    position_latency: float
+    max_temperature: float
+    voltage_range: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint. `zero` is added to the servo's angle, `direction` is 1 or -1; angles rad."""
+
+    name: str
+    servo: str  # a name in configs/servos, or a .yaml file: relative to the robot's file, absolute once loaded
+    id: int
+    direction: int
+    zero: float
+    range: tuple[float, float]
+    home: float
+    mirror: str
+    mirror_sign: int
+
+
+@dataclass(frozen=True)
+class Link:
+    """A joint of a leg: its offset [m] from the joint before it, in that joint's frame, and its axis."""
+
+    joint: str
+    offset: tuple[float, float, float]
+    axis: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Foot:
+    """A foot: its collision geoms and its sole's centre and half size [m] in the last leg link."""
+
+    geoms: tuple[str, ...]
+    sole: tuple[float, float, float]
+    half_size: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the guard enforces. Speeds rad/s, angles rad, temperatures degrees C, voltages V, `stale` in ticks.
+
+    From `derate_temperature` and `derate_voltage` on gains go down, until at `temperature` and `voltage` the robot is
+    lowered. None: no such limit, only the servos' own.
+    """
+
+    joint_speed: float
+    margin: float
+    homing_speed: float
+    tilt: float
+    stale: int
+    temperature: float
+    derate_temperature: float | None = None
+    voltage: float | None = None
+    derate_voltage: float | None = None
+
+
+@dataclass(frozen=True)
+class Imu:
+    """The IMU: where it is and how it is mounted, and its errors: standard deviation of a sample's noise, half-width of
+    the bias at power-on.
+
+    `average` [s] is the span that its low-pass filter averages over: samples at the loop's rate alone would alias.
+    `signs` are those of the sensor's axes against the mounted ones, `mounting` [rad] the roll, pitch and yaw that then
+    turn these into the base's (hw/imu/mounting.py). The board's (`opencr`) is on the servo bus; another has a `port`.
+    """
+
+    gyro_noise: float
+    gyro_bias: float
+    accelerometer_noise: float
+    accelerometer_bias: float
+    average: float
+    latency: float
+    signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    kind: Literal["opencr", "witmotion", "bno08x"] = "opencr"
+    port: str | None = None
+    baud: int = 115200  # of that port
+    yaw_sign: float = 1.0  # of a bno08x: -1 if its yaw counts clockwise
+
+
+Button = Literal["mode", "start", "user"]
+
+
+@dataclass(frozen=True)
+class Bus:
+    """The servo bus. Any of the board's `stop_buttons` is an emergency stop."""
+
+    baud: int
+    board_id: int
+    stop_buttons: tuple[Button, ...] = ("mode", "start", "user")
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot, as its file describes it. Joint arrays below are `(n_joints,)` in the file's order."""
+
+    name: str
+    mjcf: str  # relative to the robot's file; absolute once loaded
+    base: str
+    imu_site: str
+    rate: int
+    standing_height: float
+    bus: Bus
+    limits: Limits
+    imu: Imu
+    feet: dict[str, Foot]
+    legs: dict[str, tuple[Link, ...]]
+    joints: tuple[Joint, ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(joint.name for joint in self.joints)
+
+    @cached_property
+    def home(self) -> Array:
+        return np.array([joint.home for joint in self.joints])
+
+    @cached_property
+    def lower(self) -> Array:
+        return np.array([joint.range[0] for joint in self.joints])
+
+    @cached_property
+    def upper(self) -> Array:
+        return np.array([joint.range[1] for joint in self.joints])
+
+    @cached_property
+    def mirror(self) -> tuple[Array, Array]:
+        """Index and sign such that `q[..., index] * sign` is the pose seen in a mirror (left and right swapped)."""
+        index = np.array([self.names.index(joint.mirror) for joint in self.joints])
+        return index, np.array([float(joint.mirror_sign) for joint in self.joints])
+
+    @cached_property
+    def leg_index(self) -> Array:
+        """Joint numbers of each leg, `(n_legs, joints of a leg)`, hip to ankle."""
+        return np.array([[self.names.index(link.joint) for link in leg] for leg in self.legs.values()])
+
+    @cached_property
+    def servos(self) -> tuple[Servo, ...]:
+        """The servo of each joint."""
+        models = {name: load_servo(name) for name in {joint.servo for joint in self.joints}}
+        return tuple(models[joint.servo] for joint in self.joints)
+
+    @property
+    def dt(self) -> float:
+        """Length of a tick [s]."""
+        return 1.0 / self.rate
+
+
+def load_servo(name: str) -> Servo:
+    """Load a servo model by name, checked. Raises ConfigError naming file, line and key."""
+    servo, marks = load_marked(resolve("servos", name), Servo)
+    check_servo(servo, marks)
+    return servo
+
+
+def load_robot(name: str | Path = "op3") -> Robot:
+    """Load a robot by name or file, checked. Raises ConfigError naming file, line and key."""
+    path = resolve("robots", name)
+    robot, marks = load_marked(path, Robot)
+    check_robot(robot, marks)
+    folder = path.parent.resolve()
+    joints = tuple(
+        replace(joint, servo=str(folder / joint.servo)) if joint.servo.endswith((".yaml", ".yml")) else joint
+        for joint in robot.joints
+    )
+    robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints)
+    _ = robot.servos  # a servo's file that cannot be used is found now, not when the robot stands
+    return robot
+
+
+def save_robot(robot: Robot, path: Path) -> None:
+    """Write a file that `load_robot` reads as the same robot, on this machine: its paths are absolute."""
+    path.write_text(yaml.safe_dump(asdict(robot), sort_keys=False))
+
+
+__all__ = ["ConfigError", "Joint", "Robot", "Servo", "load_robot", "load_servo", "save_robot"]

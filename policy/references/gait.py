@@ -1,0 +1,178 @@
+"""An analytic walking reference for any planar velocity and yaw rate, by foot trajectories and leg inverse kinematics.
+
+It is the first reference that the tracker learns on, and with gyro feedback the scripted baseline. One instance walks
+one robot or many worlds: arrays carry any leading dimensions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoid.hw.config import CONFIGS, load_yaml
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Reference, ReferenceFrames
+from servoid.hw.robot.description import Robot
+from servoid.hw.robot.legs import LegInverse, Legs
+
+_SMOOTH = 0.3  # of a smooth swing's easing that is left at full speed
+_ACROSS = 5.0  # rad/s of turning that weigh as much as 1 m/s sideways
+
+
+@dataclass(frozen=True)
+class GaitSettings:
+    """Lengths m, times s, speeds m/s and rad/s. `*_gain` are of the gyro feedback [s]."""
+
+    cycle: float  # of two steps
+    double_support: float  # share of a step that both feet carry
+    height: float  # ankle below hip
+    foot_forward: float  # feet ahead of the hips
+    foot_apart: float  # feet outward of the hips
+    lean: float  # forward pitch of the base, rad
+    lift: float
+    sway: float
+    arm_swing: float  # rad for each m/s forward
+    sideways_gain: float  # soft legs drag their feet: how much longer than asked steps to the side are
+    backward_gain: float  # and steps backward
+    backward_lean: float  # rad that the base leans further forward for each m/s backward, so that its heels come free
+    backward_shift: float  # m that the feet trail for each m/s backward
+    max_velocity: tuple[float, float, float]  # forward, sideways, turning
+    max_backward: float  # m/s
+    even_swing: tuple[float, float]  # m/s forward between which swings grow even: smooth ones ask for too fast joints
+    acceleration: tuple[float, float, float]  # a second
+    ankle_pitch_gain: float
+    ankle_roll_gain: float
+
+
+def load_gait(name: str = "gait") -> GaitSettings:
+    """Load `configs/policies/<name>.yaml`. Raises ConfigError."""
+    return load_yaml(CONFIGS / "policies" / f"{name}.yaml", GaitSettings)
+
+
+class Gait(Reference):
+    """The walking reference. `command` `(..., 3)` is slewed, so that steps change gradually.
+
+    Standing is the same motion with no lift and no sway: `activity` (0 to 1) fades the steps in and out.
+    """
+
+    def __init__(self, robot: Robot, settings: GaitSettings, shape: tuple[int, ...] = ()) -> None:
+        self.robot, self.settings = robot, settings
+        legs = Legs(robot)
+        self._inverse, self._index = LegInverse(legs, robot.name), legs.index
+        self._side = np.sign(self._inverse.hip[:, 1])  # 1 left, -1 right
+        self._shift = np.where(self._side > 0, 0.0, 0.5)  # the right foot steps half a cycle later
+        self._arm = [robot.names.index(name) for name in ("l_sho_pitch", "r_sho_pitch") if name in robot.names]
+        self.upper = np.array(settings.max_velocity)  # that can be asked, and the same to the other sides:
+        self.lower = -np.array([settings.max_backward, *settings.max_velocity[1:]])
+        self._slew = np.array(settings.acceleration) * robot.dt
+        self._phase_step = robot.dt / settings.cycle
+        self.phase = np.zeros(shape)
+        self.velocity = np.zeros((*shape, 3))
+        self.target = np.zeros((*shape, 3))
+        self.activity = np.zeros(shape)
+
+    def reset(self, where: Array | slice = slice(None)) -> None:
+        """Stand still, in the worlds `where` (default: all)."""
+        if self.phase.ndim:
+            self.phase[where], self.velocity[where], self.target[where], self.activity[where] = 0.0, 0.0, 0.0, 0.0
+        else:
+            self.phase, self.activity = np.zeros(()), np.zeros(())
+            self.velocity, self.target = np.zeros(3), np.zeros(3)
+
+    def command(self, velocity: Array) -> None:
+        """Ask for `(..., 3)` m/s forward, m/s left, rad/s, clipped to the gait's limits."""
+        self.target = np.clip(velocity, self.lower, self.upper)
+
+    def advance(self) -> None:
+        """Go on by one tick."""
+        moving = (np.abs(self.target) > 1e-3).any(-1) | (np.abs(self.velocity) > 1e-3).any(-1)
+        self.velocity = self.velocity + np.clip(self.target - self.velocity, -self._slew, self._slew)
+        # Steps fade in over half a cycle and out over a whole one.
+        rate = np.where(moving, 2.0, -1.0) * self._phase_step
+        # The first step says where it goes: the left foot takes it, but for a walk to the right. Were it drawn, who
+        # learns from this could not know what comes, and the mean of a step of either foot is none.
+        rightward = _ACROSS * self.target[..., 1] + self.target[..., 2] < 0
+        begun = np.where(rightward, 0.5, 0.0)
+        self.phase = np.where(self.activity > 0, (self.phase + self._phase_step) % 1.0, begun)
+        self.activity = np.clip(self.activity + rate, 0.0, 1.0)
+
+    def frames(self, ahead: Array) -> ReferenceFrames:
+        """Frames `ahead` ticks from now, at the present velocity."""
+        shape = (*self.phase.shape, len(ahead))
+        phase = (self.phase[..., None] + np.asarray(ahead) * self._phase_step * (self.activity > 0)[..., None]) % 1.0
+        velocity = np.broadcast_to(self.velocity[..., None, :], (*shape, 3))
+        activity = np.broadcast_to(self.activity[..., None], shape)
+        position, contact = self.pose(phase, velocity, activity)
+        return ReferenceFrames(
+            position=position,
+            velocity=velocity[..., :2],
+            yaw_rate=velocity[..., 2],
+            height=np.full(shape, self.robot.standing_height),
+            contact=contact,
+        )
+
+    def pose(self, phase: Array, velocity: Array, activity: Array) -> tuple[Array, Array]:
+        """Joint positions `(..., n_joints)` and planned contacts `(..., n_feet)` at a phase `(...)` of the cycle.
+
+        A foot swings in the middle of its half of the cycle and is carried back by the body's twist while it stands.
+        """
+        s = self.settings
+        local = (phase[..., None] + self._shift) % 1.0  # 0..0.5 is this foot's step
+        swing_share = 0.5 * (1.0 - s.double_support)
+        start = 0.25 - swing_share / 2
+        u = np.clip((local - start) / swing_share, 0.0, 1.0)  # 0..1 through the swing
+        swinging = (u > 0) & (u < 1)
+        stance = (local - start - swing_share) % 1.0 / (1.0 - swing_share)  # 0..1 through the stance
+        even = np.interp(velocity[..., 0], s.even_swing, [1.0, _SMOOTH])[..., None]
+        travel = np.where(swinging, -0.5 + u - even * np.sin(2 * np.pi * u) / (2 * np.pi), 0.5 - stance)  # back..front
+        lift = np.where(swinging, np.sin(np.pi * u) ** 2, 0.0) * activity[..., None]
+
+        period = (1.0 - swing_share) * s.cycle  # that a foot stands
+        vx, vy, wz = velocity[..., None, 0], s.sideways_gain * velocity[..., None, 1], velocity[..., None, 2]
+        backward = np.minimum(vx, 0.0)
+        vx = vx + (s.backward_gain - 1.0) * backward
+        yaw = wz * period * travel
+        x0, y0 = s.foot_forward, self._inverse.hip[:, 1] + self._side * s.foot_apart
+        x = x0 + s.backward_shift * backward + (vx - wz * y0) * period * travel
+        y = y0 + (vy + wz * x0) * period * travel
+        y = y + (s.sway * activity * np.sin(2 * np.pi * phase))[..., None]  # away from the foot that steps
+        z = self._inverse.hip[:, 2] - s.height + s.lift * lift
+        lean = s.lean - s.backward_lean * backward
+        cos, sin = np.cos(lean), np.sin(lean)
+        ankle = np.stack([cos * x - sin * z, y, sin * x + cos * z], -1)  # seen from the leaning base
+        c, n, zero = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)
+        rotation = np.stack(
+            [
+                np.stack([cos * c, -cos * n, zero - sin], -1),
+                np.stack([n, c, zero], -1),
+                np.stack([sin * c, -sin * n, zero + cos], -1),
+            ],
+            -2,
+        )
+        legs = self._inverse(ankle, rotation)
+        joints = np.broadcast_to(self.robot.home, (*phase.shape, len(self.robot.home))).copy()
+        joints[..., self._index] = legs
+        swing = s.arm_swing * velocity[..., 0] * np.sin(2 * np.pi * phase) * activity
+        for arm in self._arm:  # the two shoulders' axes oppose, so one sign swings them against each other
+            joints[..., arm] += swing
+        contact = np.where(swinging & (activity > 0)[..., None], 0.0, 1.0)
+        return joints, contact
+
+
+class GyroFeedback:
+    """Adds to the ankles what the gyro says: the baseline's only balance."""
+
+    def __init__(self, robot: Robot, settings: GaitSettings) -> None:
+        inverse = LegInverse(Legs(robot), robot.name)
+        index = Legs(robot).index
+        self._pitch, self._pitch_sign = index[:, 4], inverse.sign[:, 4]
+        self._roll, self._roll_sign = index[:, 5], inverse.sign[:, 5]
+        self._gains = settings.ankle_pitch_gain, settings.ankle_roll_gain
+
+    def __call__(self, joints: Array, angular_velocity: Array) -> Array:
+        """Correct `(..., n_joints)` rad by the base's `(..., 3)` rad/s."""
+        out = joints.copy()
+        out[..., self._pitch] += self._gains[0] * angular_velocity[..., 1:2] * self._pitch_sign
+        out[..., self._roll] += self._gains[1] * angular_velocity[..., 0:1] * self._roll_sign
+        return out

@@ -1,0 +1,21 @@
+"""A servo from the spares box: on the bus, at the ID of another, and moving nothing."""
+
+from __future__ import annotations
+
+from servoid.hw.dynamixel.codec import StatusError
+from servoid.hw.dynamixel.tables import Item, table
+from servoid.sim.rig.device import Device
+from servoid.sim.rig.servo import FIRMWARE
+
+_POSITION = 1234  # ticks: nobody's home
+
+
+class Spare(Device):
+    """Registers without a motor. It takes every write that a servo would take with torque off."""
+
+    def __init__(self, model: int | str, eeprom: dict[str, int]) -> None:
+        super().__init__(table(model), {"firmware_version": FIRMWARE, **eeprom})
+        self.put("present_position", _POSITION)
+
+    def allowed(self, item: Item, value: int) -> StatusError:
+        return self.in_range(item, value)

@@ -1,0 +1,7 @@
+"""`python -m servoid`: the `servoid` command where its script is not on the path."""
+
+import sys
+
+from servoid.tools.cli import main
+
+sys.exit(main())

@@ -1,0 +1,89 @@
+"""Reads a flight log, whole or cut short."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.stream_reader import StreamReader
+from zstandard import ZstdError
+
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.stack.log.format import FORMAT, SCHEMAS, unpack
+
+Message = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class FlightLog:
+    """A run's log. `messages` holds each channel's messages in order, arrays still packed.
+
+    `complete` is False where the recording was cut short, by a kill or a full disk: what is there is good.
+    """
+
+    path: Path
+    header: dict[str, Any]
+    messages: dict[str, list[Message]]
+    complete: bool
+
+    @property
+    def result(self) -> dict[str, Any] | None:
+        """The run's result, or None if it did not live to write one."""
+        return self.messages["/result"][-1] if self.messages["/result"] else None
+
+    def ticks(self, channel: str) -> Array:
+        """Tick of each message of a channel, `(messages,)`."""
+        return np.array([message["tick"] for message in self.messages[channel]], dtype=int)
+
+    def column(self, channel: str, field: str) -> Array:
+        """A field over time, `(messages, ...)`. Raises KeyError if a message lacks it."""
+        values = [message[field] for message in self.messages[channel]]
+        return np.array([unpack(value) if isinstance(value, dict) else value for value in values])
+
+
+def read_log(path: Path | str) -> FlightLog:
+    """Read a flight log up to its last complete chunk. Raises ConfigError for what is none."""
+    path = Path(path)
+    found: dict[str, list[Message]] = {channel: [] for channel in SCHEMAS}
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    with file:
+        complete = False
+        topics: dict[int, str] = {}
+        try:
+            for kind, record in _records(file):
+                if kind == "Channel":
+                    topics[record.id] = record.topic
+                elif kind == "Message" and topics.get(record.channel_id) in found:
+                    found[topics[record.channel_id]].append(json.loads(record.data))
+                elif kind == "Footer":
+                    complete = True
+        except _BROKEN:
+            complete = False
+    if not complete and found["/timing"]:
+        last = found["/timing"][-1]["tick"]  # a tick's last message: what comes after belongs to a tick cut in two
+        found = {name: [m for m in part if m.get("tick", last) <= last] for name, part in found.items()}
+    if not found["/run"]:
+        raise ConfigError(f"{path}: not a flight log, or cut short before its header was written")
+    header = found["/run"][0]
+    if header.get("format") != FORMAT:
+        raise ConfigError(f"{path}: log format {header.get('format')}, but this version reads {FORMAT}")
+    return FlightLog(path, header, found, complete)
+
+
+# What the library raises at the point where a file was cut, depending on the record that it cuts.
+_BROKEN = (McapError, ZstdError, struct.error, ValueError, OSError)
+
+
+def _records(file: Any) -> Iterator[tuple[str, Any]]:
+    for record in StreamReader(file, validate_crcs=True).records:
+        yield type(record).__name__, record

@@ -1,0 +1,67 @@
+"""Which way to walk past others that walk themselves, for policies that go by a velocity."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoid.hw.contracts.body import Array
+
+_WAYS = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 25)  # rad to the left of the goal
+
+
+@dataclass(frozen=True)
+class Passing:
+    apart: float = 0.42  # m between the middles of two robots that pass
+    fade: float = 0.04  # m nearer than that which is as bad as turning by 90 degrees
+    horizon: float = 4.0  # s that the robot looks ahead
+    window: float = 0.96  # s over which the others' velocity is taken: two cycles of the gait, which sways
+    right: float = 0.1  # how much worse it is to pass on the left: who meets head-on must not choose alike
+    steady: float = 0.1  # how much worse it is to turn by a radian from the way that was chosen before
+
+    def __post_init__(self) -> None:
+        for key in ("apart", "fade", "horizon", "window"):
+            if getattr(self, key) <= 0.0:
+                raise ValueError(f"{key}: must be positive")
+        for key in ("right", "steady"):
+            if getattr(self, key) < 0.0:
+                raise ValueError(f"{key}: must not be negative")
+
+
+class Motion:
+    """How fast others go, from where they were at each tick before."""
+
+    def __init__(self, window: float, dt: float) -> None:
+        self._places: deque[Array] = deque(maxlen=max(round(window / dt), 1) + 1)
+        self._dt = dt
+
+    def update(self, places: Array) -> Array:
+        """Mean velocity `(n, 2)` m/s over the window of those who are at `places` `(n, 2)` m, once a tick."""
+        self._places.append(places.copy())
+        ticks = len(self._places) - 1
+        result: Array = (places - self._places[0]) / (max(ticks, 1) * self._dt)
+        return result
+
+
+def way(goal: Array, others: Array, speed: float, before: float, passing: Passing) -> float:
+    """Bearing [rad] to walk at, past `others` `(n, 4)`, x, y m and their velocity m/s, to `goal` `(2,)` m.
+
+    All are in one frame with the robot at its origin, and so is `before`, the bearing that was chosen last. Of straight
+    ways at `speed` [m/s] it takes the one of least `1 - cos a + r max(a, 0) + s |a - b| + sum((apart - d) / fade)`, a
+    being its angle to the left of the goal, b that of `before`, and d the least distance from each other robot within
+    the horizon, where it is less than `apart` and gets any less.
+    """
+    ahead = np.arctan2(goal[1], goal[0])
+    bearings = ahead + _WAYS
+    velocity = speed * np.stack([np.cos(bearings), np.sin(bearings)], axis=-1)
+    relative = others[:, 2:] - velocity[:, None]  # (ways, n, 2)
+    until = min(passing.horizon, float(np.hypot(*goal)) / speed)
+    speeds = np.maximum((relative**2).sum(-1), 1e-9)
+    nearest = np.clip(-(others[:, :2] * relative).sum(-1) / speeds, 0.0, until)
+    distance = np.linalg.norm(others[:, :2] + nearest[..., None] * relative, axis=-1)
+    close = np.maximum(passing.apart - distance, 0.0).sum(-1) / passing.fade
+    turn = np.abs(np.angle(np.exp(1j * (bearings - before))))
+    cost = 1.0 - np.cos(_WAYS) + passing.right * np.maximum(_WAYS, 0.0) + passing.steady * turn + close
+    return float(bearings[np.argmin(cost)])

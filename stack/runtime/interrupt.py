@@ -1,0 +1,90 @@
+"""Ctrl-C and other reasons to stop as requests, not as exceptions: a write to the motors is never cut in half."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import FrameType
+from typing import Any
+
+from servoid.stack.safety.event import Event
+
+ONCE = "interrupted: stopping; once more for torque off at once"
+TWICE = "interrupted twice: torque off at once"
+
+
+class Interrupt:
+    """Counts SIGINT and SIGTERM while it is entered, and restores the handlers after.
+
+    The first asks for an orderly end, the second for torque off at once. A policy that hangs would never look: while
+    `breakable` is set, and only then, the second signal also raises KeyboardInterrupt. Outside the main thread, where
+    Python forbids handlers, it stays at zero unless `request` is called.
+
+    Before anything moves it may be `eager`, and raise at once. An exception can get lost in a library that is just
+    being imported or is cleaning up; what was counted is not lost, and `settle` raises it.
+    """
+
+    def __init__(self, *, eager: bool = False) -> None:
+        self.eager = eager
+        self.count = 0
+        self.breakable = False
+        self._handlers: dict[signal.Signals, Any] = {}
+
+    def request(self) -> None:
+        """The same as one Ctrl-C."""
+        self.count += 1
+
+    def settle(self) -> None:
+        """End of being eager: signals are requests from here on. Raises KeyboardInterrupt for one that came before."""
+        self.eager = False
+        if self.count:
+            raise KeyboardInterrupt
+
+    def __enter__(self) -> Interrupt:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._handlers[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers.clear()
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.count += 1
+        if self.eager or (self.count > 1 and self.breakable):
+            raise KeyboardInterrupt
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """A reason to end that came from outside the robot."""
+
+    kind: str
+    text: str
+    at_once: bool = False  # without lowering
+
+
+class Stops:
+    """All such reasons in one place: the operator's Ctrl-C, a log that cannot be written, and, when a recorded run is
+    repeated, the ones that its log tells of."""
+
+    def __init__(
+        self, interrupt: Interrupt, failure: Callable[[], str | None] = lambda: None, script: Sequence[Event] = ()
+    ) -> None:
+        self._interrupt, self._failure, self._script = interrupt, failure, script
+
+    def at(self, tick: int) -> Stop | None:
+        """The reason to stop at a tick, the strongest first."""
+        due = [event for event in self._script if event.tick <= tick]
+        if self._interrupt.count > 1 or any(event.text == TWICE for event in due):
+            return Stop("interrupt", TWICE, at_once=True)
+        if self._interrupt.count == 1:
+            return Stop("interrupt", ONCE)
+        if due:
+            return Stop(due[0].kind, due[0].text)
+        failure = self._failure()
+        return Stop("record", failure) if failure is not None else None

@@ -1,0 +1,140 @@
+"""The phases of a run: home, stand still, do the task, come to rest, end."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from servoid.hw.contracts.body import Array, Observation
+from servoid.hw.contracts.control import Instruction, Policy, State
+from servoid.hw.contracts.task import Task, Trace
+from servoid.hw.contracts.world import Percept
+from servoid.hw.robot.description import Robot
+from servoid.stack.estimation.sample_hold import missing
+from servoid.stack.log.tick import Adopted, Proposal
+from servoid.stack.log.trace_buffer import Tape
+from servoid.stack.runtime.loop import Estimator
+from servoid.stack.safety.guard import Guard, Phase
+
+WAIT_SECONDS = 1.0  # for a first sample from every sensor
+STILL_SECONDS = 0.5  # after homing, when the body has stopped swinging: gravity is taken from there, not from the way
+DONE = "the task is done"
+SETTLE_SECONDS = 1.5  # standing still at home, in which the estimator learns the gyro's bias
+
+
+class Director:
+    """Pilot of a run. `push` changes the body's velocity, m/s `(2,)`; None where a body cannot be pushed.
+
+    `look` sees what is around the robot (`world.Surroundings`); without it the task says what should be there.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        guard: Guard,
+        estimator: Estimator,
+        task: Task,
+        policy: Policy,
+        push: Callable[[Array], None] | None = None,
+        look: Callable[[State], Percept] | None = None,
+    ) -> None:
+        self._robot, self._guard, self._estimator, self._task, self._policy = robot, guard, estimator, task, policy
+        self._push = push
+        self._look = task.percept if look is None else look
+        self._settled = 0
+        self._plans = 0  # adopted so far
+        self._tape = Tape(len(robot.joints), round(task.seconds / robot.dt))
+        self.ended: str | None = None  # "done" or "time", if the task ended by itself
+
+    @property
+    def task_ticks(self) -> int:
+        return len(self._tape)
+
+    def act(self, tick: int, observation: Observation, state: State | None) -> Proposal:
+        phase = self._guard.phase
+        if phase is Phase.LIMP:
+            self._wake(tick, observation, state)
+        elif phase is Phase.READY:
+            self._settled += 1
+            if self._settled == round(STILL_SECONDS * self._robot.rate):
+                self._estimator.reset()
+            if self._settled >= SETTLE_SECONDS * self._robot.rate:
+                self._estimator.reset_odometry()
+                self._guard.start()
+        elif phase is Phase.RUNNING and state is not None:
+            return self._do_task(state)
+        elif phase is Phase.STOPPING and state is not None:
+            return self._come_to_rest(state)
+        return Proposal()
+
+    def trace(self) -> Trace:
+        """What the robot believes to have gone through in the task."""
+        fallen = self._guard.phase is Phase.FAULT and self._guard.cause == "fall" and self.ended is None
+        return self._tape.trace(self._robot.dt, fallen)
+
+    def _wake(self, tick: int, observation: Observation, state: State | None) -> None:
+        if state is not None:
+            self._guard.home(observation)
+        elif tick >= WAIT_SECONDS * self._robot.rate:
+            lacking = ", ".join(missing(observation, self._robot.names))
+            self._guard.fault("stale", f"no sample from {lacking}: check cables and power")
+
+    def _do_task(self, state: State) -> Proposal:
+        tick = self.task_ticks
+        percept = self._look(state)
+        instruction = self._task.instruct(tick, state, percept)
+        self._tape.add(state, instruction, percept)
+        shown = Proposal(instruction=instruction, percept=percept)
+        if self._task.done(state):
+            return self._end("done", DONE, shown, state)
+        if tick * self._robot.dt >= self._task.seconds:
+            return self._end("time", f"{self._task.seconds:g} s are over", shown, state)
+        velocity = self._task.disturbance(tick)
+        if velocity is not None and self._push is not None:
+            self._push(velocity)
+        try:
+            target = self._policy.act(state, self._guard.applied, instruction)
+        except Exception as error:  # whatever a controller raises, the robot must end safe
+            self._guard.give_up(_failed(error))
+            return shown
+        self._tell()
+        return Proposal(target, instruction, percept, self._adopted())
+
+    def _come_to_rest(self, state: State) -> Proposal:
+        """Ask the policy to stand."""
+        try:
+            target = self._policy.act(state, self._guard.applied, Instruction(np.zeros(3)))
+        except Exception as error:
+            self._guard.give_up(_failed(error))
+            return Proposal()
+        self._tell()
+        return Proposal(target, plan=self._adopted())
+
+    def _tell(self) -> None:
+        """What the policy wants a person to know, as events."""
+        for text in self._policy.take_events() if hasattr(self._policy, "take_events") else ():
+            self._guard.note("plan", text)
+
+    def _adopted(self) -> Adopted | None:
+        """The plan that a planning policy took over at this tick."""
+        adopted: list[tuple[int, int]] = getattr(self._policy, "adopted", [])
+        if len(adopted) <= self._plans:
+            return None
+        self._plans = len(adopted)
+        return Adopted(*adopted[-1], self._policy.latest_plan)  # type: ignore[attr-defined]
+
+    def _end(self, how: str, text: str, shown: Proposal, state: State) -> Proposal:
+        """End the task. The policy is asked at this tick too: a walking robot has no time for a tick without."""
+        self.ended = how
+        self._guard.stop("task", text)
+        if self._guard.phase is not Phase.STOPPING:
+            return shown
+        return replace(self._come_to_rest(state), instruction=shown.instruction, percept=shown.percept)
+
+
+def _failed(error: Exception) -> str:
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    return f"the policy failed: {type(error).__name__}: {error} ({where.filename}:{where.lineno})"

@@ -1,0 +1,249 @@
+"""The gait's steps, as a walking robot would notice if they were wrong."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from servoid.hw.config import ConfigError
+from servoid.hw.robot.description import load_robot
+from servoid.hw.robot.legs import LegInverse, Legs
+from servoid.policy.references.gait import Gait, GaitSettings, GyroFeedback, load_gait
+from servoid.tools.learn.envs.fleet import Fleet
+from servoid.tools.learn.envs.walker import Walker
+
+ROBOT, SETTINGS = load_robot(), load_gait()
+LEGS = Legs(ROBOT)
+NOW = np.array([0])
+PHASES = np.linspace(0, 1, 48, endpoint=False)
+_GAIT = Gait(ROBOT, SETTINGS)
+BOX = np.array(list(itertools.product(*((low, 0.0, high) for low, high in zip(_GAIT.lower, _GAIT.upper, strict=True)))))
+
+
+def pose(phase: np.ndarray, velocity: np.ndarray, activity: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    velocity = np.broadcast_to(velocity, (*phase.shape, 3))
+    return Gait(ROBOT, SETTINGS).pose(phase, velocity, np.full(phase.shape, activity))
+
+
+def soles(phase: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Centres of the soles `(..., n_legs, 3)`, upright frame, without the sway that both share."""
+    centre, _ = LEGS.soles(LEGS.pick(pose(phase, velocity)[0]))
+    lean = SETTINGS.lean - SETTINGS.backward_lean * min(velocity[0], 0.0)
+    c, s = np.cos(lean), np.sin(lean)
+    x, y, z = np.moveaxis(centre, -1, 0)
+    return np.stack([c * x + s * z, y - SETTINGS.sway * np.sin(2 * np.pi * phase)[..., None], c * z - s * x], -1)
+
+
+def test_joints_stay_within_the_limits_over_the_whole_command_box() -> None:
+    phase, velocity = (a.reshape(-1, *a.shape[2:]) for a in (np.tile(PHASES, (27, 1)), np.repeat(BOX[:, None], 48, 1)))
+    joints, _ = pose(phase, velocity)
+    margin = ROBOT.limits.margin
+    assert (joints > ROBOT.lower + margin).all()
+    assert (joints < ROBOT.upper - margin).all()
+    assert np.isfinite(joints).all()
+
+
+def test_the_mirrored_command_gives_the_mirrored_steps() -> None:
+    index, sign = ROBOT.mirror
+    for velocity in BOX:
+        joints, contact = pose(PHASES, velocity)
+        mirrored, their_contact = pose((PHASES + 0.5) % 1.0, velocity * [1, -1, -1])
+        np.testing.assert_allclose(mirrored, joints[:, index] * sign, atol=1e-9)
+        np.testing.assert_array_equal(their_contact, contact[:, ::-1])
+
+
+@pytest.mark.parametrize(
+    ("velocity", "tolerance"),
+    # A turning foot goes along the tangent of its circle: an error of the second order.
+    [((0.3, 0.0, 0.0), 1e-3), ((-0.2, 0.1, 0.0), 1e-3), ((0.2, 0.05, 0.5), 0.03), ((0.0, 0.0, -0.8), 0.03)],
+)
+def test_standing_feet_stand_still_in_the_world(velocity: tuple[float, float, float], tolerance: float) -> None:
+    """But for steps that are made longer because soft legs drag: those are tested below."""
+    v, dt = np.array(velocity), 1e-4
+    v[1] /= SETTINGS.sideways_gain  # what is asked so that the feet move with `velocity`
+    v[0] /= SETTINGS.backward_gain if v[0] < 0 else 1.0
+    step = dt / SETTINGS.cycle
+    before, after = soles(PHASES, v), soles((PHASES + step) % 1.0, v)
+    contact = pose(PHASES, v)[1] * pose((PHASES + step) % 1.0, v)[1]
+    own = (after - before) / dt  # seen from the base, which goes with the twist
+    v = np.array(velocity)
+    carried = v[:2] + v[2] * np.stack([-before[..., 1], before[..., 0]], -1)
+    slip = np.linalg.norm(own[..., :2] + carried, axis=-1)[contact > 0]
+    assert slip.max() < tolerance
+    assert np.abs(own[..., 2])[contact > 0].max() < 2e-3
+    assert 0.55 < contact.mean() < 0.65  # a foot stands through 60 % of the cycle
+
+
+def test_feet_turn_with_the_yaw_rate_and_stay_level() -> None:
+    joints, contact = pose(PHASES, np.array([0.1, 0.0, 0.8]))
+    _, rotation, _, _ = LEGS.forward(LEGS.pick(joints))
+    c, s = np.cos(SETTINGS.lean), np.sin(SETTINGS.lean)
+    level = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ rotation
+    np.testing.assert_allclose(level[..., 2, 2], 1.0, atol=1e-9)
+    yaw = np.arctan2(level[..., 1, 0], level[..., 0, 0])
+    rate = np.diff(yaw, axis=0) / (SETTINGS.cycle / len(PHASES))
+    standing = contact[1:] * contact[:-1] > 0
+    np.testing.assert_allclose(rate[standing], -0.8, atol=1e-6)
+
+
+def test_the_swinging_foot_is_lifted_and_only_one_swings() -> None:
+    velocity = np.array([0.2, 0.0, 0.0])
+    _, contact = pose(PHASES, velocity)
+    height = soles(PHASES, velocity)[..., 2]
+    ground = height[contact > 0].mean()
+    np.testing.assert_allclose(height[contact > 0], ground, atol=5e-4)
+    assert height.max() - ground == pytest.approx(SETTINGS.lift, abs=1e-3)
+    assert contact.sum(-1).min() == 1
+
+
+def walked(gait: Gait, velocity: np.ndarray, ticks: int) -> None:
+    gait.command(velocity)
+    for _ in range(ticks):
+        gait.advance()
+
+
+def test_it_stands_when_nothing_is_asked_and_again_after_a_walk() -> None:
+    gait = Gait(ROBOT, SETTINGS)
+    stand = gait.frames(NOW)
+    walked(gait, np.zeros(3), 50)
+    np.testing.assert_array_equal(gait.frames(NOW).position, stand.position)
+    assert stand.contact.min() == 1.0
+    walked(gait, np.array([0.2, 0.05, 0.3]), 60)
+    assert gait.activity == 1.0
+    assert gait.frames(NOW).velocity[0] == pytest.approx([0.2, 0.05])
+    walked(gait, np.zeros(3), 100)
+    np.testing.assert_allclose(gait.frames(NOW).position, stand.position, atol=1e-12)
+    assert not gait.velocity.any()
+
+
+def test_the_foot_on_the_side_it_goes_to_takes_the_first_step() -> None:
+    for velocity, foot in (([0.2, 0, 0], 0), ([0, 0.1, 0], 0), ([0, -0.1, 0], 1), ([0.1, 0, -0.5], 1)):
+        for before in (0, 37):  # however long it walked and stood before
+            gait = Gait(ROBOT, SETTINGS)
+            walked(gait, np.array([0.2, 0.0, 0.0]), before)
+            walked(gait, np.zeros(3), 100)
+            gait.command(np.array(velocity))
+            while (contact := gait.frames(NOW).contact[0]).all():
+                gait.advance()
+            assert contact.tolist() == [float(foot != 0), float(foot != 1)]
+
+
+def test_fast_steps_swing_evenly_so_that_joints_can_follow() -> None:
+    """A smooth swing asks a hip for twice its mean speed."""
+
+    def fastest(settings: GaitSettings, speed: float) -> float:
+        gait = Gait(ROBOT, settings)
+        joints, _ = gait.pose(PHASES, np.tile([speed, 0.0, 0.0], (len(PHASES), 1)), np.ones(len(PHASES)))
+        hips = joints[:, [ROBOT.names.index(f"{side}_hip_pitch") for side in "lr"]]
+        return float(np.abs(np.diff(hips, axis=0)).max() * len(PHASES) / settings.cycle)
+
+    smooth = replace(SETTINGS, even_swing=(8.0, 9.0))
+    assert fastest(SETTINGS, 0.2) == fastest(smooth, 0.2)
+    assert fastest(SETTINGS, SETTINGS.max_velocity[0]) < 0.9 * fastest(smooth, SETTINGS.max_velocity[0])
+
+
+def test_velocity_is_slewed_and_clipped() -> None:
+    gait, last = Gait(ROBOT, SETTINGS), np.zeros(3)
+    gait.command(np.array([9.0, -9.0, 9.0]))
+    for _ in range(120):
+        gait.advance()
+        change = np.abs(gait.velocity - last)
+        assert (change <= np.array(SETTINGS.acceleration) * ROBOT.dt + 1e-12).all()
+        last = gait.velocity
+    assert last == pytest.approx(np.array(SETTINGS.max_velocity) * [1, -1, 1])
+
+
+def test_starting_and_stopping_asks_for_no_faster_joints_than_walking() -> None:
+    gait, targets = Gait(ROBOT, SETTINGS), []
+    for velocity, ticks in ((np.array([0.3, 0.0, 0.0]), 100), (np.zeros(3), 100)):
+        gait.command(velocity)
+        for _ in range(ticks):
+            targets.append(gait.frames(NOW).position[0])
+            gait.advance()
+    change = np.abs(np.diff(targets, axis=0)).max(-1)
+    steady = change[50:99].max()
+    assert change[:50].max() < 1.05 * steady
+    assert change[99:].max() < 1.05 * steady
+    assert not change[-20:].any()
+
+
+def test_frames_ahead_are_what_comes() -> None:
+    gait = Gait(ROBOT, SETTINGS)
+    walked(gait, np.array([0.2, 0.0, 0.4]), 80)
+    ahead = gait.frames(np.array([0, 3, 8]))
+    for _ in range(8):
+        gait.advance()
+    now = gait.frames(NOW)
+    np.testing.assert_allclose(ahead.position[2], now.position[0], atol=1e-9)
+    np.testing.assert_array_equal(ahead.contact[2], now.contact[0])
+    assert ahead.height == pytest.approx(ROBOT.standing_height)
+
+
+def test_many_worlds_walk_as_one_robot_does_and_reset_alone() -> None:
+    commands = np.array([[0.2, 0.0, 0.0], [0.0, 0.1, 0.5], [0.0, 0.0, 0.0]])
+    many = Gait(ROBOT, SETTINGS, (3,))
+    walked(many, commands, 37)
+    for i in range(3):
+        one = Gait(ROBOT, SETTINGS)
+        walked(one, commands[i], 37)
+        np.testing.assert_allclose(many.frames(NOW).position[i], one.frames(NOW).position, atol=1e-12)
+    many.reset(np.array([0]))
+    assert not many.velocity[0].any()
+    assert many.velocity[1].any()
+
+
+def test_gyro_feedback_turns_both_ankles_the_same_way_in_space() -> None:
+    """A body that pitches forward gets its toes pressed down: both feet pitch further than the body asks."""
+    feedback, home = GyroFeedback(ROBOT, SETTINGS), ROBOT.home
+    for axis in (0, 1):
+        rate = np.zeros(3)
+        rate[axis] = 1.0
+        _, level, _, _ = LEGS.forward(LEGS.pick(home))
+        _, turned, _, _ = LEGS.forward(LEGS.pick(feedback(home, rate)))
+        turn = turned @ np.swapaxes(level, -1, -2)
+        skew = 0.5 * (turn - np.swapaxes(turn, -1, -2))
+        vector = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
+        assert vector[:, axis] == pytest.approx([0.05, 0.05], abs=3e-3)
+    np.testing.assert_array_equal(feedback(home, np.zeros(3)), home)
+
+
+def test_legs_whose_axes_do_not_meet_are_refused() -> None:
+    """Their inverse kinematics would be silently wrong."""
+    for joint, change in ((1, (0.0, 0.02, 0.0)), (2, (0.02, 0.0, 0.0)), (5, (0.0, 0.0, -0.02))):
+        legs = Legs(ROBOT)
+        legs.offset = legs.offset.copy()
+        legs.offset[:, joint] += change
+        with pytest.raises(ConfigError, match="meet in a point"):
+            LegInverse(legs, "own")
+
+
+def test_a_robot_with_other_arms_can_walk() -> None:
+    joints = tuple(replace(j, name=j.name.replace("sho_pitch", "shoulder")) for j in ROBOT.joints)
+    joints = tuple(replace(j, mirror=j.mirror.replace("sho_pitch", "shoulder")) for j in joints)
+    gait = Gait(replace(ROBOT, joints=joints), SETTINGS)
+    walked(gait, np.array([0.3, 0.0, 0.0]), 30)
+    assert np.isfinite(gait.frames(NOW).position).all()
+
+
+def test_it_walks_five_seconds_on_the_nominal_robot() -> None:
+    commands = np.array([[0.2, 0, 0], [-0.1, 0, 0], [0, 0.08, 0], [0.1, -0.05, 0], [0.1, 0, 0.5], [0, 0, -0.8]])
+    fleet = Fleet(ROBOT, len(commands), None, seed=4, threads=1)
+    walker, everything = Walker(fleet, None), np.ones(len(commands), bool)
+    fleet.reset(everything)
+    walker.reset(everything)
+    turned, heading = np.zeros(len(commands)), fleet.truth.yaw
+    for _ in range(250):
+        fleet.observe()
+        fleet.step(walker.act(commands))
+        turned += (fleet.truth.yaw - heading + np.pi) % (2 * np.pi) - np.pi
+        heading = fleet.truth.yaw
+        assert not fleet.truth.fallen.any()
+    x, y = fleet.truth.position[:, 0], fleet.truth.position[:, 1]
+    assert x[0] > 0.5  # half of what was asked, at least: nothing corrects its slip
+    assert x[0] - x[1] > 0.5
+    assert y[2] - y[3] > 0.2
+    assert turned[4] > 1.0
+    assert turned[5] < -0.5

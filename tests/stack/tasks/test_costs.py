@@ -1,0 +1,169 @@
+"""The terms of the guidance cost: what each wants, and where its gradient points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from task_bodies import DT, moves, state
+
+from servoid.hw.contracts.control import Instruction
+from servoid.hw.robot.description import load_robot
+from servoid.stack.control.policies import make_policy
+from servoid.stack.navigation.frames import to_heading
+from servoid.stack.tasks import load_settings, load_task
+from servoid.stack.tasks.guidance import Weights, goal_cost, ground_cost, obstacle_cost, path_cost, total_cost
+
+TWIST = tuple(f"cost.{name}" for name in ("velocity", "yaw_rate", "displacement", "yaw", "stand"))
+
+
+def value(cost: torch.Tensor) -> float:
+    return float(cost.detach())
+
+
+def test_heading_frame_has_the_robot_at_its_origin_facing_x() -> None:
+    now = state(1.0, 2.0, np.pi / 2)
+    np.testing.assert_allclose(to_heading(np.array([[1.0, 3.0], [0.0, 2.0]]), now), [[1, 0], [0, 1]], atol=1e-12)
+
+
+def test_obstacle_cost_is_the_papers_and_pushes_away() -> None:
+    here = moves(np.zeros((4, 2)))
+    obstacle = np.array([[0.3, 0.0, 0.05, 0.0, 0.0]])
+    cost = obstacle_cost(here, obstacle, Weights(repulsion=2.0, sharpness=10.0))
+    assert value(cost) == pytest.approx(2.0 * np.exp(-10.0 * 0.25), rel=1e-4)
+    (gradient,) = torch.autograd.grad(cost.sum(), here.displacement)
+    assert (gradient[0, :, 0] > 0).all()  # a step down it goes back
+    assert (gradient[0, :, 1] == 0).all()
+    soft = obstacle_cost(here, obstacle, Weights(repulsion=0.0, avoidance=1.0, margin=0.25))
+    assert value(soft) == pytest.approx(np.log(2.0), rel=1e-4)
+
+
+def test_obstacle_cost_meets_a_moving_obstacle_where_it_will_be() -> None:
+    horizon = 25
+    still = moves(np.zeros((horizon, 2)))
+    coming, leaving = np.array([[0.5, 0, 0.1, -0.4, 0]]), np.array([[0.5, 0, 0.1, 0.4, 0]])
+    weights = Weights(repulsion=1.0)
+    assert obstacle_cost(still, coming, weights) > 5 * obstacle_cost(still, leaving, weights)
+    at_end = 0.5 - 0.4 * DT * horizon
+    alone = obstacle_cost(moves(np.zeros((1, 2))), np.array([[at_end + 0.4 * DT, 0, 0.1, -0.4, 0]]), weights)
+    assert value(alone) == pytest.approx(np.exp(-15 * (at_end - 0.1)), rel=1e-4)
+
+
+def test_goal_cost_wants_to_be_near_and_to_face_the_goal() -> None:
+    goal, weights = np.array([1.0, 0.0]), Weights(goal=2.0, facing=3.0)
+    assert value(goal_cost(moves(np.zeros((3, 2))), goal, weights)) == pytest.approx(2.0, rel=1e-5)
+    away = goal_cost(moves(np.zeros((3, 2)), yaw=np.pi), goal, weights)
+    assert value(away) == pytest.approx(2.0 + 3.0 * 2.0, rel=0.01)
+
+
+def pull(distance: float, weights: Weights, bearing: float = 1.0) -> tuple[float, float]:
+    """The cost of a goal in sight, and the size of its gradient on the place."""
+    here = moves(np.zeros((1, 2)))
+    cost = goal_cost(here, distance * np.array([np.cos(bearing), np.sin(bearing)]), weights)
+    (gradient,) = torch.autograd.grad(cost.sum(), here.displacement)
+    return value(cost), float(gradient.norm())
+
+
+def test_each_robot_of_a_batch_may_have_a_goal_of_its_own() -> None:
+    goals, weights = np.array([[1.0, 0.0], [0.0, 2.0]]), Weights(goal=2.0, facing=3.0)
+    for ticks in (2, 3):  # as many as robots, or more
+        one, two = moves(np.zeros((ticks, 2))), moves(np.zeros((ticks, 2)))
+        two.displacement, two.yaw = (torch.cat([part, part]) for part in (one.displacement, one.yaw))
+        alone = [value(goal_cost(one, goal, weights)) for goal in goals]
+        np.testing.assert_allclose(goal_cost(two, goals, weights).detach().numpy(), alone, rtol=1e-6)
+
+
+def test_facing_a_near_goal_does_not_outweigh_being_there() -> None:
+    facing, goal = Weights(facing=1.0), Weights(goal=1.0)
+    for distance in (0.001, 0.02, 0.1):
+        assert pull(distance, facing)[1] < 5.0 * pull(distance, goal)[1]
+    assert pull(0.02, facing)[1] < 3.0 * pull(0.02, goal)[1]
+    # Who faces it is not pushed off, and further away facing is the paper's: 1 - cos, turned by 1 / distance.
+    assert pull(0.02, facing, bearing=0.0)[1] == pytest.approx(0.0, abs=1e-3)
+    assert pull(1.0, facing) == pytest.approx((1.0 - np.cos(1.0), np.sin(1.0)), rel=0.02)
+
+
+def test_a_waypoint_costs_the_square_of_its_distance() -> None:
+    cost = goal_cost(moves(np.zeros((3, 2))), np.array([0.0, 2.0]), Weights(waypoint=0.5))
+    assert value(cost) == pytest.approx(2.0, rel=1e-5)
+
+
+def test_ground_cost_has_a_term_each_for_speed_direction_and_facing() -> None:
+    """It is told over the ground: who faces left and walks ahead goes left."""
+    left, still = np.array([0.0, 0.3]), np.zeros((5, 2))
+    right_way = moves(still, yaw=np.pi / 2, velocity=(0.3, 0.0))
+    assert value(ground_cost(right_way, left, Weights(speed=1.0, steering=1.0, heading=1.0))) < 0.02
+    slow = moves(still, yaw=np.pi / 2, velocity=(0.1, 0.0))
+    assert value(ground_cost(slow, left, Weights(speed=2.0))) == pytest.approx(2.0 * 0.2**2, rel=1e-3)
+    aside = moves(still, velocity=(0.0, 0.3))
+    assert value(ground_cost(aside, left, Weights(speed=1.0, steering=1.0))) < 0.02
+    assert value(ground_cost(aside, left, Weights(heading=2.0))) == pytest.approx(2.0, rel=1e-5)
+    ahead = moves(still, velocity=(0.3, 0.0))
+    assert value(ground_cost(ahead, left, Weights(steering=2.0))) == pytest.approx(2.0, rel=1e-5)
+    standing = np.zeros(2)
+    assert value(ground_cost(ahead, standing, Weights(speed=1.0, steering=1.0, heading=1.0))) == pytest.approx(0.09)
+
+
+def test_at_rest_the_ground_cost_pulls_toward_what_is_asked() -> None:
+    rest = moves(np.zeros((5, 2)))
+    rest.velocity.requires_grad_()
+    cost = ground_cost(rest, np.array([0.2, 0.0]), Weights(speed=1.0, steering=0.05, heading=0.1))
+    (gradient,) = torch.autograd.grad(cost.sum(), rest.velocity)
+    assert (gradient[..., 0] < 0).all()
+
+
+def test_path_cost_compares_tick_by_tick_as_far_as_both_go() -> None:
+    path = np.stack([0.1 * np.arange(1, 4), np.zeros(3)], axis=-1)
+    on_it = moves(np.stack([0.1 * np.arange(1, 7), np.zeros(6)], axis=-1))
+    assert value(path_cost(on_it, path, Weights(path=1.0))) == pytest.approx(0.0, abs=1e-12)
+    late = moves(np.stack([0.1 * np.arange(0, 6), np.zeros(6)], axis=-1))
+    assert value(path_cost(late, path, Weights(path=5.0))) == pytest.approx(5.0 * 0.01)
+
+
+def test_weights_choose_the_terms_and_zero_leaves_the_planner_to_itself() -> None:
+    trajectory = moves(0.1 * np.ones((5, 2)))
+    instruction = Instruction(
+        velocity=np.array([0.2, 0.0, 0.0]),
+        ground=np.array([0.2, 0.2]),
+        goal=np.ones(2),
+        path=np.ones((5, 2)),
+        obstacles=np.ones((2, 5)),
+    )
+    nothing = Weights(velocity=0, yaw_rate=0, displacement=0, yaw=0, stand=0, path=0, repulsion=0)
+    assert value(total_cost(trajectory, instruction, nothing)) == 0.0
+    for name in (
+        "velocity", "displacement", "speed", "steering", "heading", "goal", "waypoint", "path", "repulsion",
+        "avoidance",
+    ):  # fmt: skip
+        assert value(total_cost(trajectory, instruction, replace(nothing, **{name: 1.0}))) > 1e-6, name
+    assert (
+        load_settings("survive").cost
+        == load_settings("text").cost
+        == replace(Weights(), velocity=0, yaw_rate=0, displacement=0, yaw=0, stand=0)
+    )
+    with pytest.raises(ValueError, match="margin: must be positive"):
+        Weights(margin=0.0)
+
+
+@pytest.mark.parametrize(
+    ("task", "settings", "guides"),
+    [
+        ("survive", {}, False),
+        ("text", {}, False),
+        ("inbetween", {}, False),
+        ("text", {"cost.yaw": "0.1"}, True),
+        ("walk", {}, True),
+        ("goal", dict.fromkeys(TWIST, "0") | {"cost.goal": "1"}, True),
+    ],
+)
+def test_a_task_whose_cost_is_zero_makes_a_policy_without_guidance(
+    monkeypatch: pytest.MonkeyPatch, task: str, settings: dict[str, str], guides: bool
+) -> None:
+    costs: list[object] = []
+    monkeypatch.setattr(
+        "servoid.stack.control.diffusion.diffusion_policy", lambda robot, s, cost, process: costs.append(cost)
+    )
+    make_policy("diffusion", load_robot(), load_task(task, settings), realtime=False)
+    assert [cost is not None for cost in costs] == [guides]

@@ -1,0 +1,37 @@
+"""Bodies for tests of tasks."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import State
+
+DT = 0.02
+
+
+def state(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> State:
+    return State(
+        time_ns=0,
+        orientation=np.array([np.cos(0.5 * yaw), 0, 0, np.sin(0.5 * yaw)]),
+        gravity=np.array([0, 0, -1.0]),
+        yaw=np.array(yaw),
+        angular_velocity=np.zeros(3),
+        velocity=np.zeros(3),
+        displacement=np.array([x, y, 0.26]),
+        position=np.zeros(20),
+        joint_velocity=np.zeros(20),
+        contact=np.ones(2),
+    )
+
+
+def moves(places: Array, yaw: float = 0.0, velocity: tuple[float, float] = (0.0, 0.0)) -> SimpleNamespace:
+    """A predicted trajectory through `places` `(horizon, 2)`; `velocity` m/s is as a trajectory has it."""
+    displacement = torch.tensor(np.asarray(places, dtype=float))[None].requires_grad_()
+    horizon = displacement.shape[1]
+    zeros = torch.zeros(1, horizon, dtype=torch.float64)
+    moving = torch.zeros(1, horizon, 2, dtype=torch.float64) + torch.tensor(velocity, dtype=torch.float64)
+    return SimpleNamespace(displacement=displacement, yaw=zeros + yaw, velocity=moving, yaw_rate=zeros, dt=DT)

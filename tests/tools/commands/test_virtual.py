@@ -1,0 +1,112 @@
+"""`servoid virtual`, and `run` and `rollout` with `--backend virtual`, as a person starts them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import serial
+
+from servoid.hw.dynamixel import codec
+from servoid.stack.log.flightlog import read_log
+from servoid.tools.cli import main
+
+RUN = ["run", "walk", "--policy", "gait", "--backend", "virtual"]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "servoid", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def test_the_verb_serves_a_port_until_ctrl_c(tmp_path: Path) -> None:
+    """Any program can talk to it: the board answers a ping on the link, and both are gone afterwards."""
+    process = start("virtual", "--link", "rig", "--json")
+    assert process.stdout is not None
+    told = json.loads(process.stdout.readline())
+    assert told["robot"] == "op3"
+    assert told["port"] in ("rig", os.path.realpath("rig"))
+    answer, deadline = b"", time.monotonic() + 10.0
+    with serial.Serial("rig", told["baud"], timeout=0.2) as port:
+        while len(answer) < 14 and time.monotonic() < deadline:
+            port.write(codec.ping(200))
+            answer = port.read(14)
+    assert answer[:5] == b"\xff\xff\xfd\x00\xc8"
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 0, err
+    assert out == ""
+    assert not list(tmp_path.iterdir()), "link and socket are taken away"
+
+
+def test_a_locked_rig_that_nobody_could_advance_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["virtual", "--clock", "locked"]) == 2
+    assert "give --link or --control" in capsys.readouterr().err
+
+
+def test_a_run_is_recorded_and_replays_bit_for_bit(capfd: pytest.CaptureFixture[str]) -> None:
+    options = ["--seconds", "2", "--set", "push=0.05", "--randomise", "--seed", "3", "--set", "vx=0.1"]
+    assert main([*RUN, *options, "--record", "a.mcap", "--json"]) == 0
+    values = json.loads(capfd.readouterr().out)
+    assert (values["backend"], values["outcome"], values["missed"]) == ("virtual", "succeeded", 0)
+    log = read_log("a.mcap")
+    assert log.messages["/command"][-1]["mode"] == "OFF"
+    assert log.messages["/command"][-1]["phase"] == "damped"
+    assert main(["replay", "a.mcap"]) == 0, capfd.readouterr().out
+
+
+def test_a_robot_of_ones_own_file_is_emulated(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """The servo's ID is another than the shipped robot's: the rig must be that of the file."""
+    from servoid.hw.robot.description import load_robot, save_robot
+
+    save_robot(load_robot(), tmp_path / "mine.yaml")
+    text = (tmp_path / "mine.yaml").read_text()
+    assert text.count("id: 19\n") == 1
+    (tmp_path / "mine.yaml").write_text(text.replace("id: 19\n", "id: 77\n"))
+    assert main([*RUN, "--robot", "mine.yaml", "--seconds", "0.5"]) == 0, capfd.readouterr().err
+
+
+def test_rollouts_are_the_same_on_one_and_two_workers(capfd: pytest.CaptureFixture[str]) -> None:
+    words = ["rollout", "walk", "--policy", "expert", "--backend", "virtual", "--seconds", "2", "--episodes", "2"]
+    figures = []
+    for workers in ("1", "2"):
+        assert main([*words, "--workers", workers, "--json"]) == 0
+        figures.append(json.loads(capfd.readouterr().out))
+        assert figures[-1].pop("wall_seconds") > 0
+    assert figures[0] == figures[1]
+    assert figures[0]["backend"] == "virtual"
+    assert figures[0]["metrics"]["odometry_error_m"] < 0.1
+
+
+def test_a_port_for_the_virtual_rig_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*RUN, "--port", "/dev/ttyUSB0"]) == 2
+    assert "drop --port" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_in_mid_walk_ends_with_torque_off_acknowledged(number: signal.Signals, tmp_path: Path) -> None:
+    """A servo that had not said that torque is off would be exit code 3."""
+    process = start(*RUN, "--seconds", "600", "--record", "a.mcap", "--json")
+    while not (tmp_path / "a.mcap").exists():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    time.sleep(1.0)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert json.loads(out)["outcome"] == "interrupted"
+    log = read_log("a.mcap")
+    assert log.complete
+    assert log.messages["/command"][-1]["mode"] == "OFF"

@@ -1,0 +1,97 @@
+"""The line that a person watches never holds the robot up."""
+
+from __future__ import annotations
+
+import io
+import os
+import pty
+import signal
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any, TextIO
+
+import pytest
+
+from servoid.stack.runtime.run import Settings, run
+from servoid.tools.common import live
+from servoid.tools.common.live import LiveLine
+from servoid.tools.common.output import Screen
+
+TIMING = SimpleNamespace(read=0, estimate=0, act=0, guard=0, write=0, record=0)
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, TextIO]]:
+    """What a person types into and reads from, and the stream of a program in it; who waits for it too long fails."""
+
+    def ring(*_: Any) -> None:
+        raise TimeoutError("it waits for the terminal")
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, 20.0)
+    person, program = pty.openpty()
+    stream = os.fdopen(program, "w")
+    try:
+        yield person, stream
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+        os.close(person)
+        stream.close()
+
+
+def record(time_ns: int) -> Any:
+    observation, proposal = SimpleNamespace(time_ns=time_ns), SimpleNamespace(instruction=None)
+    return SimpleNamespace(timing=TIMING, proposal=proposal, observation=observation, state=None, phase="homing")
+
+
+def test_a_terminal_that_ctrl_s_stopped_is_not_waited_for(
+    terminal: tuple[int, TextIO], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    person, stream = terminal
+    monkeypatch.setitem(live.INTERVAL, True, 0.0)
+    line = LiveLine(stream)
+    line(record(0))
+    os.write(person, b"\x13")
+    time.sleep(0.1)
+    began = time.monotonic()
+    for i in range(100):
+        line(record(i))
+    line.close()
+    assert time.monotonic() - began < 1.0  # on a busy machine; who waits, waits for ever
+    os.read(person, 1000)
+    os.write(person, b"\x11")  # Ctrl-Q
+    time.sleep(0.1)
+    line(record(101))
+    assert b"homing" in os.read(person, 1000)
+
+
+def test_a_terminal_that_nobody_reads_is_not_waited_for(terminal: tuple[int, TextIO]) -> None:
+    """As that of an ssh connection that hangs: it takes some, and then no more."""
+    screen = Screen(terminal[1])
+    written = [screen.write("\r" + "x" * 100) for _ in range(3000)]
+    assert written[0]
+    assert not written[-1]
+
+
+class Gone(io.StringIO):
+    """A terminal whose reader has left."""
+
+    tries = 0
+
+    def isatty(self) -> bool:
+        return True
+
+    def write(self, text: str) -> int:
+        self.tries += 1
+        raise BrokenPipeError("gone")
+
+
+def test_a_reader_that_left_does_not_end_the_run() -> None:
+    stream = Gone()
+    line = LiveLine(stream)
+    result = run(Settings("stand", policy="gait", seconds=0.4), on_tick=line)
+    line.close()
+    assert result.outcome == "succeeded"
+    assert stream.tries == 1

@@ -1,0 +1,180 @@
+"""The question before something moves or is written: only Enter or y goes on. Every verb that asks is asked here."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+
+import pytest
+
+from servoid.hw.config import ConfigError
+from servoid.sim.rig.control import RigProcess
+from servoid.tools.cli import main
+from servoid.tools.common.prompt import Cancelled, confirm
+from servoid.tools.faults.controller import free_rig
+
+
+@contextmanager
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]:
+    """A terminal at standard input; yields what types into it."""
+    master, slave = os.openpty()
+    with os.fdopen(slave) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        yield lambda text: (os.write(master, text.encode()), None)[1]
+    os.close(master)
+
+
+@contextmanager
+def answering(monkeypatch: pytest.MonkeyPatch, answer: str) -> Iterator[None]:
+    """A person who reads each question, and answers after it was asked."""
+    with terminal(monkeypatch) as type_in:
+        asked, stderr = threading.Event(), sys.stderr
+
+        class Screen:
+            def write(self, text: str) -> int:
+                if "Press Enter to continue" in text:
+                    asked.set()
+                return stderr.write(text)
+
+            def flush(self) -> None:
+                stderr.flush()
+
+            def fileno(self) -> int:
+                return stderr.fileno()
+
+        monkeypatch.setattr(sys, "stderr", Screen())
+        person = threading.Thread(target=lambda: asked.wait(60.0) and type_in(answer))
+        person.start()
+        try:
+            yield
+        finally:
+            asked.set()
+            person.join()
+
+
+@pytest.mark.parametrize("answer", ["\n", "y\n", "Y\n", "yes\n", "  \n"])
+def test_enter_and_y_go_on(monkeypatch: pytest.MonkeyPatch, answer: str) -> None:
+    with answering(monkeypatch, answer):
+        confirm("It moves")
+
+
+@pytest.mark.parametrize("answer", ["n\n", "no\n", "q\n", "yn\n", "\x1b[A\n", "ls -l\n", "0\n"])
+def test_anything_else_is_a_no(monkeypatch: pytest.MonkeyPatch, answer: str) -> None:
+    with answering(monkeypatch, answer), pytest.raises(Cancelled, match="neither Enter nor y"):
+        confirm("It moves")
+
+
+def test_what_was_typed_before_the_question_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot must not walk because Enter was pressed twice at the command before."""
+    with terminal(monkeypatch) as type_in:
+        type_in("\n\ny\n")
+        answers: list[BaseException | None] = []
+
+        def ask() -> None:
+            try:
+                confirm("It moves")
+                answers.append(None)
+            except Cancelled as error:
+                answers.append(error)
+
+        person = threading.Thread(target=ask)
+        person.start()
+        person.join(0.3)
+        assert answers == [], "it took what was typed before for an answer"
+        type_in("n\n")
+        person.join(60.0)
+        assert isinstance(answers[0], Cancelled)
+
+
+def test_what_was_pasted_behind_an_answer_does_not_answer_the_next_question(monkeypatch: pytest.MonkeyPatch) -> None:
+    with terminal(monkeypatch) as type_in:
+        for answer, outcome in (("\n\n\n", None), ("n\n\n", Cancelled)):
+            answering = threading.Timer(0.3, type_in, [answer])  # each asks, and waits, before this
+            answering.start()
+            with nullcontext() if outcome is None else pytest.raises(outcome):
+                confirm("It moves")
+            answering.join()
+
+
+def test_lines_that_wait_in_a_pipe_are_no_answer_either(monkeypatch: pytest.MonkeyPatch) -> None:
+    read, write = os.pipe()
+    os.write(write, b"\ny\n")
+    os.close(write)
+    with os.fdopen(read) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        with pytest.raises(ConfigError, match="nobody is there to press Enter: give --yes"):
+            confirm("It moves")
+
+
+# Every verb that asks ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[RigProcess]:
+    with free_rig() as rig:
+        yield rig
+
+
+@pytest.fixture
+def rig(shared: RigProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RigProcess:
+    """A rig on a port, as a robot is, and a person without a calibration."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    shared.control.reset(0)
+    shared.control.accepted()
+    return shared
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "stand", "--policy", "gait", "--backend", "dynamixel", "--port"],
+        ["bringup", "jog", "l_knee", "--by", "0.1", "--port"],
+        ["bringup", "calibrate", "--port"],
+    ],
+)
+def test_a_verb_that_is_told_no_does_nothing(
+    rig: RigProcess,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    words: list[str],
+) -> None:
+    with answering(monkeypatch, "n\n"):
+        assert main([*words, rig.port]) == 130
+    said = capfd.readouterr().err
+    assert said.endswith("servoid: cancelled: the answer was 'n', neither Enter nor y\n"), said
+    writes = [write["register"] for write in rig.control.accepted()]
+    assert not {"torque_enable", "goal_position", "id", "baud_rate", "homing_offset"} & set(writes), writes
+    assert not any(servo["torque"] for servo in rig.control.servos())
+    assert not list(tmp_path.rglob("*.yaml"))
+
+
+def test_setup_that_is_told_no_writes_no_id(
+    rig: RigProcess, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for id in range(1, 21):
+        if id != 14:
+            rig.control.inject("dead", servo=id)
+    with answering(monkeypatch, "n\n"):
+        assert main(["bringup", "setup", "--id", "33", "--port", rig.port]) == 130
+    assert "will be written: ID 14 -> 33" in capfd.readouterr().out
+    assert "id" not in {write["register"] for write in rig.control.accepted()}
+
+
+def test_a_calibration_that_is_told_no_at_the_end_is_not_kept(
+    rig: RigProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """With hands that move the joints by themselves, the only question is the last one."""
+    link = tmp_path / "rig"
+    link.symlink_to(rig.port)
+    link.with_name("rig.control").symlink_to(rig.control_path)
+    with answering(monkeypatch, "n\n"):
+        code = main(["bringup", "calibrate", "--keep-directions", "--port", str(link)])
+    assert code == 130, capfd.readouterr().err
+    assert not list(tmp_path.rglob("*.yaml"))

@@ -1,0 +1,93 @@
+"""Runs that go on in their folder."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from test_train_diffusion import CONFIG, QUICK, ROBOT, Measured, trainer
+
+from servoid.hw.config import ConfigError
+from servoid.policy.checkpoint import read_header
+from servoid.policy.diffusion.dataset import Windows, read_recording
+from servoid.policy.latent.actions import LatentConfig
+from servoid.policy.latent.dataset import Demonstrations
+from servoid.tools.learn.trainers import latent
+from servoid.tools.learn.trainers.diffusion import Trainer
+
+
+@pytest.fixture(scope="module")
+def windows(synthetic_dataset: Path) -> Windows:
+    return Windows(read_recording(synthetic_dataset, ROBOT), ROBOT, CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("committed", 1), ("far_actions", 0.0), ("monotone", 0.0), ("batch", 8), ("precision", "fp32")],
+)
+def test_a_run_goes_on_under_the_settings_that_it_began_with(
+    windows: Windows, tmp_path: Path, name: str, value: Any
+) -> None:
+    trainer(windows, tmp_path, Measured(1.0)).save()
+    was = getattr(QUICK, name)
+    with pytest.raises(ConfigError, match=rf"other settings \({name} was {was}, is {value}\); use its options"):
+        trainer(windows, tmp_path, Measured(1.0), replace(QUICK, **{name: value})).resume()
+
+
+def test_a_run_goes_on_for_another_time_and_with_other_evaluations(windows: Windows, tmp_path: Path) -> None:
+    trainer(windows, tmp_path, Measured(1.0)).save()
+    longer = replace(QUICK, minutes=1.0, steps=40, evaluate_every=0.0)
+    assert trainer(windows, tmp_path, Measured(1.0), longer).resume()
+
+
+def test_a_run_of_a_program_that_did_not_keep_its_settings_goes_on(windows: Windows, tmp_path: Path) -> None:
+    trainer(windows, tmp_path, Measured(1.0)).save()
+    saved = torch.load(tmp_path / "resume.pt", weights_only=True)
+    del saved["settings"]
+    torch.save(saved, tmp_path / "resume.pt")
+    assert trainer(windows, tmp_path, Measured(1.0), replace(QUICK, batch=8)).resume()
+
+
+def test_latents_go_on_under_the_settings_that_they_began_with(synthetic_dataset: Path, tmp_path: Path) -> None:
+    pairs = Demonstrations(read_recording(synthetic_dataset, ROBOT), ROBOT)
+
+    def run(**settings: Any) -> latent.LatentTrainer:
+        config = LatentConfig(5, 24, 1)
+        return latent.LatentTrainer(pairs, ROBOT, config, latent.Settings(**settings), tmp_path, "", "", None)
+
+    run().save()
+    assert run(minutes=1.0).resume()
+    with pytest.raises(ConfigError, match=r"beta was \(0.01, 0.001\), is \(0.1, 0.1\); change was 0.005, is 0.1"):
+        run(beta=(0.1, 0.1), change=0.1).resume()
+
+
+def test_a_checkpoint_says_what_it_was_begun_with_also_after_going_on(windows: Windows, tmp_path: Path) -> None:
+    old = tmp_path / "old.safetensors"
+    Trainer(windows, ROBOT, CONFIG, QUICK, tmp_path, "old walks", "CC-BY-4.0", None)._ship(old, {"survival": 0.5})
+
+    def run(source: str = "new walks") -> Trainer:
+        return Trainer(windows, ROBOT, CONFIG, QUICK, tmp_path / "on", source, "Apache-2.0", None)
+
+    def header(of: Trainer) -> dict[str, Any]:
+        of._ship(tmp_path / "new.safetensors", {})
+        return read_header(tmp_path / "new.safetensors")
+
+    first = run()
+    first.begin_from(old)
+    first.save()
+    again = run()
+    assert again.resume()
+    for head in (header(first), header(again)):
+        assert (head["data"], head["licence"]) == ("new walks", "Apache-2.0")
+        begun = head["results"]["begun_with"]
+        assert (begun["checkpoint"], begun["data"], begun["licence"]) == ("old.safetensors", "old walks", "CC-BY-4.0")
+        assert begun["results"]["survival"] == 0.5
+    again.require_begun_with(old)
+    with pytest.raises(ConfigError, match=r"did not begin with .*new\.safetensors: give --no-resume"):
+        again.require_begun_with(tmp_path / "new.safetensors")
+    assert "begun_with" not in header(run())["results"]
+    with pytest.raises(ConfigError, match="trained on new walks, not on other walks"):
+        run("other walks").resume()

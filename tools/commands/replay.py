@@ -1,0 +1,171 @@
+"""Repeat a recorded simulated run and say whether it comes out identical.
+
+Runs the log's configuration and seed again, without its observations, and compares every observation, state, command,
+plan and event bit by bit. Exit code 0: identical; 1: it differs, and the first difference is named.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import defaultdict
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from servoid.hw.config import ConfigError
+from servoid.stack.log.flightlog import FlightLog, read_log
+from servoid.stack.log.format import MACHINE_DEPENDENT, event_message, messages, plain
+from servoid.stack.log.tick import TickRecord
+from servoid.stack.runtime.backends import BACKENDS
+from servoid.stack.runtime.phases import DONE
+from servoid.stack.runtime.run import Script, Settings, run
+from servoid.stack.safety.event import Event
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import add_json_argument, reporting
+
+Tick = dict[str, list[dict[str, Any]]]  # channel -> its messages of one tick
+
+
+@dataclass(frozen=True)
+class Difference:
+    tick: int
+    channel: str
+    field: str
+
+    def __str__(self) -> str:
+        return f"tick {self.tick}: {self.channel} {self.field}"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", type=Path, help="flight log of a simulated run")
+    add_json_argument(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        log = read_log(args.log)
+        changed = changes(log)
+        for text in changed:
+            report.line(f"not as it was recorded: {text}")
+        ticks, difference = replay(log)
+        if difference is None:
+            report.line(f"identical over {ticks} ticks" + ("" if log.complete else ", as far as the log goes"))
+        else:
+            report.line(f"differs, first at {difference}")
+        report.result(
+            {
+                "identical": difference is None,
+                "ticks": ticks,
+                "complete": log.complete,
+                "changed": changed,
+                "first_difference": None if difference is None else vars(difference),
+            }
+        )
+    return exit_codes.DONE if difference is None else exit_codes.FAILED
+
+
+def replay(log: FlightLog) -> tuple[int, Difference | None]:
+    """Repeat a log's run: how many ticks were compared, and the first difference. Raises ConfigError."""
+    settings = _settings(log)
+    body = log.header["backend"]
+    if body not in BACKENDS or not BACKENDS[body].simulated:
+        raise ConfigError(f"{log.path}: recorded on '{body}': only simulated runs can be repeated")
+    if body != settings.backend:
+        raise ConfigError(f"{log.path}: recorded with a program's own backend: only that program can repeat it")
+    if log.header["policy"]["name"] != settings.policy:
+        raise ConfigError(f"{log.path}: recorded with a program's own policy: only that program can repeat it")
+    stops = [Event(**event) for event in log.messages["/event"] if event["kind"] in ("interrupt", "record")]
+    plans = {int(message["requested"]): int(message["adopted"]) for message in log.messages["/plan"]}
+    recorded = _by_tick(log)
+    repeated: dict[int, Tick] = defaultdict(lambda: defaultdict(list))
+
+    def compare(record: TickRecord) -> None:
+        for channel, message in messages(record):
+            if channel != "/event":
+                repeated[record.tick][channel].append(plain(message))
+
+    velocities = log.column("/instruction", "velocity").reshape(-1, 3)
+    ended = any(event["kind"] == "task" and event["text"] == DONE for event in log.messages["/event"])
+    result = run(settings, on_tick=compare, script=Script(tuple(stops), plans, velocities, ended))
+    for event in result.events:  # of their own ticks, as in the log: what befalls other robots comes between two
+        repeated[event.tick]["/event"].append(plain(event_message(event)))
+    for number in sorted(recorded.keys() | (repeated.keys() if log.complete else set())):
+        difference = _difference(number, recorded.get(number), repeated.get(number))
+        if difference is not None:
+            return len(recorded), difference
+    return len(recorded), None
+
+
+def changes(log: FlightLog) -> list[str]:
+    """What is not as it was when the log was written: robot, policy, task, packages, source; as far as the log says."""
+    from servoid.hw.robot.description import load_robot
+    from servoid.policy.checkpoint import git_commit
+    from servoid.stack.control.policies import policy_fingerprint
+    from servoid.stack.log.provenance import fingerprint, versions
+
+    settings = _settings(log)
+    policy, header = policy_fingerprint(settings.policy), {**log.header, **_part("policy", log.header["policy"])}
+    now = fingerprint(load_robot(settings.robot)) | _part("policy", policy)
+    now |= _task(settings) | {"versions": versions(), "git_commit": git_commit()}
+    names = {
+        "robot": "the robot's file",
+        "servos": "a servo's file",
+        "mjcf_sha256": "the robot's model",
+        "policy.name": "the policy",
+        "policy.checkpoint_sha256": "the policy's checkpoint",
+        "policy.odometry_sha256": "the odometry's checkpoint",
+        "policy.planner": "the planner's settings",
+        "policy.gait": "the gait's settings",
+        "task": "the task's settings",
+        "task_files": "a file that the task's settings name",
+        "versions": "installed packages",
+        "git_commit": "the source",
+    }
+    return [text for key, text in names.items() if key in header and header[key] != now[key]]
+
+
+def _part(name: str, values: dict[str, Any]) -> dict[str, Any]:
+    return {f"{name}.{key}": value for key, value in values.items()}
+
+
+def _task(settings: Settings) -> dict[str, Any]:
+    """The task as a log's header has it, by the files of today."""
+    from servoid.stack.log.provenance import described, files
+    from servoid.stack.tasks import load_settings
+
+    chosen = {key: value for key, value in settings.set.items() if key != "gain"}  # which is the servos'
+    if settings.seconds is not None:
+        chosen["seconds"] = repr(settings.seconds)
+    task = load_settings(settings.task, chosen)
+    return {"task": {"name": settings.task} | described(task), "task_files": files(task)}
+
+
+def _settings(log: FlightLog) -> Settings:
+    known = {f.name for f in fields(Settings)}
+    values = {name: value for name, value in log.header["settings"].items() if name in known}
+    return Settings(**(values | {"record": None, "realtime": False}))
+
+
+def _by_tick(log: FlightLog) -> dict[int, Tick]:
+    ticks: dict[int, Tick] = defaultdict(lambda: defaultdict(list))
+    for channel, channel_messages in log.messages.items():
+        if channel in MACHINE_DEPENDENT and MACHINE_DEPENDENT[channel] is None:
+            continue
+        for message in channel_messages:
+            ticks[message["tick"]][channel].append(message)
+    return ticks
+
+
+def _difference(number: int, recorded: Tick | None, repeated: Tick | None) -> Difference | None:
+    if recorded is None or repeated is None:
+        return Difference(number, "/run", "length: " + ("the repetition is longer" if repeated else "it ended earlier"))
+    for channel in sorted((recorded.keys() | repeated.keys()) - MACHINE_DEPENDENT.keys() | {"/plan"}):
+        before, after = recorded.get(channel, []), repeated.get(channel, [])
+        if len(before) != len(after):
+            return Difference(number, channel, f"{len(before)} messages, now {len(after)}")
+        ignored = MACHINE_DEPENDENT.get(channel) or ()
+        for old, new in zip(before, after, strict=True):
+            for field in sorted(old.keys() | new.keys()):
+                if field not in ignored and old.get(field) != new.get(field):
+                    return Difference(number, channel, field)
+    return None

@@ -1,0 +1,241 @@
+"""Run a task many times in simulation and judge it by the truth.
+
+Every episode is a `servoid run` of its own, with its own random stream: results do not depend on the number of workers,
+and any episode can be repeated with `servoid run TASK --seed S`. An episode that cannot be done ends the rollout with
+its error, after the figures of those that were.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import os
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Backend
+from servoid.hw.contracts.task import Task, Trace
+from servoid.hw.contracts.world import Truth
+from servoid.tools.common.confidence import wilson
+from servoid.tools.common.exit_codes import exit_code, explain
+from servoid.tools.common.output import add_json_argument, reporting
+from servoid.tools.common.parser import add_set_argument, check_seed, settings
+from servoid.tools.common.worker_pool import each
+
+if TYPE_CHECKING:
+    from servoid.stack.runtime.run import Settings
+    from servoid.tools.common.ground_truth import Witness
+
+ENDED = ("succeeded", "failed", "timed_out")  # outcomes of runs whose task ended by itself
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("task", help="see `servoid tasks`")
+    parser.add_argument("--episodes", type=int, default=50, help="(default: %(default)s)")
+    parser.add_argument("--workers", type=int, default=0, help="processes (default: one a core)")
+    parser.add_argument("--backend", default="sim", help="sim or virtual (default: %(default)s)")
+    parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
+    parser.add_argument(
+        "--policy", default="diffusion", help="diffusion (default), expert, gait, or a file as in `run`"
+    )
+    parser.add_argument("--randomise", action="store_true", help="draw the robot anew for each episode")
+    parser.add_argument("--seconds", type=float, help="instead of the task's own")
+    parser.add_argument("--seed", type=int, default=0, help="of the first episode's stream (default: %(default)s)")
+    add_set_argument(parser)
+    add_json_argument(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        _check(args)
+        begun = time.monotonic()
+        rows: dict[int, dict[str, Any]] = {}
+        failure: Exception | None = None
+        try:
+            for episode, row in run_all(args, settings(args)):
+                rows[episode] = row
+        except Exception as error:
+            if not rows:
+                raise
+            failure = error  # raised below, when what was done is told
+        summary = summarise(args, [rows[episode] for episode in sorted(rows)], time.monotonic() - begun)
+        if failure is not None:
+            summary |= {"error": explain(failure), "exit_code": exit_code(failure)}
+        report.table(["figure", "value"], [[key, _text(value)] for key, value in summary.items()])
+        report.result(summary)
+        if failure is not None:
+            raise failure
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    from servoid.stack.runtime.backends import backend_kind
+    from servoid.stack.tasks import task_class
+
+    if args.episodes < 1:
+        raise ConfigError(f"--episodes: {args.episodes} is not a number of episodes; give 1 or more")
+    if args.workers < 0:
+        raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
+    check_seed(args.seed)
+    if task_class(args.task).steered:
+        raise ConfigError(f"task '{args.task}' is steered by a person: use `servoid run {args.task}`")
+    if not backend_kind(args.backend).simulated:
+        raise ConfigError(f"backend '{args.backend}' has no truth to judge by: use a simulated one, or `servoid run`")
+
+
+def episode_seed(seed: int, episode: int) -> int:
+    """The seed that repeats episode `episode` with `servoid run`."""
+    import numpy as np
+
+    return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
+
+
+def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[int, dict[str, Any]]]:
+    """All episodes with their rows, as they are done by `--workers` processes. Bad settings are refused before any.
+
+    Raises what the first episode raises that cannot be done; the others are given up then.
+    """
+    from tqdm import tqdm
+
+    from servoid.stack.runtime.run import Settings
+
+    seeds = [episode_seed(args.seed, i) for i in range(args.episodes)]
+    jobs = [
+        Settings(
+            task=args.task,
+            backend=args.backend,
+            robot=args.robot,
+            policy=args.policy,
+            randomise=args.randomise,
+            seconds=args.seconds,
+            seed=seed,
+            set=values,
+        )
+        for seed in seeds
+    ]
+    workers = min(args.workers or os.cpu_count() or 1, len(jobs))
+    if workers > 1:
+        episode_check(jobs[0])
+    done = each(_numbered, enumerate(jobs), workers)
+    yield from tqdm(done, total=len(jobs), unit="episode", mininterval=2.0)
+
+
+def _numbered(job: tuple[int, Settings]) -> tuple[int, dict[str, Any]]:
+    return job[0], episode(job[1])
+
+
+def episode_check(job: Settings) -> None:
+    """Raise here, in the parent, what every episode would raise: an unknown task, policy, robot or key."""
+    from dataclasses import replace
+
+    from servoid.stack.runtime.run import run
+
+    run(replace(job, seconds=0.1))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One run as the truth saw it."""
+
+    row: dict[str, Any]  # what a rollout keeps of it
+    task: Task
+    trace: Trace
+    witness: Witness
+
+
+def episode(job: Settings) -> dict[str, Any]:
+    """One run, judged by the truth; see `judge`."""
+    return judge(job).row
+
+
+def judge(job: Settings) -> Judged:
+    """One run, with everything that the truth shows of it.
+
+    One that the guard broke off is no success, however far it came, and one that never began has no metrics but those
+    that count what was left undone. Raises KeyboardInterrupt where the run was told to end, by a Ctrl-C that it took
+    for itself: that is no episode, and there shall be none after it.
+    """
+    from servoid.hw.robot.description import load_robot
+    from servoid.stack.runtime.run import prepare, run
+    from servoid.tools.common.ground_truth import Witness
+
+    task, backend = prepare(job)
+    witness = Witness(simulated_truth(backend), load_robot(job.robot).dt, getattr(backend, "stage", None))
+    result = run(job, backend=backend, on_tick=witness)
+    _give_memory_back()
+    if result.interrupted:
+        raise KeyboardInterrupt
+    trace = witness.trace()
+    began, undone = len(trace.yaw) > 0, getattr(task, "counts_undone", ())
+    metrics = task.metrics(trace) if began or undone else {}
+    fell = trace.fallen or result.outcome == "fell"
+    row = {
+        "seed": job.seed,
+        "outcome": result.outcome,
+        "success": result.outcome in ENDED and bool(task.success(trace)),
+        "fell": fell,
+        "broken_off": not fell and result.outcome not in ENDED,
+        "fell_ending": witness.fell_ending,
+        "seconds": result.seconds,
+        "metrics": {name: value for name, value in metrics.items() if began or name in undone},
+        "odometry_error_m": witness.odometry_error(result.trace),
+    }
+    return Judged(row, task, trace, witness)
+
+
+def _give_memory_back() -> None:
+    """Hand what a run has freed back to the system: the C library keeps some 20 MB of each planner."""
+    with suppress(OSError, AttributeError):  # another C library than glibc
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def simulated_truth(backend: Backend) -> Truth:
+    """The truth of a simulated body. Raises ConfigError for another: an episode is judged by the truth."""
+    truth: Truth | None = getattr(backend, "truth", None)
+    if truth is None:
+        raise ConfigError(f"backend '{backend.name}' has no truth to judge by: use a simulated one, or `servoid run`")
+    return truth
+
+
+def summarise(args: argparse.Namespace, rows: list[dict[str, Any]], wall_seconds: float) -> dict[str, Any]:
+    """What `--json` prints. Metrics are means over the episodes that have them."""
+    import numpy as np
+
+    n, successes = len(rows), sum(row["success"] for row in rows)
+    measured = [{**row["metrics"], "odometry_error_m": row["odometry_error_m"]} for row in rows]
+    metrics: dict[str, Any] = {}
+    for name in sorted({name for row in measured for name in row}):
+        values = np.array([row.get(name, np.nan) for row in measured], dtype=float)
+        metrics[name] = float(np.nanmean(values)) if np.isfinite(values).any() else None
+    return {
+        "task": args.task,
+        "policy": args.policy,
+        "backend": args.backend,
+        "robot": args.robot,
+        "randomised": args.randomise,
+        "episodes": n,
+        "seed": args.seed,
+        "success_rate": successes / n,
+        "success_ci95": wilson(successes, n),
+        "fall_rate": sum(row["fell"] for row in rows) / n,
+        "broken_off_rate": sum(row["broken_off"] for row in rows) / n,
+        "fell_ending_rate": sum(row["fell_ending"] for row in rows) / n,
+        "mean_seconds": float(np.mean([row["seconds"] for row in rows])),
+        "metrics": metrics,
+        "wall_seconds": wall_seconds,
+        "failed_seeds": [row["seed"] for row in rows if not row["success"]],
+    }
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_text(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(_text(item) for item in value[:10]) + (" ..." if len(value) > 10 else "")
+    return str(value)

@@ -1,0 +1,179 @@
+"""Run a task on a robot.
+
+Writes a flight log, for `servoid plot` and `servoid replay`. Ctrl-C lowers the robot and turns torque off; a second one
+turns torque off at once. Exit code 0: the goal was met; 1: the task failed; 4: the guard stopped the run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from servoid.hw.config import ConfigError
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import Report, add_json_argument, reporting
+from servoid.tools.common.parser import add_set_argument, check_seed, settings
+from servoid.tools.common.prompt import confirm
+
+EXIT_CODES = {
+    "succeeded": exit_codes.DONE,
+    "failed": exit_codes.FAILED,
+    "fell": exit_codes.FAILED,
+    "timed_out": exit_codes.FAILED,
+    "stopped": exit_codes.STOPPED,
+    "interrupted": exit_codes.INTERRUPTED,
+}
+WORDS = {
+    "succeeded": "goal met",
+    "failed": "goal not met",
+    "fell": "the robot fell",
+    "timed_out": "time ran out",
+    "stopped": "stopped by the guard",
+    "interrupted": "interrupted",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("task", help="what to do (servoid tasks)")
+    parser.add_argument("--backend", default="sim", help="body to run on: sim (default), virtual or dynamixel")
+    parser.add_argument("--port", metavar="PATH", help="serial port of the robot (--backend dynamixel)")
+    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
+    parser.add_argument(
+        "--policy",
+        default="diffusion",
+        help="controller: diffusion (default), expert, gait, or a file: a checkpoint, or diffusion settings",
+    )
+    parser.add_argument(
+        "--randomise", action="store_true", help="draw the simulated robot's mass, friction, delays ..."
+    )
+    parser.add_argument("--seconds", type=positive, metavar="S", help="length of the task instead of its own")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything that is random (default: 0)")
+    add_set_argument(parser)
+    parser.add_argument("--start", action="store_true", help="move a real robot without asking")
+    parser.add_argument("--record", type=Path, metavar="FILE", help="flight log (default: runs/DATE-TASK.mcap)")
+    parser.add_argument("--video", type=Path, metavar="FILE", help="film the run afterwards: MP4, and its path as PNG")
+    parser.add_argument("--fast", action="store_true", help="do not keep a simulation to real time on a terminal")
+    add_json_argument(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        check_seed(args.seed)
+        if args.video is not None:
+            _prepare_video(args.video)
+        from servoid.stack.runtime.interrupt import Interrupt
+
+        with Interrupt(eager=True) as interrupt:  # these take a while, and a Ctrl-C meanwhile must not get lost
+            from servoid.stack.runtime.backends import backend_kind
+            from servoid.stack.runtime.run import Settings, run
+            from servoid.stack.tasks import task_class
+            from servoid.tools.common.live import LiveLine
+
+            interrupt.settle()
+
+        watched = (sys.stdout.isatty() and not args.json) or task_class(args.task).steered
+        plan = Settings(
+            task=args.task,
+            backend=args.backend,
+            robot=args.robot,
+            policy=args.policy,
+            randomise=args.randomise,
+            seconds=args.seconds,
+            seed=args.seed,
+            set=settings(args),
+            start=args.start,
+            record=args.record or _default_log(args.task),
+            realtime=(watched and not args.fast) if backend_kind(args.backend).simulated else None,
+            port=args.port,
+        )
+        live = LiveLine(sys.stderr if args.json else sys.stdout)
+        try:
+            result = run(plan, on_tick=live, confirm=partial(confirm, remedy="give --start to let the robot move"))
+        finally:
+            live.close()
+        files: dict[str, Any] = {"log": result.log}
+        _summarise(report, result)
+        if args.video is not None and result.log is not None:
+            files |= _film(report, result.log, args.video)
+        for name, path in files.items():
+            if path is not None:
+                report.line(f"{name:>8}: {path}")
+        chosen = {name: getattr(args, name) for name in ("task", "policy", "backend", "robot", "seed")}
+        report.result(chosen | {"randomised": args.randomise} | result.summary() | files)
+    return EXIT_CODES[result.outcome]
+
+
+def positive(text: str) -> float:
+    """An argument that is a positive number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
+    return value
+
+
+def _default_log(task: str) -> Path:
+    """A name that is free: runs/DATE-TASK.mcap, numbered when two runs start in one second."""
+    stem = f"{datetime.now():%Y%m%d-%H%M%S}-{task}"
+    names = (Path("runs") / f"{stem}{end}.mcap" for end in ("", *(f"-{i}" for i in range(2, 1000))))
+    return next(name for name in names if not name.exists())
+
+
+def _prepare_video(path: Path) -> None:
+    """Refuse a file that cannot be made before the robot moves; choose how to draw before MuJoCo is loaded."""
+    if path.suffix != ".mp4":
+        raise ConfigError(f"--video {path}: give a name that ends in .mp4")
+    if path.exists():
+        raise ConfigError(f"--video {path}: exists already: give another name")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        path.unlink()
+    except OSError as error:
+        raise ConfigError(f"--video {path}: cannot be written ({error.strerror}): give another name") from None
+    if not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+
+
+def _film(report: Report, log: Path, path: Path) -> dict[str, Path]:
+    """Video and plot of a run; where they cannot be made, the reason. The run itself has succeeded or not before."""
+    from servoid.stack.log.flightlog import read_log
+    from servoid.tools.common.video import VideoError, make_video
+
+    made: dict[str, Path] = {}
+    failures = (VideoError, ConfigError, OSError, ValueError)  # a full disk, say, or no encoder
+    try:
+        make_video(read_log(log), path)
+        made["video"] = path
+    except failures as error:
+        report.line(f"no video: {error}")
+    try:
+        from servoid.tools.commands.plot import plot_path
+
+        plot_path(read_log(log), path.with_suffix(".png"))
+        made["plot"] = path.with_suffix(".png")
+    except ModuleNotFoundError as error:
+        report.line(f"no plot: {exit_codes.explain(error)}")
+    except failures as error:
+        report.line(f"no plot: {error}")
+    return made
+
+
+def _summarise(report: Report, result: Any) -> None:
+    for event in result.events:
+        if event.kind not in ("phase", "task"):
+            report.line(f"{event.time:6.2f} s  {event.text}")
+    report.line(f"{WORDS[result.outcome]} after {result.seconds:.1f} s")
+    for name, value in result.metrics.items():
+        report.line(f"{name:>24}: {value:.3f}")
+    report.line(
+        f"{result.ticks} ticks, {result.missed} missed, late p50 {result.late_p50_ms:.2f} ms,"
+        f" p99 {result.late_p99_ms:.2f} ms"
+    )

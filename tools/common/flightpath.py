@@ -1,0 +1,63 @@
+"""What video and plot both draw: the robot's path, goal and plans of a flight log, in the odometry frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoid.hw.contracts.body import Array
+from servoid.stack.log.flightlog import FlightLog
+from servoid.stack.log.format import unpack
+
+
+@dataclass(frozen=True)
+class DrawnPlan:
+    adopted: int  # tick of the run
+    path: Array  # (horizon, 2) m, odometry frame
+
+
+def task_ticks(log: FlightLog) -> Array:
+    """Ticks of the run in which the task ran; the first is the task's tick 0."""
+    return log.ticks("/instruction")
+
+
+def goal(log: FlightLog) -> Array | None:
+    """The newest goal `(2,)` m, odometry frame."""
+    places = [message["place"] for message in log.messages["/instruction"] if "place" in message]
+    return unpack(places[-1]) if places else None
+
+
+def obstacles(log: FlightLog) -> Array | None:
+    """What was seen in the way at each tick of the task, `(ticks, n, 3)` m: x, y, radius, odometry frame."""
+    return _seen(log, "obstacles")
+
+
+def robots(log: FlightLog) -> Array | None:
+    """Where the other robots were seen at each tick of the task, `(ticks, n, 3)`: x, y m, heading rad, odometry
+    frame."""
+    return _seen(log, "robots")
+
+
+def plans(log: FlightLog) -> list[DrawnPlan]:
+    """Predicted paths of the task. Ticks of plans count calls of the policy: one a tick, and some after the task."""
+    ticks = task_ticks(log)
+    if not log.messages["/plan"]:
+        return []
+    at = {int(tick): row for row, tick in enumerate(log.ticks("/state"))}
+    displacement, yaw = log.column("/state", "displacement"), log.column("/state", "yaw")
+    found = []
+    for message in log.messages["/plan"]:
+        if message["requested"] >= len(ticks):
+            continue  # to come to rest
+        row = at[int(ticks[message["requested"]])]
+        c, s = np.cos(yaw[row]), np.sin(yaw[row])
+        turn = np.array([[c, -s], [s, c]])
+        found.append(DrawnPlan(int(message["tick"]), displacement[row, :2] + unpack(message["path"]) @ turn.T))
+    return found
+
+
+def _seen(log: FlightLog, what: str) -> Array | None:
+    """What of a kind was perceived at each tick of the task; None where it was not at each."""
+    seen = [message[what] for message in log.messages["/instruction"] if what in message]
+    return np.array([unpack(value) for value in seen]) if seen and len(seen) == len(task_ticks(log)) else None

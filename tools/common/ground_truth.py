@@ -1,0 +1,121 @@
+"""Watches a simulated run by the truth, in the frame that the robot's odometry started in.
+
+With other robots it is the frame of the scene, in which their goals are.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.world import Truth
+from servoid.stack.log.tick import TickRecord
+from servoid.stack.safety.guard import Phase
+from servoid.tools.common.motion_quality import Poses
+
+if TYPE_CHECKING:
+    from servoid.sim.scene import Stage
+
+
+class Witness:
+    """An `on_tick` listener: one row for each tick of the task. `stage` is the scene in play, where there is one.
+
+    In a world of several robots it follows the first; that any of them fell or touched another counts. `fell_ending`:
+    whether it fell after the task, while it came to rest or was lowered.
+    """
+
+    def __init__(self, truth: Truth, dt: float, stage: Stage | None = None) -> None:
+        self._truth, self._dt, self._stage = truth, dt, stage
+        self._rows: list[tuple[Array, float, Array, float, Array]] = []
+        self._joints: list[Array] = []
+        self._up: list[Array] = []
+        self._obstacles: list[Array] = []
+        self._robots: list[Array] = []
+        self._fallen = self._touched = self.fell_ending = False
+        self.upright = 0  # ticks of the task before the robot had fallen
+
+    def __call__(self, record: TickRecord) -> None:
+        instruction, truth = record.proposal.instruction, self._truth
+        if instruction is None:
+            if self._rows and not self._fallen:
+                self.fell_ending |= record.phase in (Phase.STOPPING, Phase.LOWERING) and bool(truth.fallen[0])
+                self.fell_ending |= any(event.kind == "fall" for event in record.events)
+            return
+        self._fallen |= bool(truth.fallen.any())
+        self.upright += not self._fallen
+        self._joints.append(truth.joints[0].copy())
+        self._up.append(-truth.gravity[0])
+        if self._stage is not None:
+            self._touched |= bool(truth.touching.any())
+            self._obstacles.append(self._stage.obstacles)
+            self._robots.append(np.column_stack([truth.position[1:, :2], truth.yaw[1:]]))
+        rate = -float(truth.gravity[0] @ truth.angular_velocity[0])
+        self._rows.append(
+            (truth.position[0].copy(), float(truth.yaw[0]), truth.velocity[0], rate, instruction.velocity)
+        )
+
+    def trace(self) -> Trace:
+        """The run by the truth; without rows if the guard never let the task begin."""
+        if not self._rows:
+            none = np.zeros((0, 3))
+            return Trace(self._dt, none, np.zeros(0), none, np.zeros(0), none, self._fallen)
+        position, yaw, velocity, rate, command = (np.array(column) for column in zip(*self._rows, strict=True))
+        yaw, (origin, heading) = np.unwrap(yaw), self._frame()
+        goal = None if self._stage is None else self._stage.scene.goal
+        if goal is not None:  # where it lies, which is where the robot sees it
+            goal = np.tile(_turned(np.array([*goal, 0.0]) - origin, heading)[:2], (len(yaw), 1))
+        return Trace(
+            dt=self._dt,
+            displacement=_turned(position - origin, heading),
+            yaw=yaw - heading,
+            velocity=velocity,
+            yaw_rate=rate,
+            command=command,
+            fallen=self._fallen,
+            joints=np.array(self._joints),
+            goal=goal,
+            obstacles=_turned(np.array(self._obstacles) - origin, heading) if self._obstacles else None,
+            robots=_turned(np.array(self._robots) - [*origin[:2], heading], heading) if self._others() else None,
+            touched=self._touched if self._obstacles else None,
+        )
+
+    def _others(self) -> bool:
+        return bool(self._robots) and len(self._robots[0]) > 0
+
+    def _frame(self) -> tuple[Array, float]:
+        """Origin `(3,)` m of the trace's frame in the world, and its heading [rad]."""
+        return (np.zeros(3), 0.0) if self._others() else self._start()
+
+    def _start(self) -> tuple[Array, float]:
+        """The place on the ground `(3,)` m where the task began, and the heading there [rad]."""
+        return self._rows[0][0] * [1.0, 1.0, 0.0], self._rows[0][1]
+
+    def poses(self) -> Poses:
+        """All poses before the robot had fallen."""
+        upright = slice(self.upright)
+        position, yaw, *_ = zip(*self._rows, strict=True) if self._rows else ((), ())
+        return Poses(
+            self._dt,
+            np.array(position[upright]).reshape(-1, 3),
+            np.array(yaw[upright], dtype=float),
+            np.array(self._up[upright]).reshape(-1, 3),
+            np.array(self._joints[upright]),
+        )
+
+    def odometry_error(self, estimate: Trace) -> float:
+        """Distance [m] between where the robot ended and where it believed to be; NaN if the task never began."""
+        if not self._rows:
+            return float("nan")
+        origin, heading = self._start()
+        end = _turned(self._rows[-1][0] - origin, heading)[:2]
+        return float(np.linalg.norm(end - estimate.displacement[-1, :2]))
+
+
+def _turned(points: Array, yaw: float) -> Array:
+    """Points `(..., 3)` seen in a frame that is turned by `yaw` about the vertical; their third value stays."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([c * x + s * y, c * y - s * x, points[..., 2]], -1)

@@ -1,0 +1,148 @@
+"""What a command prints. With `--json`, standard output is one line, one JSON object; the rest goes to standard error.
+
+with reporting(args.json) as report:
+    report.line("walking ...")               # standard error with --json
+    report.result({"success_rate": 0.97})    # one line with --json, nothing otherwise
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import math
+import os
+import select
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+from servoid.tools.common.exit_codes import exit_code, explain
+
+
+class Report:
+    """Where a command's lines and its result go."""
+
+    def __init__(self, as_json: bool, stdout: TextIO) -> None:
+        self.as_json = as_json
+        self.has_result = False
+        self._stdout = stdout
+
+    def line(self, text: str = "") -> None:
+        """A line for a person."""
+        print(text, file=sys.stderr if self.as_json else self._stdout, flush=True)
+
+    def table(self, head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+        """A table for a person, columns aligned."""
+        text = [[str(cell) for cell in row] for row in (head, *rows)]
+        widths = [max(len(row[i]) for row in text) for i in range(len(head))]
+        for row in text:
+            self.line("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+    def result(self, values: dict[str, Any]) -> None:
+        """The result: the one line of `--json`. Call it once. Without `--json` it prints nothing."""
+        if self.has_result:
+            raise RuntimeError("a command has one result")
+        self.has_result = True
+        if self.as_json:
+            print(to_json(values), file=self._stdout, flush=True)
+
+
+class Screen:
+    """A stream that nobody waits for, for the line that is rewritten while a control loop runs.
+
+    What it does not take at once is left out: a terminal that Ctrl-S stopped, or an ssh connection that hangs. When a
+    write fails, because the reader is gone, nothing is written any more.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.tty = stream.isatty()
+        self._stream: TextIO | None = stream
+
+    def write(self, text: str) -> bool:
+        """Write a line at most, to be seen at once; whether it was."""
+        if self._stream is None or not _takes(self._stream):
+            return False
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except OSError:  # the robot goes on without it
+            self._stream = None
+        return self._stream is not None
+
+
+def _takes(stream: TextIO) -> bool:
+    """Whether a stream takes a line without waiting. A terminal or a pipe that takes anything has room for one."""
+    try:
+        descriptor = stream.fileno()
+    except (AttributeError, OSError):  # in memory
+        return True
+    poll = select.poll()
+    poll.register(descriptor, select.POLLOUT)
+    return any(events & select.POLLOUT for _, events in poll.poll(0))
+
+
+@contextlib.contextmanager
+def reporting(as_json: bool) -> Iterator[Report]:
+    """A report. With `as_json`, whatever else prints to standard output meanwhile goes to standard error.
+
+    That holds for other languages and child processes too, where standard output is a real file. A command that
+    raises still answers, with `{"error": ..., "exit_code": ...}`, and the exception goes on.
+    """
+    if not as_json:
+        yield Report(False, sys.stdout)
+        return
+    with contextlib.ExitStack() as stack:
+        report = Report(True, stack.enter_context(_claim_stdout()))
+        stack.enter_context(contextlib.redirect_stdout(sys.stderr))
+        try:
+            yield report
+        except BaseException as error:
+            if not report.has_result and not isinstance(error, SystemExit | GeneratorExit):
+                report.result({"error": explain(error), "exit_code": exit_code(error)})
+            raise
+
+
+@contextlib.contextmanager
+def _claim_stdout() -> Iterator[TextIO]:
+    """Standard output as it was, with file descriptor 1 pointing to standard error meanwhile."""
+    try:
+        descriptor, other = sys.stdout.fileno(), sys.stderr.fileno()
+    except (AttributeError, io.UnsupportedOperation):  # a capture in memory: there is no descriptor to move
+        yield sys.stdout
+        return
+    sys.stdout.flush()
+    saved = os.dup(descriptor)
+    os.dup2(other, descriptor)
+    try:
+        with os.fdopen(os.dup(saved), "w", encoding="utf-8") as stream:
+            yield stream
+    finally:
+        sys.stdout.flush()
+        os.dup2(saved, descriptor)
+        os.close(saved)
+
+
+def to_json(values: Any) -> str:
+    """One line of standard JSON; numpy values become plain, and what is not finite becomes null."""
+    return json.dumps(_plain(values), allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy arrays and numbers
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def add_json_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")

@@ -1,0 +1,70 @@
+"""Argument parsing that offers the nearest name for a mistyped one."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import sys
+from collections.abc import Iterable, Sequence
+from typing import Any, NoReturn
+
+from servoid.hw.config import ConfigError
+from servoid.tools.common import exit_codes
+
+
+class Parser(argparse.ArgumentParser):
+    """An ArgumentParser whose errors are one line, with the nearest option. Options are not abbreviated."""
+
+    def __init__(self, **options: Any) -> None:
+        options.setdefault("allow_abbrev", False)
+        super().__init__(**options)
+
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> argparse.Namespace:
+        parsed, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            name = unknown[0].split("=")[0]
+            kind = "option" if name.startswith("-") else "argument"
+            self.error(f"unknown {kind} '{name}'{suggestion(name, self._option_string_actions)}")
+        return parsed
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: {message} (see {self.prog} --help)", file=sys.stderr)
+        raise SystemExit(exit_codes.USAGE)
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """The nearest known name as the end of a sentence, or nothing."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean '{close[0]}'?" if close else ""
+
+
+def check_seed(seed: int) -> None:
+    """Raise ConfigError for a `--seed` that no generator takes."""
+    if seed < 0:
+        raise ConfigError(f"--seed {seed}: give a number from 0 on")
+
+
+def add_set_argument(parser: argparse.ArgumentParser) -> None:
+    """`--set key=value`, any number of times; read it with `settings(args)`."""
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="change a setting of the task (servoid tasks); gain=G scales the servos' position gain",
+    )
+
+
+def settings(args: argparse.Namespace) -> dict[str, str]:
+    """The settings given with `--set`. Raises ConfigError for one without a value or given twice."""
+    result: dict[str, str] = {}
+    for item in args.set:
+        key, equals, value = item.partition("=")
+        if not equals or not key:
+            raise ConfigError(f"--set {item}: write --set key=value")
+        if key in result:
+            raise ConfigError(f"--set {item}: {key} is set twice")
+        result[key] = value
+    return result

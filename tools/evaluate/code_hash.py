@@ -1,0 +1,57 @@
+"""Hashes of the code and the settings that an episode's record may depend on."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("hw", "sim", "policy", "stack")  # checkpoints among them are hashed where they are used
+JUDGES = (
+    "tools/common/ground_truth.py",
+    "tools/common/motion_quality.py",
+    "tools/commands/rollout.py",
+    "tools/evaluate/episode.py",
+)
+
+
+@cache
+def code() -> str:
+    """Hash of the code when the evaluation began: `read_anew` tells whether it is still the same."""
+    return digest(ROOT)
+
+
+def digest(root: Path) -> str:
+    """Hash of the names and bytes of the Python files of the packages, all of configs/, and what judges a run."""
+    total = hashlib.sha256()
+    for path in sorted(_files(root)):
+        content = hashlib.sha256(path.read_bytes()).hexdigest()
+        total.update(f"{path.relative_to(root).as_posix()} {content}\n".encode())
+    return total.hexdigest()
+
+
+def read_anew(robot: str) -> tuple[Any, ...]:
+    """What an episode may read from files again, to be compared: hashes of code and configs/, and the robot.
+
+    Nothing is cached. Code is among it because workers and virtual rigs import what they need when they need it. Raises
+    ConfigError where the robot's file is no good.
+    """
+    from servoid.hw.config import CONFIGS
+    from servoid.hw.robot.description import load_robot
+    from servoid.stack.log.provenance import fingerprint, sha256
+
+    return digest(ROOT), [(str(path), sha256(path)) for path in _settings(CONFIGS)], fingerprint(load_robot(robot))
+
+
+def _settings(folder: Path) -> Iterator[Path]:
+    yield from (path for path in sorted(folder.rglob("*")) if path.is_file())
+
+
+def _files(root: Path) -> Iterator[Path]:
+    for package in PACKAGES:
+        yield from (root / package).rglob("*.py")
+    yield from _settings(root / "configs")
+    yield from (root / name for name in JUDGES)

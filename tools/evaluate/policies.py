@@ -1,0 +1,189 @@
+"""The policies of an evaluation: the planner with the settings of each row, and what their episodes depend on."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from servoid.hw.config import ConfigError
+from servoid.tools.evaluate.cache import key
+from servoid.tools.evaluate.code_hash import code
+from servoid.tools.evaluate.spec import Network, Run
+
+if TYPE_CHECKING:
+    from servoid.policy.diffusion.settings import DiffusionSettings
+
+EXPERT = "expert"
+_DATA = "runs/walks"  # the dataset that the README shows how to record
+_LAST = "last.safetensors"  # the newest network of a training run, beside its best
+_WHATEVER = ("evaluate_every", "seed")  # of training: what does not make another kind of network
+
+
+class Pilots:
+    """Makes the policies that runs name. Settings of the planner become files in `folder`/policies, as they are now."""
+
+    def __init__(self, policy: str, folder: Path) -> None:
+        """`policy` is the evaluated one, named as in `servoid run`. Raises ConfigError for an unknown one."""
+        from servoid.stack.control.policies import check_policy
+
+        check_policy(policy)
+        self._policy, self._folder = policy, folder
+        self._settings = _diffusion_settings(policy)
+
+    def network(self, run: Run) -> Path | None:
+        """Where the network of its own that a run needs is looked for."""
+        return None if run.network is None else self._folder / "networks" / run.network.name / "best.safetensors"
+
+    def training(self, run: Run) -> str | None:
+        """How the network that a run lacks is trained; None where nothing is lacking. Raises ConfigError."""
+        path = self.network(run)
+        if run.network is None or path is None or path.is_file():
+            return None
+        return self._command(run.network, path)
+
+    def _command(self, network: Network, path: Path) -> str:
+        """What trains a network and, before it, its latents; given again, it goes on with what was begun."""
+        options, before = network.train + _anew(path), ""
+        if network.latents:
+            latents = self._folder / "networks" / "latents" / "latent.safetensors"
+            options += f" --latent {latents}"
+            if _share(latents) != 1.0:
+                before = f"`servoid train latent --data {_DATA} --out {latents.parent}{_anew(latents)}`, then "
+        return f"{before}`servoid train diffusion --data {_DATA} --out {path.parent} {options}`"
+
+    def name(self, run: Run) -> str:
+        """The policy of a run, as `servoid run --policy` takes it. Raises ConfigError for settings that do not fit."""
+        settings = self.settings(run)
+        if settings is None:
+            return EXPERT if run.policy == EXPERT else self._policy
+        values = asdict(settings)
+        path = self._folder / "policies" / f"{run.task}-{key(values)}.yaml"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(
+                f"{path}: cannot be written ({error.strerror}): choose another place with --out"
+            ) from None
+        return str(path)
+
+    def settings(self, run: Run) -> DiffusionSettings | None:
+        """Settings of the planner of a run; None for another policy. Raises ConfigError for a variant of that."""
+        from servoid.hw.overrides import override
+
+        if run.policy == EXPERT:
+            return None
+        if self._settings is None:
+            if run.plan or run.network is not None:
+                raise ConfigError(f"policy '{self._policy}' has no such settings: this row is for diffusion models")
+            return None
+        base, path = self._settings, self.network(run)
+        if run.network is not None and path is not None:
+            _check_training(path, run.network)
+            self._check_whole(path, run.network)
+            base = replace(base, checkpoint=str(path.resolve()))
+        return override(base, dict(run.plan), "planner setting")
+
+    def _check_whole(self, path: Path, network: Network) -> None:
+        """Raise ConfigError for a network whose training was not finished: the best so far is there from early on."""
+        share, last = _share(path), path.with_name(_LAST)
+        if share is None:
+            raise ConfigError(
+                f"{last} does not say that the training was finished: train anew: {self._command(network, path)}"
+            )
+        if share < 1.0:
+            raise ConfigError(f"{last}: {share:.1%} of its training are done: go on: {self._command(network, path)}")
+
+    def fingerprint(self, run: Run) -> dict[str, Any]:
+        """Everything about the policy of a run that its episodes depend on: checkpoints by their hash."""
+        from servoid.policy.checkpoint import resolve
+        from servoid.policy.references.gait import load_gait
+        from servoid.stack.control.policies import policy_fingerprint
+        from servoid.stack.log.provenance import sha256
+
+        settings = self.settings(run)
+        odometry = {"odometry": sha256(resolve("odometry"))}
+        if settings is None:
+            name = EXPERT if run.policy == EXPERT else self._policy
+            known = policy_fingerprint(name)
+            return {**odometry, "checkpoint": known["checkpoint_sha256"], "gait": asdict(load_gait())}
+        values = asdict(settings)
+        return {**odometry, "settings": values | {"checkpoint": sha256(resolve(values["checkpoint"]))}}
+
+
+def _share(path: Path) -> float | None:
+    """How much of its budget a training has used, 0 to 1, by the newest network beside its best, `path`; None where
+    there is none, or an old one that does not say."""
+    from servoid.policy.checkpoint import read_header
+
+    last = path.with_name(_LAST)
+    return read_header(last)["results"].get("share") if last.is_file() else None
+
+
+def _anew(path: Path) -> str:
+    """What a command must say besides where it cannot go on with what is there."""
+    return " --no-resume" if path.is_file() and _share(path) is None else ""
+
+
+@cache
+def _check_training(path: Path, network: Network) -> None:
+    """Raise ConfigError for a network that was trained with other options than its row says."""
+    from servoid.policy.checkpoint import read_header
+    from servoid.tools.learn.trainers.diffusion import add_arguments
+
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    asked = vars(parser.parse_args(["--data", "", "--out", "", *shlex.split(network.train)]))
+    header = read_header(path)
+    given = {**header.get("config", {}), **header.get("training", {})}
+    whatever = {*_WHATEVER, "minutes"} if asked["steps"] else _WHATEVER  # then they say when to evaluate, and no more
+    for name, value in given.items():
+        if name in asked and name not in whatever and asked[name] != value:
+            option = "--" + name.replace("_", "-")
+            raise ConfigError(f"{path}: trained with {option} {value}, and this row is of {asked[name]}: train it anew")
+
+
+def _diffusion_settings(policy: str) -> DiffusionSettings | None:
+    """Settings of the diffusion policy of that name, its checkpoint as a whole path; None for another policy."""
+    from servoid.policy.checkpoint import read_header, resolve
+    from servoid.policy.diffusion.settings import load_settings
+
+    if policy.endswith(".safetensors"):
+        if read_header(Path(policy))["kind"] != "diffusion":
+            return None
+        settings = replace(load_settings(), checkpoint=policy)
+    elif policy == "diffusion" or policy.endswith((".yaml", ".yml")):
+        settings = load_settings(policy)
+    else:
+        return None
+    return replace(settings, checkpoint=str(resolve(settings.checkpoint).resolve()))
+
+
+def spec(
+    run: Run, pilots: Pilots, robot: str, seed: int, seconds: float | None, clips: str | None
+) -> Mapping[str, Any]:
+    """What the episodes of a run depend on: the same spec, the same episodes. Raises ConfigError."""
+    from servoid.hw.robot.description import load_robot
+    from servoid.stack.log.provenance import described, fingerprint, versions
+    from servoid.stack.tasks import load_settings
+
+    return {
+        "task": run.task,
+        "settings": described(load_settings(run.task, dict(run.set))),
+        "seconds": seconds,
+        "policy": pilots.fingerprint(run),
+        "robot": fingerprint(load_robot(robot)),
+        "backend": run.backend,
+        "randomise": run.randomise,
+        "seed": seed,
+        "clips": clips,
+        "code": code(),
+        "versions": versions(),
+    }

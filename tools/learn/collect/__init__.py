@@ -1,0 +1,207 @@
+"""Record demonstrations of the expert in simulation as a LeRobot v3.0 dataset.
+
+Every world walks and stands under commands that change every few seconds, with noise on its actions and pushes; the
+labels are the expert's actions without the noise. What a fall ends loses its last second. Mirrored copies are not
+stored: training mirrors each window when it reads it, which comes to the same data twice.
+
+The same options and the same seed make the same files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from servoid.hw.config import ConfigError
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import add_json_argument, reporting
+
+if TYPE_CHECKING:
+    from servoid.hw.robot.description import Robot
+    from servoid.tools.learn.collect.disturbances import DisturbanceSettings
+    from servoid.tools.learn.collect.episode_cutter import Recorder
+    from servoid.tools.learn.collect.lerobot import Feature
+
+LICENCE = "Apache-2.0"
+MIRRORING = "applied when read (servoid.policy.diffusion.dataset): each window also serves with left and right swapped"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the dataset, to be created")
+    parser.add_argument("--frames", type=int, default=500_000, help="ticks to keep, at least (default: %(default)s)")
+    parser.add_argument("--worlds", type=int, default=256, help="robots at a time (default: %(default)s)")
+    parser.add_argument("--policy", default="expert", help="expert, gait, or a tracker's checkpoint (default: expert)")
+    parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=15.0, help="of an episode (default: %(default)s)")
+    parser.add_argument(
+        "--randomise",
+        type=float,
+        default=0.4,
+        metavar="SHARE",
+        help="share of episodes on a randomised robot (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--noise",
+        type=float,
+        nargs=2,
+        default=[0.2, 0.6],
+        metavar=("LOW", "HIGH"),
+        help="scale of an episode's action noise, drawn between these (default: 0.2 0.6)",
+    )
+    parser.add_argument("--plain-odometry", action="store_true", help="leg odometry without the learned correction")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=0, help="of the simulation; 0: all cores (default)")
+    parser.add_argument("--force", action="store_true", help="replace a dataset that is there")
+    add_json_argument(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Collect; returns 0. Raises ConfigError."""
+    with reporting(args.json) as report:
+        _check(args)
+        result = collect(args)
+        share, minutes = result["fell_share"], result["walked_minutes"]
+        report.line(
+            f"{args.out}: {result['episodes']} episodes, {result['frames']} frames; {100 * share:.1f} % of "
+            f"{result['begun']} episodes fell ({minutes:.0f} minutes walked), {result['seconds']:.0f} s"
+        )
+        if not 0.05 <= share <= 0.25 and minutes > 60:  # less walking says little
+            report.line("5 to 25 % is wanted, enough to learn recovery from: change --noise")
+        report.result(result)
+    return exit_codes.DONE
+
+
+def _check(args: argparse.Namespace) -> None:
+    for name in ("frames", "worlds"):
+        if getattr(args, name) < 1:
+            raise ConfigError(f"--{name} {getattr(args, name)}: at least 1 is needed")
+    if not 0.0 <= args.randomise <= 1.0:
+        raise ConfigError(f"--randomise {args.randomise:g}: a share between 0 and 1 is needed")
+    if not 0.0 <= args.noise[0] <= args.noise[1] < math.inf:
+        raise ConfigError(f"--noise {args.noise[0]:g} {args.noise[1]:g}: 0 or more is needed, the lower one first")
+    if args.seed < 0:
+        raise ConfigError(f"--seed {args.seed}: 0 or more is needed")
+
+
+def collect(args: argparse.Namespace) -> dict[str, Any]:
+    """Record a dataset into `args.out`; returns what `--json` prints. Raises ConfigError."""
+    from tqdm import tqdm
+
+    from servoid.hw.robot.description import load_robot
+    from servoid.policy.checkpoint import resolve
+    from servoid.stack.estimation.odometry import load_odometry
+    from servoid.tools.learn.collect.disturbances import DisturbanceSettings
+    from servoid.tools.learn.collect.episode_cutter import Recorder
+    from servoid.tools.learn.collect.lerobot import DatasetWriter
+    from servoid.tools.learn.collect.skills import SKILLS
+    from servoid.tools.learn.envs.fleet import Fleet
+    from servoid.tools.learn.envs.walker import Walker, load_tracker
+
+    begin = time.perf_counter()
+    robot = load_robot(args.robot)
+    tracker = None if args.policy == "gait" else load_tracker(robot, args.policy)
+    odometry = None if args.plain_odometry else load_odometry(robot)
+    sources = {
+        "policy": {"name": "gait"} if tracker is None else _source(resolve(args.policy)),
+        "odometry": {"name": "legs"} if odometry is None else _source(resolve("odometry")),
+    }
+    settings = DisturbanceSettings(scale=(args.noise[0], args.noise[1]))
+    writer = DatasetWriter(
+        args.out,
+        robot_type=robot.name,
+        fps=robot.rate,
+        features=_features(robot),
+        tasks=[skill.text for skill in SKILLS],
+        force=args.force,
+    )
+    with writer:
+        fleet = Fleet(robot, args.worlds, odometry, randomise=args.randomise, seed=args.seed, threads=args.threads)
+        recorder = Recorder(fleet, Walker(fleet, tracker), settings, args.seconds)
+        with tqdm(total=args.frames, desc="walking", unit="frame", mininterval=1.0) as bar:
+
+            def progress(total: int) -> None:
+                bar.update(min(total, args.frames) - bar.n)
+                bar.set_postfix_str(f"{recorder.fell} of {recorder.begun} fell", refresh=False)
+
+            for episode in recorder.episodes(args.frames, progress):
+                writer.add(episode.columns, episode.skill)
+        result = {
+            "episodes": writer.episodes,
+            "frames": writer.frames,
+            "begun": recorder.begun,
+            "fell": recorder.fell,
+            "fell_share": round(recorder.fell / recorder.begun, 4),
+            "walked_minutes": round(recorder.walked * robot.dt / 60, 2),
+        }
+        writer.finish({"servoid.yaml": _provenance(args, robot, recorder, settings, sources, result)})
+    return result | {"out": str(args.out), "seconds": round(time.perf_counter() - begin, 1)}
+
+
+def _features(robot: Robot) -> dict[str, Feature]:
+    """The dataset's columns and the names of their numbers."""
+    from servoid.policy.diffusion.features import recorded_names
+    from servoid.tools.learn.collect.lerobot import Feature
+
+    notes = {
+        "observation.state": {"mirroring": MIRRORING},
+        "action": {"meaning": "the expert's joint targets after the limits, rad"},
+        "action_applied": {"meaning": "the joint targets that ran, with noise, rad"},
+        "command": {"meaning": "the velocity asked for, m/s and rad/s"},
+    }
+    return {name: Feature(names, notes[name]) for name, names in recorded_names(robot).items()}
+
+
+def _source(path: Path) -> dict[str, str]:
+    from servoid.policy.checkpoint import read_header
+
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return {"name": path.stem, "sha256": digest, "git_commit": str(read_header(path)["git_commit"])}
+
+
+def _provenance(
+    args: argparse.Namespace,
+    robot: Robot,
+    recorder: Recorder,
+    settings: DisturbanceSettings,
+    sources: Mapping[str, Any],
+    result: Mapping[str, Any],
+) -> str:
+    """meta/servoid.yaml: all that is needed to record the dataset again."""
+    import mujoco
+    import numpy as np
+    import yaml
+
+    from servoid.policy.checkpoint import git_commit
+    from servoid.tools.learn.collect.episode_cutter import FALL_SECONDS, SHORTEST_SECONDS
+    from servoid.tools.learn.collect.skills import SKILLS
+
+    def plain(values: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
+
+    options = {name: getattr(args, name) for name in ("frames", "worlds", "seconds", "randomise", "plain_odometry")}
+    content = {
+        "licence": LICENCE,
+        "git_commit": git_commit(),
+        "versions": {"mujoco": mujoco.__version__, "numpy": np.__version__},
+        "robot": robot.name,
+        "seed": args.seed,
+        "options": options,
+        **sources,
+        "mirroring": MIRRORING,
+        "episodes": {"ticks": recorder.ticks, "dropped_before_fall": FALL_SECONDS, "shortest": SHORTEST_SECONDS},
+        "commands": {
+            "segment_seconds": {skill.name: list(skill.seconds) for skill in SKILLS},
+            "skills": [
+                {"name": s.name, "weight": s.weight, "boxes": [plain(asdict(box)) for box in s.boxes]} for s in SKILLS
+            ],
+        },
+        "disturbances": plain(asdict(settings)),
+        "result": dict(result),
+    }
+    return yaml.safe_dump(content, sort_keys=False)

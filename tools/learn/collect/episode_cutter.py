@@ -1,0 +1,132 @@
+"""Runs a fleet under random commands and disturbances, and cuts what happened into episodes worth learning from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.policy.diffusion.features import raw_layout, raw_row
+from servoid.tools.learn.collect.disturbances import Disturbances, DisturbanceSettings
+from servoid.tools.learn.collect.skills import Commands
+from servoid.tools.learn.envs.fleet import Fleet
+
+FALL_SECONDS = 1.0  # dropped from the end of an episode that fell: nobody shall learn how
+SHORTEST_SECONDS = 2.0  # of what is left
+_HOPELESS = 20  # ticks walked for one that is kept: no dataset will come of it
+
+
+class Driver(Protocol):
+    """What gives the joint targets: `servoid.tools.learn.envs.walker.Walker`."""
+
+    def reset(self, where: Array) -> None: ...
+
+    def act(self, command: Array) -> Array: ...
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Rows of one episode by column `(ticks, size)` float32, and the number of each tick's skill `(ticks,)`."""
+
+    columns: dict[str, Array]
+    skill: Array
+
+
+class Recorder:
+    """Records a fleet. Row k of an episode holds the state at tick k, and what was decided and done on it.
+
+    `observation.state` is the estimate, `action` the expert's target after the limits (the label), `action_applied`
+    what ran instead, with noise, and `command` what was asked. `begun` and `fell` count episodes; those that are
+    still walking when the last frame is in count as begun.
+    """
+
+    def __init__(self, fleet: Fleet, driver: Driver, settings: DisturbanceSettings, seconds: float) -> None:
+        """Episodes end after `seconds`, or with a fall."""
+        robot = fleet.robot
+        self.fleet, self._driver = fleet, driver
+        self.ticks = round(seconds * robot.rate)
+        self._drop, self._shortest = round(FALL_SECONDS * robot.rate), round(SHORTEST_SECONDS * robot.rate)
+        if self.ticks < self._drop + self._shortest:
+            raise ConfigError(
+                f"episodes of {seconds:g} s are too short: at least {FALL_SECONDS + SHORTEST_SECONDS:g} s are needed"
+            )
+        self._commands = Commands(fleet.n, robot.rate)
+        self._disturbances = Disturbances(robot, fleet.n, settings)
+        n = len(robot.joints)
+        sizes = {"observation.state": raw_layout(n).size, "action": n, "action_applied": n, "command": 3}
+        self._rows = {name: np.zeros((fleet.n, self.ticks, size), np.float32) for name, size in sizes.items()}
+        self._skills = np.zeros((fleet.n, self.ticks), np.int64)
+        self._length = np.zeros(fleet.n, int)
+        self.begun, self.fell, self.walked = 0, 0, 0
+
+    def episodes(self, frames: int, progress: Callable[[int], None] | None = None) -> Iterator[Episode]:
+        """Episodes of at least `frames` ticks together, in the order in which they end.
+
+        The last ones are cut short, and lose their last second like those that fell: it is not known whether they
+        were falling. `progress` is told each tick how many frames are recorded. Raises ConfigError when the robot
+        falls so soon that nothing is kept.
+        """
+        done, kept = np.ones(self.fleet.n, bool), 0
+        while True:
+            self._start(done)
+            self._tick()
+            fallen = self.fleet.truth.fallen
+            done = fallen | (self._length == self.ticks)
+            self.fell += int(fallen.sum())
+            worth = self._worth(self._length)
+            yield from self._cut(ended := np.where(fallen, worth, self._length * done))
+            kept += int(ended.sum())
+            under_way = np.where(done, 0, worth)
+            total = kept + int(under_way.sum())
+            if progress:
+                progress(total)
+            if total >= frames:
+                break
+            if self.walked > _HOPELESS * total + self.fleet.n * self.ticks:
+                raise ConfigError(
+                    f"{self.fell} of {self.begun} episodes fell, most of them at once, and {total} frames were kept: "
+                    "use another --policy"
+                )
+        yield from self._cut(under_way)
+
+    def _worth(self, length: Array) -> Array:
+        """Ticks to keep of episodes of `length` ticks whose end is not to be kept; 0: too short."""
+        left = length - self._drop
+        return np.where(left >= self._shortest, left, 0)
+
+    def _start(self, where: Array) -> None:
+        ids = np.flatnonzero(where)
+        if not len(ids):
+            return
+        self.fleet.reset(where)
+        self._driver.reset(where)
+        self._commands.reset(ids)
+        self._disturbances.reset(ids, self.fleet.rngs)
+        self._length[ids] = 0
+        self.begun += len(ids)
+
+    def _tick(self) -> None:
+        fleet, rngs = self.fleet, self.fleet.rngs
+        state = fleet.observe()
+        self._commands.advance(rngs)
+        fleet.worlds.push(self._disturbances.push(rngs))
+        command = self._commands.velocity
+        clean = fleet.step(self._driver.act(command), self._disturbances.noise(rngs))
+        worlds, at = np.arange(fleet.n), self._length
+        values = {"observation.state": raw_row(state), "action": clean, "action_applied": fleet.applied}
+        for name, value in (values | {"command": command}).items():
+            self._rows[name][worlds, at] = value
+        self._skills[worlds, at] = self._commands.skill
+        self._length += 1
+        self.walked += fleet.n
+
+    def _cut(self, lengths: Array) -> Iterator[Episode]:
+        """The first `lengths` `(n,)` ticks of each world's episode; 0: none."""
+        for world in np.flatnonzero(lengths):
+            length = lengths[world]
+            columns = {name: rows[world, :length].copy() for name, rows in self._rows.items()}
+            yield Episode(columns, self._skills[world, :length].copy())

@@ -1,0 +1,84 @@
+"""What the robot is asked while data is collected: named skills, each a set of velocities to draw from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoid.hw.contracts.body import Array
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Box:
+    """Velocities to draw uniformly: m/s forward, m/s left, rad/s."""
+
+    forward: Range = (0.0, 0.0)
+    left: Range = (0.0, 0.0)
+    turn: Range = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Skill:
+    """`text` is the dataset's task; one of the boxes is drawn, then a velocity in it. `weight`: how often."""
+
+    name: str
+    text: str
+    boxes: tuple[Box, ...]
+    weight: float = 1.0
+    seconds: Range = (2.0, 6.0)  # that a command lasts
+
+    def draw(self, rng: np.random.Generator) -> Array:
+        """A command `(3,)`."""
+        box = self.boxes[int(rng.integers(len(self.boxes)))]
+        low, high = np.transpose([box.forward, box.left, box.turn])
+        return rng.uniform(low, high)
+
+
+# Their numbers are the dataset's task indices. Turning and walking mixed weigh more: they are most of what steering
+# to a goal asks for, and so does straight ahead, up to more than the expert can. Creeping covers the slow end, where a
+# robot arrives.
+SKILLS: tuple[Skill, ...] = (
+    Skill("stand", "stand still", (Box(),), 2.5, (1.0, 3.0)),
+    Skill("forward", "walk forward", (Box(forward=(0.05, 0.5)),), 2.5),
+    Skill("slow", "walk forward slowly", (Box(forward=(0.03, 0.12)),)),
+    Skill("backward", "walk backward", (Box(forward=(-0.12, -0.03)),)),
+    Skill("side", "step sideways", (Box(left=(0.04, 0.12)), Box(left=(-0.12, -0.04)))),
+    Skill("turn", "turn on the spot", (Box(turn=(0.2, 1.0)), Box(turn=(-1.0, -0.2))), 1.5),
+    Skill("arc", "walk along an arc", (Box(forward=(0.05, 0.4), turn=(-0.8, 0.8)),), 2.0),
+    Skill("diagonal", "walk diagonally", (Box((0.05, 0.15), (0.04, 0.1)), Box((0.05, 0.15), (-0.1, -0.04))), 0.8),
+    Skill("reverse", "walk backward along an arc", (Box((-0.12, -0.04), turn=(-0.6, 0.6)),), 0.6),
+    Skill("any", "walk and turn in any direction", (Box((-0.12, 0.3), (-0.1, 0.1), (-0.8, 0.8)),), 2.0),
+    Skill("creep", "creep slowly in any direction", (Box((-0.06, 0.06), (-0.06, 0.06), (-0.2, 0.2)),)),
+)
+FIRST_SECONDS: Range = (0.1, 0.6)  # of standing that an episode begins with: a run starts from rest
+
+_SHARES = np.cumsum([skill.weight for skill in SKILLS]) / sum(skill.weight for skill in SKILLS)
+
+
+class Commands:
+    """The present command of each of `n` worlds, changed every few seconds, drawn from the worlds' own streams."""
+
+    def __init__(self, n: int, rate: int) -> None:
+        self._rate = rate
+        self.velocity = np.zeros((n, 3))  # what is asked: m/s forward, m/s left, rad/s
+        self.skill = np.zeros(n, int)  # number in SKILLS
+        self._left = np.zeros(n, int)  # ticks until the next change
+        self._first = np.ones(n, bool)
+
+    def reset(self, ids: Array) -> None:
+        """A new command is due in the worlds `ids`."""
+        self._left[ids], self._first[ids] = 0, True
+
+    def advance(self, rngs: list[np.random.Generator]) -> None:
+        """Draw the commands that are due; call it once a tick, before reading `velocity`."""
+        for i in np.flatnonzero(self._left == 0):
+            rng = rngs[i]
+            self.skill[i] = 0 if self._first[i] else int(np.searchsorted(_SHARES, rng.random(), side="right"))
+            skill = SKILLS[self.skill[i]]
+            self.velocity[i] = skill.draw(rng)
+            self._left[i] = round(rng.uniform(*(FIRST_SECONDS if self._first[i] else skill.seconds)) * self._rate)
+            self._first[i] = False
+        self._left -= 1
