@@ -73,7 +73,9 @@ def classifier_free(denoise: Callable[..., tuple[Tensor, Tensor]], text: Tensor 
     twice = torch.cat([text, text])
 
     def predict(states: Tensor, actions: Tensor, *levels: Tensor) -> tuple[Tensor, Tensor]:
-        pairs = denoise(torch.cat([states, states]), torch.cat([actions, actions]), *levels, text=twice, text_mask=text_mask)
+        pairs = denoise(
+            torch.cat([states, states]), torch.cat([actions, actions]), *levels, text=twice, text_mask=text_mask
+        )
         with_text, without = zip(*(x.chunk(2) for x in pairs), strict=True)
         state, action = (b + weight * (a - b) for a, b in zip(with_text, without, strict=True))
         return state, action
