@@ -206,7 +206,8 @@ def test_a_rig_whose_controller_was_killed_before_it_had_begun_leaves_nothing_be
 def test_the_command_serves_a_linked_port_until_ctrl_c(tmp_path: Path) -> None:
     link = tmp_path / "rig"
     code = (
-        "import argparse, sys; from tools import virtual; p = argparse.ArgumentParser(); virtual.add_arguments(p); "
+        "import argparse, sys; from servoid.tools.commands import virtual; "
+        "p = argparse.ArgumentParser(); virtual.add_arguments(p); "
         "sys.exit(virtual.main(p.parse_args(sys.argv[1:])))"
     )
     process = subprocess.Popen([sys.executable, "-c", code, "--link", str(link)], stdout=subprocess.PIPE, text=True)
