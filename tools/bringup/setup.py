@@ -50,7 +50,7 @@ def main(args: argparse.Namespace) -> int:
                 raise BackendError(f"{device} is not the {wanted} that {robot.name} has at {args.joint}: take another")
             if device.get("torque_enable"):
                 raise BackendError(
-                    f"{device} has torque on, which locks its EEPROM: hold it, then servoid bringup off --baud {device.baud}"
+                    f"{device} has torque on, which locks its EEPROM: servoid bringup off --baud {device.baud}"
                 )
             changes = _changes(device, id, baud)
             if changes:
