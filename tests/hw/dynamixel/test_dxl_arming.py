@@ -16,7 +16,7 @@ from servoid.hw.dynamixel.bus import Bus
 from servoid.hw.dynamixel.register_check import GRAVE, UNCOMPARED, compare, correct, find_servos
 from servoid.hw.dynamixel.tables import models, table
 from servoid.hw.robot.description import load_robot
-from servoid.sim.rig.in_process import LocalLine
+from servoid.sim.rig.in_process import InProcessLine
 from servoid.sim.rig.rig import Rig
 
 ROBOT = load_robot("op3")
@@ -48,7 +48,7 @@ class Found:
     """A rig whose servos have power, and another program that has spoken to them."""
 
     rig: Rig
-    line: LocalLine
+    line: InProcessLine
     bus: Bus
 
     def write(self, id: int, **registers: int) -> None:
@@ -72,7 +72,7 @@ class Found:
 @pytest.fixture
 def found() -> Found:
     rig = Rig(ROBOT)
-    line = LocalLine(rig)
+    line = InProcessLine(rig)
     bus = Bus(line, line)
     assert bus.write_item(200, table("opencr").item("dynamixel_power"), 1)
     line.sleep_until(line.now_ns() + 500_000_000)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from servoid.sim.rig.control import RigProcess
 from test_bringup_scan import AT_2M, VIRTUAL, bus_of, write
 
 from servoid.hw.dynamixel.tables import table
+from servoid.sim.rig.process.control import RigProcess
 
 XM430 = table("xm430-w350")
 
