@@ -13,6 +13,7 @@ import yaml
 from servoid.hw.config import ConfigError, load_marked, resolve
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.checks import check_robot, check_servo
+from servoid.hw.robot.plausible import check_plausible
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,7 @@ def load_robot(name: str | Path = "op3") -> Robot:
         for joint in robot.joints
     )
     robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints)
-    _ = robot.servos  # a servo's file that cannot be used is found now, not when the robot stands
+    check_plausible(robot, marks)  # loads the servos' files: one that cannot be used is found now
     return robot
 
 
