@@ -8,6 +8,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import turned, up_vector, yaw_of
 from servoid.hw.robot.description import Robot
+from servoid.sim.multi_robot import ADDED
 from servoid.sim.scene import scene_sensors
 
 FALL_HEIGHT = 0.6  # of the standing height
@@ -23,8 +24,9 @@ class Truth:
         """`recent` `(n, substeps, ...)` are the sensors at the substeps of the last tick; by default those of now."""
         self._robot, self._qpos, self._qvel, self._sensors = robot, qpos, qvel, sensors
         self._recent = sensors[:, None] if recent is None else recent
-        self._at = {model.sensor(i).name: slice(int(a := model.sensor(i).adr[0]), int(a + model.sensor(i).dim[0]))
-                    for i in range(model.nsensor)}  # fmt: skip
+        views = [model.sensor(i) for i in range(model.nsensor)]
+        starts = {sensor.name.removeprefix(ADDED): (int(sensor.adr[0]), int(sensor.dim[0])) for sensor in views}
+        self._at = {name: slice(start, start + size) for name, (start, size) in starts.items()}
         self._scene = scene_sensors(model)
         joints = [model.joint(name) for name in robot.names]
         self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])

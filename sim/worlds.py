@@ -17,7 +17,7 @@ from servoid.hw.contracts.body import Array, Command, Mode, Observation
 from servoid.hw.geometry import headed
 from servoid.hw.robot.description import Imu, Robot
 from servoid.hw.robot.legs import Legs
-from servoid.sim.model import TIMESTEP, build
+from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.multi_robot import Crowd
 from servoid.sim.randomise import Body, draw, longest
 from servoid.sim.scene import robot_bodies
@@ -79,7 +79,7 @@ class Worlds:
         self._gain, self._force = b.expand("actuator_gainprm"), b.expand("actuator_forcerange")
         if self.model.nmocap:
             self._mocap = b.bind("mocap_pos")
-        self._floor = b.expand("geom_friction")[:, self.model.geom("floor").id]
+        self._floor = b.expand("geom_friction")[:, self.model.geom(FLOOR).id]
         if randomise > 0:
             self._mass, self._inertia = b.expand("body_mass"), b.expand("body_inertia")
         self.bodies: list[Body | None] = [None] * n
