@@ -33,8 +33,8 @@ class State:
 class ReferenceFrames:
     """`k` frames of a motion to track, along the axis before the last; of a number a frame, along the last.
 
-    A velocity is in the heading frame of its own frame. The root's pose is in the heading frame that the reference's own
-    root has now: x along its heading at `ahead` 0, z up, and the origin on the ground below it. So a clip is tracked
+    A velocity is in the heading frame of its own frame. The root's pose is in the heading frame of the reference's
+    own root now: x along its heading at `ahead` 0, z up, and the origin on the ground below it. So a clip is tracked
     wherever the robot is, by its displacement from now on; nothing says where it was recorded.
     """
 
