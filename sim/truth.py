@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.geometry import turned, up_vector, yaw_of
 from servoid.hw.robot.description import Robot
 from servoid.sim.multi_robot import ADDED
 from servoid.sim.scene import scene_sensors
@@ -52,14 +53,12 @@ class Truth:
     @property
     def yaw(self) -> Array:
         """Heading `(n,)` rad in -pi..pi."""
-        w, x, y, z = self.orientation.T
-        return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return yaw_of(self.orientation)
 
     @property
     def gravity(self) -> Array:
         """Unit vector along gravity in the base frame `(n, 3)`."""
-        w, x, y, z = self.orientation.T
-        return -np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1)
+        return -up_vector(self.orientation)
 
     @property
     def tilt(self) -> Array:
@@ -69,9 +68,7 @@ class Truth:
     @property
     def velocity(self) -> Array:
         """Base velocity `(n, 3)` m/s in the heading frame."""
-        c, s = np.cos(self.yaw), np.sin(self.yaw)
-        vx, vy, vz = self._qvel[:, 0:3].T
-        return np.stack([c * vx + s * vy, -s * vx + c * vy, vz], -1)
+        return turned(self._qvel[:, 0:3], -self.yaw)
 
     @property
     def angular_velocity(self) -> Array:
