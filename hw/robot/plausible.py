@@ -96,7 +96,9 @@ def _check_protections(robot: Robot, marks: Marks) -> None:
 def _check_geometry(robot: Robot, marks: Marks) -> None:
     limits = robot.limits
     if limits.tilt > math.pi / 2:
-        raise marks.error("limits.tilt", f"{limits.tilt:g} rad is more than lying down: the robot has fallen long before")
+        raise marks.error(
+            "limits.tilt", f"{limits.tilt:g} rad is more than lying down: the robot has fallen long before"
+        )
     falls = math.sqrt(robot.standing_height / GRAVITY)
     if limits.stale * robot.dt > falls:
         raise marks.error(

@@ -73,7 +73,6 @@ class Interrupt:
         if self.eager or (self.count > 1 and self.breakable):
             raise KeyboardInterrupt
 
-
     def _same(self, number: int) -> bool:
         """Whether a signal says again what a hang-up and what comes with it have said."""
         again = self._hung_up or self._terminated
