@@ -50,8 +50,8 @@ def _check_bus(robot: Robot, marks: Marks) -> None:
     remedy = f"set {fast} or more" if fast else "lower the rate"
     raise marks.error(
         "bus.baud",
-        f"at {robot.bus.baud} bit/s a control cycle of {n} servos takes {1000 * needs:.1f} ms on the wire, and a tick at "
-        f"rate {robot.rate} has {1000 * tick:.1f}, of which {1000 * BUS_SHARE * tick:.1f} for the bus: {remedy}",
+        f"at {robot.bus.baud} bit/s a control cycle of {n} servos takes {1000 * needs:.1f} ms on the wire, and a tick "
+        f"at rate {robot.rate} has {1000 * tick:.1f}, of which {1000 * BUS_SHARE * tick:.1f} for the bus: {remedy}",
     )
 
 

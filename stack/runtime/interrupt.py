@@ -29,9 +29,10 @@ class Interrupt:
     """Counts the signals that ask to end while it is entered, and restores the handlers after.
 
     A terminal that closes, or an ssh connection that is lost, sends SIGHUP, often more than once and with a SIGTERM
-    behind it: all of that is one request. The first request asks for an orderly end, the second for torque off at once. A policy that hangs would never look: while
-    `breakable` is set, and only then, the second signal also raises KeyboardInterrupt. Outside the main thread, where
-    Python forbids handlers, it stays at zero unless `request` is called.
+    behind it: all of that is one request. The first request asks for an orderly end, the second for torque off at once.
+    A policy that hangs would never look: while `breakable` is set, and only then, the second also raises
+    KeyboardInterrupt. Outside the main thread, where Python forbids handlers, it stays at zero unless `request` is
+    called.
 
     Before anything moves it may be `eager`, and raise at once. An exception can get lost in a library that is just
     being imported or is cleaning up; what was counted is not lost, and `settle` raises it.

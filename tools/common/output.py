@@ -52,8 +52,8 @@ class Report:
 
 
 def say(text: str, stream: TextIO) -> None:
-    """Print a line. To a terminal that was closed, or went with an ssh connection, nothing is printed from then on: what
-    remains to be done is done all the same."""
+    """Print a line. Once a terminal was closed, or went with an ssh connection, nothing is printed: what remains to be
+    done is done all the same."""
     try:
         print(text, file=stream, flush=True)
     except OSError as error:
