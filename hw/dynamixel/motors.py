@@ -14,7 +14,7 @@ from servoid.hw.dynamixel.codec import SyncWriter
 from servoid.hw.dynamixel.group_read import GroupRead
 from servoid.hw.dynamixel.guardian_client import Lifeline
 from servoid.hw.dynamixel.register_check import Found
-from servoid.hw.dynamixel.servo_monitor import Watch
+from servoid.hw.dynamixel.servo_monitor import ServoMonitor
 from servoid.hw.dynamixel.units import Units
 from servoid.hw.faults import describe
 
@@ -35,14 +35,14 @@ class DynamixelMotors:
         bus: Bus,
         found: Sequence[Found],
         units: Units,
-        watch: Watch,
+        monitor: ServoMonitor,
         present: GroupRead,
         lifeline: Lifeline | None = None,
     ) -> None:
         """`present` is the group of the control cycle, at whose positions torque comes on. `lifeline` is told of
         torque; without one nothing but the servos' watchdog stops them when this process is killed."""
         table = found[0].table
-        self._bus, self._found, self._units, self._watch, self._present = bus, found, units, watch, present
+        self._bus, self._found, self._units, self._monitor, self._present = bus, found, units, monitor, present
         self._lifeline = lifeline
         self._ids = [servo.joint.id for servo in found]
         self._goal = table.item("goal_position")
@@ -60,7 +60,7 @@ class DynamixelMotors:
     @property
     def armed(self) -> bool:
         """Whether torque was switched on by this program."""
-        return self._watch.armed
+        return self._monitor.armed
 
     def write(self, command: Command) -> None:
         """Send a command. Raises BackendError, naming the joints, where torque does not go on or off, and where a joint
@@ -89,7 +89,7 @@ class DynamixelMotors:
             left = self._unconfirmed(left, b"\0")
             if not left:
                 self.on, self._gain = False, None
-                self._watch.expect(False)
+                self._monitor.expect(False)
                 if self._lifeline is not None:
                     self._lifeline.let_go()
                 return
@@ -103,8 +103,8 @@ class DynamixelMotors:
         `wanted` `(n_joints,)` are the goal ticks that will be sent next.
         """
         everyone = list(range(len(self._ids)))
-        if broken := [i for i in everyone if self._watch.fault[i] & 0xFF]:
-            reasons = ", ".join(describe(int(self._watch.fault[broken[0]]) & 0xFF))
+        if broken := [i for i in everyone if self._monitor.fault[i] & 0xFF]:
+            reasons = ", ".join(describe(int(self._monitor.fault[broken[0]]) & 0xFF))
             raise BackendError(f"{self._names(broken)} reports {reasons}: let it cool, then switch it off and on")
         if self._lifeline is not None:
             self._lifeline.hold()  # first, as it may wait for seconds, in which a limp robot moves
@@ -114,7 +114,7 @@ class DynamixelMotors:
             raise BackendError(
                 f"{self._names(moved)} moved before torque was on: support the robot, hold it still and start again"
             )
-        self._watch.expect(False)
+        self._monitor.expect(False)
         self._gain = None
         for _ in self._attempts(ON_SECONDS):
             self._write(self._watchdog.address, everyone, [b"\0"] * len(everyone))  # lifts an expired one, too
@@ -134,7 +134,7 @@ class DynamixelMotors:
             self._write(self._watchdog.address, left, [bytes([WATCHDOG])] * len(left))
             left = self._unconfirmed(left, b"\1", bytes([WATCHDOG]))
             if not left:
-                self._watch.expect(True)
+                self._monitor.expect(True)
                 return
         names = self._names(left)
         self.off()

@@ -21,7 +21,7 @@ from servoid.tools.evaluate.report import Measured
 from servoid.tools.evaluate.spec import Experiment, Row
 
 if TYPE_CHECKING:
-    from servoid.stack.runtime.run import Settings
+    from servoid.stack.runtime.run import RunSettings
 
 Work = Callable[[EpisodeJob], EpisodeResult]
 Pool = Callable[[Work, Iterable[EpisodeJob], int, float | None], Iterator[EpisodeResult]]
@@ -56,7 +56,7 @@ class _Prepared:
     """An experiment of one or more rows, with what was done of it."""
 
     experiment: Experiment
-    settings: Settings
+    settings: RunSettings
     policy: tuple[Mapping[str, Any], str | None]  # its fingerprint, and the hash of its file of settings
     limit: float  # s that an episode lasts at most
     episodes: int
@@ -154,7 +154,7 @@ def _prepare_all(
 
 def _prepare(experiment: Experiment, policies: Policies, options: Options) -> _Prepared:
     """Raises ConfigError where the experiment cannot be done."""
-    from servoid.stack.runtime.run import Settings
+    from servoid.stack.runtime.run import RunSettings
     from servoid.stack.tasks import load_settings
     from servoid.tools.evaluate import clips
 
@@ -169,7 +169,7 @@ def _prepare(experiment: Experiment, policies: Policies, options: Options) -> _P
     shortest = min(limit for limit in limits if limit is not None)
     seconds = None if shortest == own else shortest
     kept = dependencies(experiment, policies, options.robot, options.seed, seconds, recipe)
-    settings = Settings(
+    settings = RunSettings(
         task=experiment.task,
         backend=experiment.backend,
         robot=options.robot,

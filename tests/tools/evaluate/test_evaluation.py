@@ -14,7 +14,7 @@ import pytest
 from servoid.hw.config import CONFIGS, ConfigError
 from servoid.hw.contracts.body import BackendError
 from servoid.policy.checkpoint import resolve
-from servoid.stack.runtime.run import Settings
+from servoid.stack.runtime.run import RunSettings
 from servoid.tools.cli import main
 from servoid.tools.commands import rollout
 from servoid.tools.evaluate import clips, code_hash
@@ -121,7 +121,7 @@ def test_quick_cuts_the_longest_episodes_and_does_not_mistake_them_for_whole_one
     "name",
     [
         "hw/robot/legs.py",
-        "sim/rig/servo.py",
+        "sim/rig/servo/virtual_servo.py",
         "policy/diffusion/sampler.py",
         "stack/control/trim.py",
         "configs/servos/xm430-w350.yaml",
@@ -233,7 +233,7 @@ def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done
 def test_an_error_of_one_run_does_not_stop_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
-    def record(settings: Settings) -> dict[str, Any]:
+    def record(settings: RunSettings) -> dict[str, Any]:
         if settings.task == "goal-far":
             raise error
         return {"success": True}
@@ -306,7 +306,7 @@ def test_the_command_prints_and_writes_what_was_done_until_ctrl_c(
     judged = rollout.judge
     seen = []
 
-    def judge(settings: Settings) -> rollout.Judged:
+    def judge(settings: RunSettings) -> rollout.Judged:
         if seen:
             raise KeyboardInterrupt
         seen.append(settings)
@@ -336,7 +336,7 @@ def test_the_command_prints_and_writes_what_was_done_until_ctrl_c(
 def test_ctrl_c_while_a_clip_is_recorded_is_no_fall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else that walk is left out ever after."""
 
-    def run(settings: Settings) -> SimpleNamespace:
+    def run(settings: RunSettings) -> SimpleNamespace:
         assert settings.record is not None
         settings.record.touch()
         return SimpleNamespace(interrupted=True, outcome="stopped")
