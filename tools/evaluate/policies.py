@@ -63,7 +63,7 @@ class Policies:
         return f"{before}`servoid train diffusion --data {_DATA} --out {path.parent} {options}`"
 
     def name(self, experiment: Experiment) -> str:
-        """An experiment's policy, as `servoid run --policy` takes it. Raises ConfigError for settings that do not fit."""
+        """An experiment's policy, as `servoid run --policy` takes it. Raises ConfigError where settings do not fit."""
         settings = self.settings(experiment)
         if settings is None:
             return experiment.policy or self._policy
