@@ -6,7 +6,6 @@ import json
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,12 +16,10 @@ from servoid.policy.checkpoint import resolve
 from servoid.stack.runtime.run import RunSettings
 from servoid.tools.cli import main
 from servoid.tools.commands import rollout
-from servoid.tools.evaluate import clips, code_hash
-from servoid.tools.evaluate.cache import EpisodeCache, key
-from servoid.tools.evaluate.code_hash import digest
+from servoid.tools.evaluate import code_hash
+from servoid.tools.evaluate.cache import EpisodeCache
 from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult, do_episode
 from servoid.tools.evaluate.metrics import METRICS
-from servoid.tools.evaluate.policies import Policies, dependencies
 from servoid.tools.evaluate.report import Measured
 from servoid.tools.evaluate.runner import Interrupted, Options
 from servoid.tools.evaluate.runner import evaluate as evaluate_with
@@ -115,51 +112,6 @@ def test_quick_cuts_the_longest_episodes_and_does_not_mistake_them_for_whole_one
     evaluate([row], options(tmp_path), done)
     evaluate([row], options(tmp_path, quick=True, seconds=5.0), done)
     assert [job.settings.seconds for job in done.jobs] == [61.0, None, 5.0]
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "hw/robot/legs.py",
-        "sim/rig/servo/virtual_servo.py",
-        "policy/diffusion/sampler.py",
-        "stack/control/trim.py",
-        "configs/servos/xm430-w350.yaml",
-        "tools/common/ground_truth.py",
-        "tools/common/motion_quality.py",
-        "tools/commands/rollout.py",
-        "tools/evaluate/episode.py",
-    ],
-)
-def test_the_hash_of_the_code_changes_with_all_that_makes_or_judges_a_run(tmp_path: Path, name: str) -> None:
-    """Else an evaluation after a change goes on with episodes from before it."""
-    root = Path(__file__).resolve().parents[3]
-    for part in ("hw", "sim", "policy", "stack", "configs", "tools"):
-        shutil.copytree(root / part, tmp_path / part, ignore=shutil.ignore_patterns("__pycache__", "*.safetensors"))
-    before = digest(tmp_path)
-    assert before == digest(tmp_path)
-    (tmp_path / "tools" / "plot.py").write_text("# how pictures look\n")
-    (tmp_path / "policy" / "checkpoints" / "other.safetensors").parent.mkdir(exist_ok=True)
-    (tmp_path / "policy" / "checkpoints" / "other.safetensors").write_bytes(b"one that no row uses")
-    (tmp_path / "configs" / "evaluation" / "mine.yaml").write_text("title: another evaluation\n")
-    assert digest(tmp_path) == before
-    with (tmp_path / name).open("a") as file:
-        file.write("# changed\n")
-    assert digest(tmp_path) != before
-
-
-def test_changed_code_changes_what_episodes_and_clips_depend_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    near, policies = Experiment("goal-near"), Policies("gait", tmp_path)
-
-    def keys() -> tuple[str, str]:
-        return key(dependencies(near, policies, "op3", 0, None, None)), key(clips.recipe("op3"))
-
-    before = keys()
-    monkeypatch.setattr("servoid.tools.evaluate.policies.code", lambda: "other")
-    monkeypatch.setattr("servoid.tools.evaluate.clips.code", lambda: "other")
-    assert not set(before) & set(keys())
 
 
 def test_episodes_are_not_those_that_settings_are_tried_on(tmp_path: Path, done: Episodes) -> None:
@@ -331,20 +283,6 @@ def test_the_command_prints_and_writes_what_was_done_until_ctrl_c(
     assert (answer["exit_code"], answer["rows"][0]["episodes"]) == (130, 1)
     assert "the same command goes on" in answer["error"]
     assert "| 1 |" in (tmp_path / "papers.md").read_text()
-
-
-def test_ctrl_c_while_a_clip_is_recorded_is_no_fall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else that walk is left out ever after."""
-
-    def run(settings: RunSettings) -> SimpleNamespace:
-        assert settings.record is not None
-        settings.record.touch()
-        return SimpleNamespace(interrupted=True, outcome="stopped")
-
-    monkeypatch.setattr("servoid.stack.runtime.run.run", run)
-    with pytest.raises(KeyboardInterrupt):
-        clips.record_clips(tmp_path, "op3", 1)
-    assert not list(tmp_path.rglob("*.fell"))
 
 
 def test_a_cache_that_cannot_be_written_says_so(tmp_path: Path) -> None:
