@@ -198,6 +198,11 @@ class Worlds:
         self.tick += 1
 
     @property
+    def weight(self) -> float:
+        """Of a nominal robot [N]."""
+        return _GRAVITY * float(self.model.body_mass[1 : self._bodies].sum())
+
+    @property
     def effort(self) -> Array:
         """True torque of the servos `(n, n_joints)` N m."""
         return self._record["actuator_force"][:, -1]
