@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from servoid.hw.config import ConfigError, nearest
-from servoid.hw.dynamixel.tables import ControlTable, table
+from servoid.hw.dynamixel.protocol.tables import ControlTable, table
 from servoid.hw.robot.description import Robot
 
 Assembly = Literal["file", "random"]

@@ -18,7 +18,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from servoid.hw.config import ConfigError, load_yaml, nearest
-from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.protocol import codec
 from servoid.hw.faults import ENCODER, INPUT_VOLTAGE, OVERHEATING, OVERLOAD, SHOCK
 from servoid.hw.robot.description import Robot
 

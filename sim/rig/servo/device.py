@@ -5,8 +5,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator
 
-from servoid.hw.dynamixel.codec import CLEAR_REVOLUTIONS, Instruction, Reset, Status, StatusError
-from servoid.hw.dynamixel.tables import ControlTable, Item
+from servoid.hw.dynamixel.protocol.codec import CLEAR_REVOLUTIONS, Instruction, Reset, Status, StatusError
+from servoid.hw.dynamixel.protocol.tables import ControlTable, Item
 
 _KEPT = {Reset.ALL: (), Reset.EXCEPT_ID: ("id",), Reset.EXCEPT_ID_AND_BAUD: ("id", "baud_rate")}
 

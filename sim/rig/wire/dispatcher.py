@@ -7,9 +7,9 @@ import operator
 import struct
 from collections.abc import Iterator, Sequence
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import Instruction, Packet, Parser, Status
-from servoid.hw.dynamixel.crc import crc16
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Instruction, Packet, Parser, Status
+from servoid.hw.dynamixel.protocol.crc import crc16
 from servoid.sim.rig.faults import MISSPOKEN, STATUS_KINDS, Chunk, FaultInjector
 from servoid.sim.rig.servo.device import VirtualDevice
 from servoid.sim.rig.wire.half_duplex import FRAME_BITS, Wire, same_baud
