@@ -28,7 +28,7 @@ from typing import Any, Literal
 from servoid.hw.clock import wake_sharply
 from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
-from servoid.sim.rig.factory_state import FactoryState, add_factory_state_arguments
+from servoid.sim.rig.factory_state import add_factory_state_arguments, factory_state_of
 from servoid.sim.rig.faults import Scenario, load_scenario
 from servoid.sim.rig.process import control_requests
 from servoid.sim.rig.process.control_requests import Connection
@@ -269,7 +269,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def build(args: argparse.Namespace, *, linger: float | None = None) -> Server:
     """A server as the arguments say. Raises ConfigError, and OSError for a link or socket that cannot be made."""
     scenario = load_scenario(args.faults) if args.faults else Scenario()
-    factory_state = FactoryState(tuple(args.fresh), tuple(args.only), args.assembly)
+    factory_state = factory_state_of(args)
     rig = Rig(
         load_robot(args.robot), seed=args.seed, randomise=args.randomise, scenario=scenario, factory_state=factory_state
     )
