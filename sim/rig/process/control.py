@@ -100,6 +100,11 @@ class Control:
             raise BackendError(f"virtual rig: {answer['forgotten']} accepted writes were forgotten: ask more often")
         return list(answer["accepted"])
 
+    def lateness(self) -> str | None:
+        """What a person should know of a rig in real time that was late since this was last asked; None if it was not."""
+        text: str | None = self.call("lateness")["text"]
+        return text
+
     def servos(self) -> list[dict[str, Any]]:
         """State of each servo, in the robot's joint order."""
         return list(self.call("servos")["servos"])
