@@ -282,7 +282,7 @@ class Rig:
         """Move limp joints of the held robot by hand, to angles [rad]. Raises ValueError for a robot that stands on its
         own, and for joints that it has not or that have torque."""
         if not self.plant.held:
-            raise ValueError("the robot is not held: reset it first")
+            raise ValueError("the robot is not held: it is again 3 s after all torque went off, or after a reset")
         for name in pose:
             if name not in self.robot.names:
                 raise ValueError(f"{self.robot.name} has no joint '{name}'; {nearest(name, self.robot.names)}")
