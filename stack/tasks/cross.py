@@ -58,7 +58,7 @@ class Cross(BaseTask):
     name = "cross"
     description = "cross a circle together with other robots, to the opposite side, without touching one"
     settings_type = CrossSettings
-    others: tuple[Cross, ...] = ()  # of the first robot's task: those of the other robots
+    teammates: tuple[Cross, ...] = ()  # of the first robot's task: those of the other robots
 
     def __init__(self, settings: CrossSettings, dt: float) -> None:
         super().__init__(settings, dt)
@@ -80,7 +80,7 @@ class Cross(BaseTask):
         rim = s.circle * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
         middle = np.array([s.circle, 0.0])
         self._others = np.column_stack([middle + rim, angles - math.pi, middle - rim])
-        self.others = tuple(Cross(s, self.dt) for _ in range(s.robots - 1))
+        self.teammates = tuple(Cross(s, self.dt) for _ in range(s.robots - 1))
 
     def scene(self) -> Scene:
         return Scene(np.zeros((0, 3)), np.zeros((0, 4)), self.goal, self._others)
@@ -109,7 +109,7 @@ class Cross(BaseTask):
 
     def done(self, state: State) -> bool:
         """For the first robot, when it and all others have arrived, or cannot any more. The others stand meanwhile."""
-        return bool(self.others) and self.arrived and all(other.arrived or other.ended for other in self.others)
+        return bool(self.teammates) and self.arrived and all(other.arrived or other.ended for other in self.teammates)
 
     def lost(self) -> None:
         self.ended = True
