@@ -21,17 +21,17 @@ SECONDS = Metric("metrics.seconds_to_goal", "s", lower=True, unfinished="left ou
 # How plans are sampled, by the papers' names: settings of the diffusion policy.
 # UniPhys stabilises with level 3 of 50, where noise has a deviation of 0.105 by the cosine schedule: level 1 of 20 has
 # 0.089 and level 3 of 20 has 0.243. That is for text; under guidance it takes more, and does not say how much.
-_STABLE = {"stabilise": "1"}
-_CHUNKS = {"steps": "5", "replan": "4", "delay": "2"}  # as in configs/policies/uniphys.yaml
+_STABLE = {"stabilization_level": "1"}
+_CHUNKS = {"steps": "5", "execution_horizon": "4", "delay": "2"}  # as in configs/policies/uniphys.yaml
 _AT_ONCE = {"lead": "0"}  # state and action of a frame, which are one token in UniPhys
 FULL: Mapping[str, str] = {"schedule": "full_sequence", **_CHUNKS, **_AT_ONCE, **_STABLE}
 AUTOREGRESSIVE: Mapping[str, str] = {"schedule": "autoregressive", **_CHUNKS, **_AT_ONCE, **_STABLE}
-UNSTABLE: Mapping[str, str] = {"schedule": "autoregressive", **_CHUNKS, **_AT_ONCE, "stabilise": "0"}
-GRADUAL: Mapping[str, str] = {"schedule": "gradual", **_CHUNKS, **_AT_ONCE, **_STABLE}
+UNSTABLE: Mapping[str, str] = {"schedule": "autoregressive", **_CHUNKS, **_AT_ONCE, "stabilization_level": "0"}
+GRADUAL: Mapping[str, str] = {"schedule": "pyramid", **_CHUNKS, **_AT_ONCE, **_STABLE}
 # Actions come after the states that guidance moved.
-GUIDED: Mapping[str, str] = {"schedule": "gradual", **_CHUNKS, **_STABLE}
+GUIDED: Mapping[str, str] = {"schedule": "pyramid", **_CHUNKS, **_STABLE}
 # As in configs/policies/diffuse_cloc.yaml; at a level of 20 nothing but a frame's noise goes over to the next plan.
-_EVERY_TICK = {"delay": "1", "replan": "1"}
+_EVERY_TICK = {"delay": "1", "execution_horizon": "1"}
 ROLLING: Mapping[str, str] = {"schedule": "rolling", "steps": "3", **_EVERY_TICK}
 # No rolling: from pure noise, in steps about as long as the 3 that rolling needs for 14 of 20 levels.
 ANEW: Mapping[str, str] = {"schedule": "full_sequence", "steps": "5", **_EVERY_TICK}
@@ -211,7 +211,7 @@ _SAMPLING: tuple[Row, ...] = (
     *(
         Row(
             f"cloc/executed-{n}", CLOC, f"Forest, actions executed of a plan: {n}",
-            Run("forest", plan={"delay": "0", "replan": str(n)}), SUCCESS, quick=False,
+            Run("forest", plan={"delay": "0", "execution_horizon": str(n)}), SUCCESS, quick=False,
             note="not in the paper's table",
         )
         for n in (1, 4, 8, 16)
@@ -333,7 +333,7 @@ _PACE: tuple[Row, ...] = tuple(
         *(
             (
                 f"{replan}-{delay}", f"plans {replan} ticks apart and adopted after {delay}",
-                {"replan": str(replan), "delay": str(delay)},
+                {"execution_horizon": str(replan), "delay": str(delay)},
             )
             for replan, delay in ((4, 2), (4, 1), (4, 0), (2, 2), (2, 1), (1, 1))
         ),

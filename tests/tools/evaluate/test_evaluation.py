@@ -198,7 +198,7 @@ def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path, monkeyp
     ran = []
 
     def do(job: Job) -> Done:
-        ran.append(load_settings(job.settings.policy).replan)
+        ran.append(load_settings(job.settings.policy).execution_horizon)
         mine.write_text("checkpoint: diffusion\nreplan: 8\n")
         return Done(job, {"success": True})
 
@@ -209,7 +209,9 @@ def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path, monkeyp
 
 def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done: list[Job]) -> None:
     stand = Row("t/stand", "T", "Stand", Run("stand", episodes=3), Metric("success", share=True))
-    variant = Row("t/variant", "T", "Variant", Run("goal-near", plan={"replan": "8"}), Metric("success", share=True))
+    variant = Row(
+        "t/variant", "T", "Variant", Run("goal-near", plan={"execution_horizon": "8"}), Metric("success", share=True)
+    )
     measured = evaluate([stand, variant, FAR], options(tmp_path), quiet)
     assert measured["t/stand"].refused == "the floor is missing"
     assert sum(job.settings.task == "stand" for job in done) == 1

@@ -34,7 +34,7 @@ def test_a_changed_checkpoint_setting_or_task_changes_what_episodes_depend_on(tm
     assert made_of(Run("goal-near", episodes=7)) == before  # more of the same
     others = [
         made_of(Run("goal-near", set={"radius": "0.09"})),
-        made_of(Run("goal-near", plan={"replan": "8"})),
+        made_of(Run("goal-near", plan={"execution_horizon": "8"})),
         made_of(Run("goal-near", randomise=True)),
         made_of(Run("goal-near", backend="virtual")),
         made_of(Run("goal-near", policy="expert")),
@@ -116,10 +116,10 @@ def test_variants_of_the_planner_are_files_that_the_policy_is_made_from(tmp_path
     from servoid.policy.diffusion.settings import load_settings
 
     pilots = Pilots("diffusion", tmp_path)
-    assert load_settings(pilots.name(Run("goal"))).replan == load_settings().replan
+    assert load_settings(pilots.name(Run("goal"))).execution_horizon == load_settings().execution_horizon
     assert pilots.name(Run("goal", policy="expert")) == "expert"
-    written = load_settings(pilots.name(Run("goal", plan={"replan": "8", "guidance.clip": "3"})))
-    assert (written.replan, written.guidance.clip) == (8, 3.0)
+    written = load_settings(pilots.name(Run("goal", plan={"execution_horizon": "8", "guidance.clip": "3"})))
+    assert (written.execution_horizon, written.guidance.clip) == (8, 3.0)
     assert written.steps == load_settings().steps
     with pytest.raises(ConfigError, match="replann"):
         pilots.name(Run("goal", plan={"replann": "8"}))
