@@ -70,6 +70,11 @@ class Truth(Protocol):
         ...
 
     @property
+    def orientation(self) -> Array:
+        """Base quaternion `(n, 4)` w x y z."""
+        ...
+
+    @property
     def yaw(self) -> Array:
         """Heading `(n,)` rad in -pi..pi."""
         ...

@@ -19,7 +19,7 @@ from servoid.hw.dynamixel.backend import DynamixelBackend
 from servoid.hw.dynamixel.motors import DynamixelMotors
 from servoid.hw.dynamixel.sensors import DynamixelSensors
 from servoid.hw.robot.description import Robot
-from servoid.sim.rig.control import Control, LockedClock, RigProcess, RigTruth
+from servoid.sim.rig.process.control import Control, LockedClock, RigProcess, RigTruth
 from servoid.sim.scene import Stage
 
 
@@ -162,6 +162,11 @@ class VirtualTruth:
     def position(self) -> Array:
         """Base position `(1, 3)` m."""
         return self._now().position
+
+    @property
+    def orientation(self) -> Array:
+        """Base quaternion `(1, 4)` w x y z."""
+        return self._now().orientation
 
     @property
     def yaw(self) -> Array:

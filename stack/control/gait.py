@@ -7,7 +7,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.robot.description import Robot
-from servoid.policy.references.gait import Gait, GyroFeedback, load_gait
+from servoid.policy.references.gait import Gait, GyroFeedback
 from servoid.stack.control.base import BasePolicy
 
 _NOW = np.array([0])
@@ -17,8 +17,7 @@ class GaitPolicy(BasePolicy):
     """Walks one robot, or worlds of any leading `shape`."""
 
     def __init__(self, robot: Robot, shape: tuple[int, ...] = ()) -> None:
-        settings = load_gait()
-        self._gait, self._feedback = Gait(robot, settings, shape), GyroFeedback(robot, settings)
+        self._gait, self._feedback = Gait(robot, shape), GyroFeedback(robot)
 
     def reset(self, where: Array | None, seeds: Array) -> None:
         self._gait.reset(slice(None) if where is None else where)

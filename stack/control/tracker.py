@@ -7,7 +7,7 @@ from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import resolve
 from servoid.policy.mlp import Mlp
-from servoid.policy.references.gait import Gait, load_gait
+from servoid.policy.references.gait import Gait
 from servoid.policy.tracker.observation import AHEAD, RESIDUAL, TrackerObservation
 from servoid.stack.control.base import BasePolicy
 
@@ -16,7 +16,7 @@ class ExpertPolicy(BasePolicy):
     """Walks one robot, or worlds of any leading `shape`. Raises CheckpointError when the tracker does not fit."""
 
     def __init__(self, robot: Robot, checkpoint: str = "expert", shape: tuple[int, ...] = ()) -> None:
-        self._gait, self._observation = Gait(robot, load_gait(), shape), TrackerObservation(robot, shape)
+        self._gait, self._observation = Gait(robot, shape), TrackerObservation(robot, shape)
         self._tracker, _ = Mlp.load(resolve(checkpoint), "tracker", robot, self._observation.size)
 
     def reset(self, where: Array | None, seeds: Array) -> None:

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from servoid.hw.contracts.control import Instruction
+from servoid.hw.geometry import rotate, up_vector, yaw_of
 from servoid.hw.robot.description import load_robot
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.gait import GaitPolicy
-from servoid.stack.estimation.attitude import Attitude, rotate, up_vector, yaw_of
+from servoid.stack.estimation.attitude import Attitude
 
 DT = 0.02
 LEVEL = np.array([0.0, 0.0, 9.81])

@@ -9,13 +9,13 @@ import pytest
 
 from servoid.hw.contracts.body import Observation
 from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.geometry import rotate
 from servoid.hw.robot.description import load_robot
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.tracker import ExpertPolicy
-from servoid.stack.estimation.attitude import rotate
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import load_odometry
-from servoid.tools.learn.trainers.odometry import drift, driver
+from servoid.tools.learn.trainers.odometry import drift, maker
 
 ROBOT = load_robot()
 
@@ -168,7 +168,7 @@ def test_standing_it_neither_moves_nor_sinks() -> None:
 
 @pytest.mark.parametrize("policy", ["expert", "diffusion", "gait"])
 def test_drift_of_twenty_walks_is_a_small_share_of_the_path(policy: str) -> None:
-    result = drift(ROBOT, driver(ROBOT, policy), load_odometry(ROBOT), walks=20, seconds=30.0, seed=11)
+    result = drift(ROBOT, maker(ROBOT, policy), load_odometry(ROBOT), walks=20, seconds=30.0, seed=11)
     assert result.walks >= 15  # that stayed up and covered more than a metre
     assert result.p90 <= 0.04
     assert result.yaw_p90 <= 0.1

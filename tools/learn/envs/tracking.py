@@ -8,7 +8,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.mlp import Mlp
-from servoid.policy.references.gait import Gait, load_gait
+from servoid.policy.references.gait import Gait
 from servoid.policy.tracker.observation import AHEAD, RESIDUAL, TrackerObservation
 from servoid.policy.tracker.rewards import Step, total
 from servoid.stack.control.fleet import Fleet
@@ -24,7 +24,7 @@ class Tracking:
     def __init__(self, robot: Robot, n: int, odometry: Mlp | None, settings: ExpertSettings, seed: int = 0) -> None:
         self.robot, self.n, self.settings = robot, n, settings
         self.fleet = Fleet(robot, n, odometry, randomise=settings.randomised, seed=seed)
-        self.gait = Gait(robot, load_gait(), (n,))
+        self.gait = Gait(robot, (n,))
         self.observation = TrackerObservation(robot, (n,))
         joints, feet = Mirror.joints(robot), Mirror.feet(robot)
         self.mirror_action, self.mirror_actor = joints, self.observation.mirror
