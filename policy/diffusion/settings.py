@@ -228,6 +228,12 @@ def _near_alone(training: Mapping[str, Any], ticks: int) -> int:
     return ticks if training.get("far_actions", 1.0) else min(ticks, training["near_actions"])
 
 
+def with_new_names(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as an older program wrote them into a log, by the names of today."""
+    values = {RENAMED.get(key, key): value for key, value in settings.items()}
+    return values | {"schedule": RENAMED.get(values["schedule"], values["schedule"])}
+
+
 def load_settings(name: str = "diffusion") -> DiffusionSettings:
     """Settings by name or file. Raises ConfigError."""
     return load_yaml(resolve("policies", name), DiffusionSettings, RENAMED)

@@ -38,6 +38,9 @@ def test_what_a_policy_is_made_of_is_in_the_log_and_changes_are_named(tmp_path: 
         log.header.update(change)
         assert changes(log) == [text]
         log.header.update(before)
+    planner = log.header["policy"]["planner"]
+    planner["replan"] = planner.pop("execution_horizon")  # as an older program named it
+    assert changes(log) == []
     del log.header["policy"]["planner"], log.header["policy"]["odometry_sha256"]  # of an older program
     assert changes(log) == []
 
