@@ -291,6 +291,7 @@ def test_a_cache_that_cannot_be_written_says_so(tmp_path: Path) -> None:
         EpisodeCache(tmp_path / "file", {"a": 1})
 
 
+@pytest.mark.slow
 def test_the_command_from_episodes_to_pictures(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """A real one, two seconds long, with a pillar or two; and again, from what was kept."""
     words = [
