@@ -57,14 +57,7 @@ VERBS: dict[str, Verb] = {
             "diffusion": Verb("the diffusion planner-controller", "servoid.tools.learn.trainers.diffusion"),
         },
     ),
-    "evaluate": Verb(
-        "measure a policy the way that papers do",
-        verbs={
-            "papers": Verb(
-                "the tables of UniPhys and Diffuse-CLoC, with a column of one's own", "servoid.tools.evaluate.papers"
-            )
-        },
-    ),
+    "evaluate": Verb("measure a policy the way that papers do, or yours", "servoid.tools.commands.evaluate"),
     "bench": Verb(
         "measure speed and what faults do, on this machine",
         verbs={
