@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from servoid.hw.config import ConfigError
-from servoid.hw.robot.description import Imu, Joint, Limits, Link, Motion, Robot, load_robot
+from servoid.hw.robot.description import Imu, Joint, Limits, Link, Robot, Walking, load_robot
 from servoid.policy.checkpoint import REQUIRED
 from servoid.policy.diffusion.features import raw_layout
 from servoid.sim.model import build
@@ -84,7 +84,7 @@ def test_every_key_is_explained() -> None:
         "bus": "bus.baud",
         "limits": Limits,
         "imu": Imu,
-        "motion": Motion,
+        "walking": Walking,
         "feet": "feet.NAME",
         "legs": Link,
         "joints": Joint,
@@ -92,7 +92,7 @@ def test_every_key_is_explained() -> None:
     prefixes = {
         "limits": "limits.",
         "imu": "imu.",
-        "motion": "motion.",
+        "walking": "walking.",
         "legs": "legs.NAME[i].",
         "joints": "joints[i].",
     }

@@ -122,11 +122,10 @@ class Imu:
 
 
 @dataclass(frozen=True)
-class Motion:
-    """What a controller may ask of the robot at most, and what its motion is measured by.
+class Walking:
+    """What a controller may ask of the robot at most, and how high it walks.
 
-    What a file leaves out is NaN until `load_robot` derives it from the standing height; a weight that it leaves out is
-    that of the simulated body.
+    What a file leaves out is NaN until `load_robot` derives it from the standing height.
     """
 
     forward: float = math.nan  # m/s
@@ -134,7 +133,6 @@ class Motion:
     sideways: float = math.nan  # m/s
     turning: float = math.nan  # rad/s
     height: float = math.nan  # m of the base above the ground while it walks
-    weight: float | None = None  # N
 
     @property
     def lower(self) -> Array:
@@ -151,7 +149,7 @@ class Motion:
         """Top speed in any direction, and of turning `(3,)`: by shares of it robots of any size are asked alike."""
         return np.array([self.forward, self.forward, self.turning])
 
-    def derived(self, standing_height: float) -> Motion:
+    def derived(self, standing_height: float) -> Walking:
         """With what is NaN derived from the standing height [m], as alike robots of any size walk alike.
 
         Forward they reach a Froude number v^2 / (g h) of 0.1, backward and sideways 0.3 and 0.26 of that speed. They
@@ -192,7 +190,8 @@ class Robot:
     feet: dict[str, Foot]
     legs: dict[str, tuple[Link, ...]]
     joints: tuple[Joint, ...]
-    motion: Motion = Motion()
+    walking: Walking = Walking()
+    weight: float | None = None  # N; None: the file does not say it
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -250,8 +249,8 @@ def load_robot(name: str | Path = "op3") -> Robot:
         replace(joint, servo=str(folder / joint.servo)) if joint.servo.endswith((".yaml", ".yml")) else joint
         for joint in robot.joints
     )
-    motion = robot.motion.derived(robot.standing_height)
-    robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints, motion=motion)
+    walking = robot.walking.derived(robot.standing_height)
+    robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints, walking=walking)
     _ = robot.servos  # a servo's file that cannot be used is found now, not when the robot stands
     return robot
 

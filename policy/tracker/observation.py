@@ -23,7 +23,7 @@ class TrackerObservation:
     """Builds observations `(..., size)` float32; keeps the short history. `shape` are the leading dimensions."""
 
     def __init__(self, robot: Robot, shape: tuple[int, ...] = ()) -> None:
-        self._home, self._motion = robot.home, robot.motion
+        self._home, self._walking = robot.home, robot.walking
         n, feet = len(robot.joints), len(robot.feet)
         self._past = np.zeros((*shape, _HISTORY, n + 3))
         self._before = np.zeros((*shape, _COMMANDS, n))  # newest first
@@ -49,7 +49,7 @@ class TrackerObservation:
             self._past = np.where(self._fresh[..., None, None], row[..., None, :], self._past)
             self._before = np.where(self._fresh[..., None, None], applied[..., None, :], self._before)
             self._fresh = np.zeros_like(self._fresh)
-        lead, m = state.yaw.shape, self._motion
+        lead, m = state.yaw.shape, self._walking
         rise = 2.5 / m.height  # heights are seen from that of walking, speeds as shares of the fastest
         observation = np.concatenate(
             [

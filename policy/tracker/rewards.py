@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.robot.description import Motion
+from servoid.hw.robot.description import Walking
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Step:
     reference_joints: Array  # (n, n_joints)
     reference_contact: Array  # (n, n_feet)
     fallen: Array  # (n,)
-    motion: Motion  # of the robot: what is far, fast and high depends on its size
+    walking: Walking  # of the robot: what is far, fast and high depends on its size
     weight: float  # N
 
 
@@ -51,20 +51,20 @@ def _carries(s: Step) -> Array:
 def velocity(s: Step) -> Array:
     """Planar velocity near the reference's: a wide kernel to find it and a narrow one to hold it."""
     error = ((s.velocity - s.reference_velocity) ** 2).sum(-1)
-    return 0.5 * _kernel(error, 0.3 * s.motion.forward) + 0.5 * _kernel(error, 0.1 * s.motion.forward)
+    return 0.5 * _kernel(error, 0.3 * s.walking.forward) + 0.5 * _kernel(error, 0.1 * s.walking.forward)
 
 
 def progress(s: Step) -> Array:
     """Share of the reference's speed that is reached along its direction: it pulls where `velocity` is flat."""
     squared = (s.reference_velocity**2).sum(-1)
     along = (s.velocity * s.reference_velocity).sum(-1) / np.maximum(squared, 1e-6)
-    return np.where(squared > (0.06 * s.motion.forward) ** 2, np.clip(along, 0.0, 1.0), 1.0)
+    return np.where(squared > (0.06 * s.walking.forward) ** 2, np.clip(along, 0.0, 1.0), 1.0)
 
 
 def yaw_rate(s: Step) -> Array:
     """Yaw rate near the reference's."""
     error = (s.yaw_rate - s.reference_yaw_rate) ** 2
-    return 0.5 * _kernel(error, 0.6 * s.motion.turning) + 0.5 * _kernel(error, 0.2 * s.motion.turning)
+    return 0.5 * _kernel(error, 0.6 * s.walking.turning) + 0.5 * _kernel(error, 0.2 * s.walking.turning)
 
 
 def pose(s: Step) -> Array:
@@ -80,7 +80,7 @@ def contact(s: Step) -> Array:
 def clearance(s: Step) -> Array:
     """How far swinging feet are lifted, up to 8 % of the base's height."""
     swing = s.reference_contact < 0.5
-    return (np.clip(s.foot_height / (0.08 * s.motion.height), 0.0, 1.0) * swing).sum(-1)
+    return (np.clip(s.foot_height / (0.08 * s.walking.height), 0.0, 1.0) * swing).sum(-1)
 
 
 def upright(s: Step) -> Array:

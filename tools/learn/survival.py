@@ -72,7 +72,7 @@ def survival_of(
     from servoid.stack.estimation.odometry import load_odometry
 
     fleet = Fleet(robot, worlds, load_odometry(robot), randomise=_RANDOMISED, seed=seed, tag=_MEASURED)
-    cycle, low, high = load_gait().cycle, _LOW * robot.motion.scale, _HIGH * robot.motion.scale
+    cycle, low, high = load_gait().cycle, _LOW * robot.walking.scale, _HIGH * robot.walking.scale
     walker, everything = drive(fleet), np.ones(worlds, bool)
     fleet.reset(everything)
     walker.reset(everything)
@@ -84,7 +84,7 @@ def survival_of(
             command = np.array([rng.uniform(low, high) for rng in fleet.rngs])
         if tick % _PUSH_EVERY == 0 and tick:
             bearing = np.array([rng.uniform(-np.pi, np.pi) for rng in fleet.rngs])
-            fleet.worlds.push(_PUSH * robot.motion.forward * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1))
+            fleet.worlds.push(_PUSH * robot.walking.forward * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1))
         fleet.observe()
         fleet.step(walker.act(command))
         alive &= ~fleet.truth.fallen

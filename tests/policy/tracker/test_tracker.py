@@ -167,7 +167,7 @@ def step(**changes: Any) -> Step:
         "reference_joints": joints,
         "reference_contact": feet + 1.0,
         "fallen": np.zeros(2, bool),
-        "motion": ROBOT.motion,
+        "walking": ROBOT.walking,
         "weight": 30.0,
     }
     return Step(**(values | changes))
@@ -224,7 +224,7 @@ def test_the_nearer_to_the_reference_the_better() -> None:
 
 def test_what_is_far_and_fast_goes_by_the_robots_size() -> None:
     """A robot of twice the speed, height and weight is paid alike for twice the error, step and force."""
-    motion = replace(ROBOT.motion, forward=1.0, turning=2.0, height=0.5)
+    walking = replace(ROBOT.walking, forward=1.0, turning=2.0, height=0.5)
     for name, changes in {
         "velocity": {"velocity": 0.04 * np.ones((2, 2))},
         "yaw_rate": {"yaw_rate": 0.3 * np.ones(2)},
@@ -234,7 +234,7 @@ def test_what_is_far_and_fast_goes_by_the_robots_size() -> None:
         "contact": {"foot_force": 0.9 * np.ones((2, 2))},
     }.items():
         doubled = {key: value if key == "reference_contact" else 2 * value for key, value in changes.items()}
-        larger = step(**doubled, motion=motion, weight=60.0)
+        larger = step(**doubled, walking=walking, weight=60.0)
         np.testing.assert_allclose(TERMS[name](larger), TERMS[name](step(**changes)), err_msg=name)
 
 

@@ -250,7 +250,7 @@ def test_policy_that_always_falls_is_given_up(robot: Robot) -> None:
 
 def test_skills_are_asked_as_fast_as_the_robot_goes(robot: Robot) -> None:
     """A command that no robot of this size can follow would be recorded beside what it did instead."""
-    small = replace(robot, motion=replace(robot.motion, forward=0.2, sideways=0.03))
+    small = replace(robot, walking=replace(robot.walking, forward=0.2, sideways=0.03))
     for ours, theirs in zip(skills_of(robot), skills_of(small), strict=True):
         for box, smaller in zip(ours.boxes, theirs.boxes, strict=True):
             assert smaller.forward == pytest.approx(0.4 * np.array(box.forward))
@@ -278,7 +278,7 @@ def test_noise_rises_to_the_feet_and_pushes_keep_their_pace(robot: Robot) -> Non
     assert lag[slow].mean() > 0.1 > np.abs(lag[white]).mean()
     pushes = np.array([disturbances.push(rngs) for _ in range(ticks)])
     speed = np.linalg.norm(pushes, axis=-1)
-    hardest = settings.push_speed[1] * robot.motion.forward
+    hardest = settings.push_speed[1] * robot.walking.forward
     assert 0.93 * hardest < speed.max() <= hardest
     count = (speed > 0).sum(0)
     assert count.min() >= ticks / 50 / 3 - 1

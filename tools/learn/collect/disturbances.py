@@ -49,7 +49,7 @@ class Disturbances:
 
     def __init__(self, robot: Robot, n: int, settings: DisturbanceSettings) -> None:
         self.settings, self._rate = settings, robot.rate
-        self._speeds = robot.motion.forward * np.array(settings.push_speed)
+        self._speeds = robot.walking.forward * np.array(settings.push_speed)
         self._sizes = joint_noise(robot, settings)
         self._keep = float(np.exp(-robot.dt / settings.slow_seconds))
         self.scale = np.zeros(n)  # of the white noise; 0: a quiet episode

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.robot.description import Motion, Robot
+from servoid.hw.robot.description import Robot, Walking
 
 Range = tuple[float, float]
 
@@ -20,10 +20,10 @@ class Box:
     left: Range = (0.0, 0.0)
     turn: Range = (0.0, 0.0)
 
-    def of(self, motion: Motion) -> Box:
+    def of(self, walking: Walking) -> Box:
         """A box of shares of the robot's top speeds, in m/s and rad/s, as far as the robot goes."""
         shares = np.array([self.forward, self.left, self.turn])
-        asked = np.clip(shares.T * motion.scale, motion.lower, motion.upper).T
+        asked = np.clip(shares.T * walking.scale, walking.lower, walking.upper).T
         return Box(*((float(low), float(high)) for low, high in asked))
 
 
@@ -67,7 +67,7 @@ _SHARES = np.cumsum([skill.weight for skill in SKILLS]) / sum(skill.weight for s
 
 def skills_of(robot: Robot) -> tuple[Skill, ...]:
     """The skills with what this robot is asked, in m/s and rad/s."""
-    return tuple(replace(skill, boxes=tuple(box.of(robot.motion) for box in skill.boxes)) for skill in SKILLS)
+    return tuple(replace(skill, boxes=tuple(box.of(robot.walking) for box in skill.boxes)) for skill in SKILLS)
 
 
 class Commands:

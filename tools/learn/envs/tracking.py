@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.robot.description import Motion, Robot
+from servoid.hw.robot.description import Robot, Walking
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.mlp import Mlp
 from servoid.policy.references.gait import Gait
@@ -32,7 +32,7 @@ class Tracking:
             *[Mirror.PLANAR, Mirror.FLIPPED] * 2, *[Mirror.SCALAR] * 4, joints,
         )  # fmt: skip
         self.ticks = np.zeros(n, int)
-        self._weight = robot.motion.weight or self.fleet.worlds.weight
+        self._weight = robot.weight or self.fleet.worlds.weight
         self.limit = round(settings.episode_seconds / robot.dt)
         self.push_scale = 1.0
         self.terms: dict[str, float] = {}
@@ -64,7 +64,7 @@ class Tracking:
         bodies = worlds.bodies
         privileged = np.concatenate(
             [
-                truth.velocity / self.robot.motion.forward,
+                truth.velocity / self.robot.walking.forward,
                 truth.foot_force * (0.9 / self._weight),
                 truth.foot_velocity.reshape(self.n, -1),
                 self._twist,
@@ -87,14 +87,14 @@ class Tracking:
         command = self.gait.target.copy()
         for i in np.flatnonzero(self.ticks >= self._next_command):
             rng = self.fleet.rngs[i]
-            command[i] = _draw(rng, s, self.robot.motion)
+            command[i] = _draw(rng, s, self.robot.walking)
             self._next_command[i] = self.ticks[i] + round(rng.uniform(*s.command_every) * rate)
         self.gait.command(command)
         push = np.zeros((self.n, 2))
         for i in np.flatnonzero(self.ticks >= self._next_push):
             rng = self.fleet.rngs[i]
             size, angle = (
-                rng.uniform(0, s.hardest_push * self.push_scale * self.robot.motion.forward),
+                rng.uniform(0, s.hardest_push * self.push_scale * self.robot.walking.forward),
                 rng.uniform(-np.pi, np.pi),
             )
             push[i] = size * np.cos(angle), size * np.sin(angle)
@@ -149,7 +149,7 @@ class Tracking:
             reference_joints=reference,
             reference_contact=contact,
             fallen=fallen,
-            motion=self.robot.motion,
+            walking=self.robot.walking,
             weight=self._weight,
         )
         reward, self.terms = total(step, self.settings.rewards)
@@ -163,10 +163,10 @@ class Tracking:
         return reward * self.robot.dt, done, late
 
 
-def _draw(rng: np.random.Generator, s: ExpertSettings, motion: Motion) -> Array:
+def _draw(rng: np.random.Generator, s: ExpertSettings, walking: Walking) -> Array:
     """A command `(3,)`: standing, straight ahead, along one other axis, backward, or any mixture."""
-    command = rng.uniform(motion.lower, motion.upper)
-    slowest, fastest = -motion.backward, motion.forward
+    command = rng.uniform(walking.lower, walking.upper)
+    slowest, fastest = -walking.backward, walking.forward
     kind = rng.random()
     shares = np.cumsum([s.stand, s.forward, s.single, s.backward])
     if kind < shares[0]:
