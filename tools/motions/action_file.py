@@ -114,9 +114,9 @@ def joint_goals(pages: list[Page], robot: Robot, start: Array) -> Array:
     goals, at = [], here
     for step, _ in steps:
         at = at.copy()
-        for id, ticks in step.goals.items():
+        for id, encoder in step.goals.items():
             if id in ids:
-                at[ids[id]] = (ticks - _CENTRE) * 2 * np.pi / _TURN
+                at[ids[id]] = (encoder - _CENTRE) * 2 * np.pi / _TURN
         goals.append(at)
     for i, (step, acceleration) in enumerate(steps):
         way = goals[i] - here
@@ -142,12 +142,12 @@ def _trapezoid(way: Array, before: Array, passes: Array, time: int, part: int) -
     """
     if time == 0:
         return np.zeros((0, len(way))), np.zeros_like(way)
-    end = np.where(passes, 0.0, part)
+    end: Array = np.where(passes, 0.0, float(part))
     kept = (way - before * part / 2) / np.maximum(time - part / 2 - end / 2, 1e-9)
     t = np.arange(1, time + 1)[:, None].astype(float)
     rising = np.minimum(t, part)
     path = before * rising + (kept - before) * rising**2 / (2 * max(part, 1))
     path = path + kept * np.clip(t - part, 0.0, time - part - end)
-    falling = np.clip(t - (time - end), 0.0, None)
-    path = path + kept * (falling - falling**2 / (2 * np.maximum(end, 1)))
+    falling = np.maximum(t - (time - end), 0.0)
+    path = path + kept * (falling - falling**2 / (2 * np.maximum(end, 1.0)))
     return path, kept
