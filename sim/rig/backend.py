@@ -19,7 +19,7 @@ from servoid.hw.dynamixel.backend import DynamixelBackend
 from servoid.hw.dynamixel.motors import DynamixelMotors
 from servoid.hw.dynamixel.sensors import DynamixelSensors
 from servoid.hw.robot.description import Robot
-from servoid.sim.rig.control import Control, LockedClock, RigProcess, RigTruth
+from servoid.sim.rig.process.control import Control, LockedClock, RigProcess, RigTruth
 from servoid.sim.scene import Stage
 
 

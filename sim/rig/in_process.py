@@ -19,7 +19,7 @@ from servoid.sim.rig.rig import Rig
 _TOGETHER_NS = 80_000_000  # after which ticks of 20 ms and batches of 16 ms begin together again
 
 
-class LocalLine:
+class InProcessLine:
     """The rig's line as a Port, and its time as a Clock, which sleeping lets pass.
 
     A port that vanished or an adapter that takes nothing more fails as a real one does on Linux.
@@ -67,7 +67,7 @@ class LocalLine:
             raise BackendError(f"{self.name}: the port is gone")
 
 
-class LocalBackend:
+class InProcessBackend:
     """The hardware backend on `rig`, reset to the robot, the noise and the dice of a seed, without faults.
 
     The truth is the rig's own.
@@ -81,7 +81,7 @@ class LocalBackend:
         rig.advance(-(-rig.now_ns // _TOGETHER_NS) * _TOGETHER_NS)
         rig.scenario = Scenario(seed=seed)
         rig.reset(seed)
-        self._line = LocalLine(rig)
+        self._line = InProcessLine(rig)
         self.clock: Clock = self._line
         self._body = DynamixelBackend(on_the_board(rig.robot), port=self._line, clock=self._line, name=self.name)
 

@@ -28,9 +28,9 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Plan, PlanRequest, State
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import read_header, resolve
-from servoid.policy.diffusion.actions import JOINT_TARGETS, ActionSpace, load_action_space
-from servoid.policy.diffusion.config import check_fit
 from servoid.policy.diffusion.features import raw_row
+from servoid.policy.diffusion.model.action_space import JOINT_TARGETS, ActionSpace, load_action_space
+from servoid.policy.diffusion.model.config import check_fit
 from servoid.policy.diffusion.settings import DiffusionSettings, load_settings
 from servoid.stack.control.planner import Answer, InlinePlanner, Planner, ProcessPlanner
 from servoid.stack.control.trim import Trim
@@ -246,7 +246,7 @@ def _build(robot: Robot, settings: DiffusionSettings, cost: Cost | None) -> Answ
 
 def _plan(runtime: Runtime, request: PlanRequest, seed: int) -> Plan:
     """The plan of a request, or why there is none."""
-    from servoid.policy.diffusion.sampler import Diverged
+    from servoid.policy.diffusion.guidance import Diverged
 
     try:
         return runtime.plan(request, seed)

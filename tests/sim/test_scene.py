@@ -18,7 +18,7 @@ from servoid.hw.robot.description import Robot, load_robot
 from servoid.sim.backend import SimBackend
 from servoid.sim.model import build
 from servoid.sim.render import Frame, render
-from servoid.sim.rig.plant import Plant
+from servoid.sim.rig.servo.plant import Plant
 from servoid.sim.scene import from_plain, plain, robot_bodies
 
 NOTHING = np.zeros((0, 3)), np.zeros((0, 4))

@@ -37,13 +37,13 @@ def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         robot = load_robot(args.robot)
         id, baud, model = _wanted(args, robot)
-        delivery = None
+        factory_state = None
         if is_virtual(args):
-            from servoid.sim.rig.factory_state import Delivery
+            from servoid.sim.rig.factory_state import FactoryState
 
             alone = (args.joint or robot.joints[0].name,)
-            delivery = Delivery(fresh=alone, only=alone)
-        with open_line(args, robot, delivery=delivery) as line:
+            factory_state = FactoryState(fresh=alone, only=alone)
+        with open_line(args, robot, factory_state=factory_state) as line:
             device = find_one(line.bus, robot, baud, report)
             if model is not None and device.model != model:
                 wanted = robot.servos[robot.names.index(args.joint)].name

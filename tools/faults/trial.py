@@ -16,7 +16,7 @@ import numpy as np
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.sim.rig.faults import EXPECTED, KINDS, NEEDS_SERVO, STATUS_KINDS, Outcome
-from servoid.sim.rig.in_process import LocalBackend
+from servoid.sim.rig.in_process import InProcessBackend
 from servoid.sim.rig.rig import Rig
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import Settings, run
@@ -65,7 +65,7 @@ class Verdict:
     said: str = ""  # what named it
 
 
-class Witnessed(LocalBackend):
+class Witnessed(InProcessBackend):
     """A virtual robot that is looked at once more, by the rig's own account, before it is let go.
 
     `powered` are the joints that are still driven then, and `later` those that are once the watchdog has had its time.
@@ -82,7 +82,7 @@ class Witnessed(LocalBackend):
     @property
     def struck(self) -> int:
         """How often faults did strike."""
-        return sum(self.rig.dice.struck.values())
+        return sum(self.rig.injector.struck.values())
 
     def close(self) -> None:
         if not self._ended:

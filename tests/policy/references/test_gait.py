@@ -12,7 +12,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.legs import LegInverse, Legs
 from servoid.policy.references.gait import Gait, GaitSettings, GyroFeedback, load_gait
-from servoid.tools.learn.envs.fleet import Fleet
+from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.envs.walker import Walker
 
 ROBOT, SETTINGS = load_robot(), load_gait()

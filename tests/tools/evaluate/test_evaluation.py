@@ -111,7 +111,7 @@ def test_quick_cuts_the_longest_episodes_and_does_not_mistake_them_for_whole_one
     "name",
     [
         "hw/robot/legs.py",
-        "sim/rig/servo.py",
+        "sim/rig/servo/virtual_servo.py",
         "policy/diffusion/sampler.py",
         "stack/control/trim.py",
         "configs/servos/xm430-w350.yaml",

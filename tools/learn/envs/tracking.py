@@ -11,7 +11,7 @@ from servoid.policy.mlp import Mlp
 from servoid.policy.references.gait import Gait, load_gait
 from servoid.policy.tracker.observation import AHEAD, RESIDUAL, TrackerObservation
 from servoid.policy.tracker.rewards import Step, total
-from servoid.tools.learn.envs.fleet import Fleet
+from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.settings import ExpertSettings
 
 _MIXED_SPEED = 0.35  # m/s

@@ -9,7 +9,7 @@ from servoid.policy.checkpoint import resolve
 from servoid.policy.mlp import Mlp
 from servoid.policy.references.gait import Gait, GyroFeedback, load_gait
 from servoid.policy.tracker.observation import AHEAD, RESIDUAL, TrackerObservation
-from servoid.tools.learn.envs.fleet import Fleet
+from servoid.stack.control.fleet import Fleet
 
 
 class Walker:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     import torch
 
     from servoid.hw.robot.description import Robot
-    from servoid.policy.diffusion.config import DenoiserConfig
     from servoid.policy.diffusion.dataset import Windows
+    from servoid.policy.diffusion.model.config import DenoiserConfig
 
 MEANS = ("loss", "state_loss", "action_loss", "learning_rate", "tokens_per_s")
 OBJECTIVE = ("near_actions", "far_actions", "min_snr", "action_rate", "monotone", "forcing")
@@ -44,7 +44,7 @@ class Settings:
     evaluate_every: float = 5.0
     seed: int = 0
     precision: str = "bf16"
-    near_actions: int = 8  # this and the rest: see `servoid.policy.diffusion.training.Objective`
+    near_actions: int = 8  # this and the rest: see `servoid.policy.diffusion.objective.Objective`
     far_actions: float = 0.2
     min_snr: float = 0.0
     action_rate: float = 0.0
@@ -99,10 +99,10 @@ def main(args: argparse.Namespace) -> int:
     import torch
 
     from servoid.hw.robot.description import load_robot
-    from servoid.policy.diffusion.config import DenoiserConfig
     from servoid.policy.diffusion.dataset import Windows, read_recording
     from servoid.policy.diffusion.features import token_layout
-    from servoid.policy.diffusion.training import Objective
+    from servoid.policy.diffusion.model.config import DenoiserConfig
+    from servoid.policy.diffusion.objective import Objective
     from servoid.policy.latent.actions import load_latents
     from servoid.policy.text.encoder import load_encoder
 
@@ -177,9 +177,9 @@ class Trainer(TimedTrainer):
     ) -> None:
         import torch
 
-        from servoid.policy.diffusion.denoiser import Denoiser
+        from servoid.policy.diffusion.model.denoiser import Denoiser
+        from servoid.policy.diffusion.objective import Average, Objective
         from servoid.policy.diffusion.schedule import cosine_signal
-        from servoid.policy.diffusion.training import Average, Objective
 
         super().__init__(out, settings, survival)
         self.objective = Objective(**{name: getattr(settings, name) for name in OBJECTIVE})
@@ -197,7 +197,7 @@ class Trainer(TimedTrainer):
 
     def begin_from(self, path: Path) -> None:
         """Take weights and normalisation of a checkpoint, to go on with other data. Raises ConfigError."""
-        from servoid.policy.diffusion.checkpoint import load
+        from servoid.policy.diffusion.model.checkpoint import load
         from servoid.policy.latent.actions import same_latents
         from servoid.stack.log.provenance import sha256
 
@@ -242,7 +242,7 @@ class Trainer(TimedTrainer):
     def _step(self) -> tuple[float, float]:
         import torch
 
-        from servoid.policy.diffusion.training import losses
+        from servoid.policy.diffusion.objective import losses
 
         settings = self.settings
         warm = min(1.0, (self.step + 1) / settings.warmup_steps)
@@ -271,8 +271,8 @@ class Trainer(TimedTrainer):
         """Action loss of the averaged network on held-out windows, the same noise every time."""
         import torch
 
-        from servoid.policy.diffusion.denoiser import Denoiser
-        from servoid.policy.diffusion.training import Objective, losses
+        from servoid.policy.diffusion.model.denoiser import Denoiser
+        from servoid.policy.diffusion.objective import Objective, losses
 
         network = Denoiser(self.config).eval()
         network.load_state_dict(self.average.weights)
@@ -284,7 +284,7 @@ class Trainer(TimedTrainer):
             return losses(network, *given, objective)[1].item()
 
     def _ship(self, path: Path, results: Mapping[str, float]) -> None:
-        from servoid.policy.diffusion import checkpoint
+        from servoid.policy.diffusion.model import checkpoint
 
         checkpoint.save(
             path,

@@ -15,8 +15,8 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 
 if TYPE_CHECKING:
+    from servoid.stack.control.fleet import Fleet
     from servoid.tools.learn.collect.episode_cutter import Driver
-    from servoid.tools.learn.envs.fleet import Fleet
 
     MakeDriver = Callable[[Fleet], Driver]
 
@@ -132,7 +132,7 @@ def record(
     """Walk randomised worlds; returns rows `(n, ticks, features)`, starts `(n, ticks)` and errors `(n, ticks, 3)`."""
     from tqdm import trange
 
-    from servoid.tools.learn.envs.fleet import Fleet
+    from servoid.stack.control.fleet import Fleet
 
     fleet = Fleet(robot, worlds, odometry, randomise=0.7, seed=seed + 1000)
     walker = drive(fleet)
@@ -239,7 +239,7 @@ def drift(
     gait's sway would add to it, up to its double.
     """
     from servoid.policy.references.gait import load_gait
-    from servoid.tools.learn.envs.fleet import Fleet
+    from servoid.stack.control.fleet import Fleet
 
     fleet = Fleet(robot, walks, odometry, randomise=randomise, seed=seed)
     walker = drive(fleet)

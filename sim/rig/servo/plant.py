@@ -1,8 +1,9 @@
 """The body that a virtual rig's motors move: the simulated backend's model, driven by voltages and read by encoders.
 
-The motor is the actuator of `sim/model.py`. Its controller makes a voltage of `gain * (control - angle)`; here the gain
-is one volt a radian and the control is `angle + voltage`, so that firmware of any operating mode can drive the very same
-motor: in position mode with a P gain alone, the torque is that of the simulated backend to the last bit but rounding.
+The motor is the actuator of `sim/model.py`. Its controller makes a voltage of `gain * (control - angle)`; here the
+gain is one volt a radian and the control is `angle + voltage`, so that firmware of any operating mode can drive the
+very same motor: in position mode with a P gain alone, the torque is that of the simulated backend to the last bit but
+rounding.
 """
 
 from __future__ import annotations
