@@ -8,7 +8,6 @@ from __future__ import annotations
 import typing
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache
 from typing import Any
 
 Range = tuple[float, float]  # low, high
@@ -89,8 +88,7 @@ def as_typed(value: Any) -> str:
     return "none" if value is None else f"{value:g}" if isinstance(value, (int, float)) else str(value)
 
 
-@cache
-def _described(cls: type[Any]) -> tuple[tuple[str, Setting, bool], ...]:
+def _described(cls: Any) -> tuple[tuple[str, Setting, bool], ...]:
     """Name and setting of each field that has one, and whether its value is a range."""
     hints = typing.get_type_hints(cls, include_extras=True)
     found = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -72,16 +73,6 @@ class Instruction:
     ground: Array | None = None  # (2,) m/s over the ground in the heading frame, where the task asks for one
 
 
-class Policy(Protocol):
-    """A controller. `applied` is what the guard really sent last, so that a policy never believes its own wishes."""
-
-    def reset(self, seed: int) -> None: ...
-
-    def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
-        """Joint targets `(..., n_joints)` rad for the next tick."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
     """What a planner is asked at `tick`: the newest `history` of features and the actions that run meanwhile."""
@@ -107,3 +98,43 @@ class Plan:
     path: Array  # (horizon, 2) m: predicted displacement in the heading frame of `tick`, to be drawn and logged
     seconds: float  # how long planning took
     error: str = ""  # why there is no plan, where there is none: its arrays are NaN then
+
+
+@dataclass(frozen=True, slots=True)
+class Adopted:
+    """A plan at the tick of its adoption; ticks count calls of the policy in this run."""
+
+    requested: int
+    adopted: int
+    plan: Plan
+
+
+class Policy(Protocol):
+    """A controller. `stack.control.base.BasePolicy` answers all but `act` for one that neither plans nor holds
+    anything."""
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode, whose random numbers all come from `seed`."""
+        ...
+
+    def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
+        """Joint targets `(..., n_joints)` rad for the next tick. `applied` is what the guard really sent last, so that
+        a policy never believes its own wishes. Whatever it raises ends the run safely."""
+        ...
+
+    @property
+    def adopted(self) -> Adopted | None:
+        """The plan that was taken over in the last call of `act`; None where that took over none."""
+        ...
+
+    def take_events(self) -> tuple[str, ...]:
+        """What a person should know of, since the last call."""
+        ...
+
+    def repeat(self, plans: Mapping[int, int]) -> None:
+        """Take over the plans of a recorded run and no others: ticks of their requests, and of their adoption."""
+        ...
+
+    def close(self) -> None:
+        """Let go of processes and devices."""
+        ...

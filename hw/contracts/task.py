@@ -119,3 +119,17 @@ class Task(Protocol):
     def success(self, trace: Trace, episode: Any) -> bool: ...
 
     def metrics(self, trace: Trace, episode: Any) -> dict[str, float]: ...
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """A task and the episode of it that a run does, and is judged by."""
+
+    task: Task
+    episode: Episode
+
+    def success(self, trace: Trace) -> bool:
+        return self.task.success(trace, self.episode)
+
+    def metrics(self, trace: Trace) -> dict[str, float]:
+        return self.task.metrics(trace, self.episode)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 from servoid.hw.clock import WallClock
+from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import BackendError, Clock
 from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY, Bus, Counters
 from servoid.hw.dynamixel.guardian_client import Lifeline
@@ -43,6 +44,7 @@ class DynamixelBackend:
     ) -> None:
         self.name = name
         self.clock: Clock = clock or WallClock()
+        self.simulation: Simulation | None = None  # it moves metal
         self.differences: tuple[Difference, ...] = ()
         self._robot, self._given, self._fix, self._exact, self._open = robot, port, fix, exact, opener
         self._port: Port | None = None

@@ -6,8 +6,8 @@ between are left out. It is several times quicker, for runs by the hundred.
 
 from __future__ import annotations
 
+from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array, BackendError, Clock
-from servoid.hw.contracts.world import Truth
 from servoid.hw.dynamixel.backend import DynamixelBackend
 from servoid.hw.dynamixel.motors import DynamixelMotors
 from servoid.hw.dynamixel.sensors import DynamixelSensors
@@ -83,11 +83,8 @@ class InProcessBackend:
         rig.reset(seed)
         self._line = InProcessLine(rig)
         self.clock: Clock = self._line
+        self.simulation = Simulation(rig.plant.truth, self.push)
         self._body = DynamixelBackend(on_the_board(rig.robot), port=self._line, clock=self._line, name=self.name)
-
-    @property
-    def truth(self) -> Truth:
-        return self.rig.plant.truth
 
     def connect(self) -> tuple[DynamixelSensors, DynamixelMotors]:
         """Find the servos, and wait for a step of physics that ticks may begin on. Raises BackendError."""

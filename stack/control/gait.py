@@ -9,11 +9,12 @@ from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Task
 from servoid.hw.robot.description import Robot
 from servoid.policy.references.gait import Gait, GyroFeedback, load_gait
+from servoid.stack.control.base import BasePolicy
 
 _NOW = np.array([0])
 
 
-class GaitPolicy:
+class GaitPolicy(BasePolicy):
     def __init__(self, robot: Robot, task: Task, realtime: bool) -> None:
         del task, realtime  # a gait needs neither
         settings = load_gait()

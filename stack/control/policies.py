@@ -81,7 +81,8 @@ def make_policy(name: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     """A policy for a robot and a task. Raises ConfigError for an unknown name, or for a checkpoint that does not fit.
 
     `name` is one of POLICIES, the .safetensors file of a diffusion model or a tracker, a .yaml file of diffusion
-    settings, an installed package's, or `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is for.
+    settings, an installed package's, or `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it
+    answers at the tick that its plan is for.
     """
     return _maker(name)(name, robot, task, realtime)
 

@@ -10,9 +10,10 @@ from servoid.policy.checkpoint import resolve
 from servoid.policy.mlp import Mlp
 from servoid.policy.references.gait import Gait, load_gait
 from servoid.policy.tracker.observation import AHEAD, RESIDUAL, TrackerObservation
+from servoid.stack.control.base import BasePolicy
 
 
-class ExpertPolicy:
+class ExpertPolicy(BasePolicy):
     """Raises CheckpointError when the tracker of `checkpoint` does not fit the robot."""
 
     def __init__(self, robot: Robot, task: Task, realtime: bool, checkpoint: str = "expert") -> None:

@@ -10,11 +10,11 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array, Observation
 from servoid.hw.contracts.control import Instruction, Policy, State
-from servoid.hw.contracts.task import Task, Trace
+from servoid.hw.contracts.task import Assignment, Behaviour, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot
 from servoid.stack.estimation.sample_hold import missing
-from servoid.stack.log.tick import Adopted, Proposal
+from servoid.stack.log.tick import Proposal
 from servoid.stack.log.trace_buffer import Tape
 from servoid.stack.runtime.loop import Estimator
 from servoid.stack.safety.guard import Guard, Phase
@@ -28,7 +28,7 @@ SETTLE_SECONDS = 1.5  # standing still at home, in which the estimator learns th
 class Director:
     """Pilot of a run. `push` changes the body's velocity, m/s `(2,)`; None where a body cannot be pushed.
 
-    `look` sees what is around the robot (`world.Surroundings`); without it the task says what should be there.
+    `look` sees what is around the robot (`world.Surroundings`); without it the behaviour says what should be there.
     """
 
     def __init__(
@@ -36,17 +36,19 @@ class Director:
         robot: Robot,
         guard: Guard,
         estimator: Estimator,
-        task: Task,
+        assignment: Assignment,
+        behaviour: Behaviour,
         policy: Policy,
         push: Callable[[Array], None] | None = None,
         look: Callable[[State], Percept] | None = None,
     ) -> None:
-        self._robot, self._guard, self._estimator, self._task, self._policy = robot, guard, estimator, task, policy
+        self._robot, self._guard, self._estimator, self._policy = robot, guard, estimator, policy
+        self._behaviour, self._seconds = behaviour, assignment.task.seconds
+        self._pushes = assignment.episode.pushes
         self._push = push
-        self._look = task.percept if look is None else look
+        self._look = behaviour.percept if look is None else look
         self._settled = 0
-        self._plans = 0  # adopted so far
-        self._tape = Tape(len(robot.joints), round(task.seconds / robot.dt))
+        self._tape = Tape(len(robot.joints), round(self._seconds / robot.dt))
         self.ended: str | None = None  # "done" or "time", if the task ended by itself
 
     @property
@@ -85,14 +87,14 @@ class Director:
     def _do_task(self, state: State) -> Proposal:
         tick = self.task_ticks
         percept = self._look(state)
-        instruction = self._task.instruct(tick, state, percept)
+        instruction = self._behaviour.instruct(tick, state, percept)
         self._tape.add(state, instruction, percept)
         shown = Proposal(instruction=instruction, percept=percept)
-        if self._task.done(state):
+        if self._behaviour.done(state):
             return self._end("done", DONE, shown, state)
-        if tick * self._robot.dt >= self._task.seconds:
-            return self._end("time", f"{self._task.seconds:g} s are over", shown, state)
-        velocity = self._task.disturbance(tick)
+        if tick * self._robot.dt >= self._seconds:
+            return self._end("time", f"{self._seconds:g} s are over", shown, state)
+        velocity = self._pushes.get(tick)
         if velocity is not None and self._push is not None:
             self._push(velocity)
         try:
@@ -101,7 +103,7 @@ class Director:
             self._guard.give_up(_failed(error))
             return shown
         self._tell()
-        return Proposal(target, instruction, percept, self._adopted())
+        return Proposal(target, instruction, percept, self._policy.adopted)
 
     def _come_to_rest(self, state: State) -> Proposal:
         """Ask the policy to stand."""
@@ -111,20 +113,12 @@ class Director:
             self._guard.give_up(_failed(error))
             return Proposal()
         self._tell()
-        return Proposal(target, plan=self._adopted())
+        return Proposal(target, plan=self._policy.adopted)
 
     def _tell(self) -> None:
         """What the policy wants a person to know, as events."""
-        for text in self._policy.take_events() if hasattr(self._policy, "take_events") else ():
+        for text in self._policy.take_events():
             self._guard.note("plan", text)
-
-    def _adopted(self) -> Adopted | None:
-        """The plan that a planning policy took over at this tick."""
-        adopted: list[tuple[int, int]] = getattr(self._policy, "adopted", [])
-        if len(adopted) <= self._plans:
-            return None
-        self._plans = len(adopted)
-        return Adopted(*adopted[-1], self._policy.latest_plan)  # type: ignore[attr-defined]
 
     def _end(self, how: str, text: str, shown: Proposal, state: State) -> Proposal:
         """End the task. The policy is asked at this tick too: a walking robot has no time for a tick without."""

@@ -7,15 +7,15 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from servoid.hw.config import ConfigError
-from servoid.hw.contracts.body import Array, Backend
+from servoid.hw.contracts.backend import Backend
+from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Policy
-from servoid.hw.contracts.task import Task, Trace
-from servoid.hw.contracts.world import Scene, Surroundings
+from servoid.hw.contracts.task import Assignment, Task, Trace
 from servoid.hw.robot.calibration import calibrated
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.stack.control.policies import make_policy, policy_fingerprint
@@ -26,19 +26,20 @@ from servoid.stack.runtime.backends import backend_kind, make_backend
 from servoid.stack.runtime.clock import RealTime, Schedule, WallClock
 from servoid.stack.runtime.interrupt import Interrupt, Stops
 from servoid.stack.runtime.loop import Loop
-from servoid.stack.runtime.multi_robot import Others, OtherTask
+from servoid.stack.runtime.multi_robot import Others
 from servoid.stack.runtime.phases import Director
 from servoid.stack.runtime.realtime import steady
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Guard, Phase
-from servoid.stack.tasks import load_task
+from servoid.stack.tasks import load_task, source
+from servoid.stack.tasks.steer import SteeredAgain
 
 MAX_GAIN = 2.0  # times the firmware's configured gain; above, a servo of this class rings
 TASK_STREAM = 1  # distinguishes the task's random stream from others of the same seed
 
 
 @dataclass(frozen=True)
-class Settings:
+class RunSettings:
     """What to run. `set` overrides the task's settings by name; `gain` in it scales the servos' position gain."""
 
     task: str
@@ -92,7 +93,7 @@ class Result:
 
 
 def run(
-    settings: Settings,
+    settings: RunSettings,
     *,
     backend: Backend | None = None,
     on_tick: Listener | None = None,
@@ -102,15 +103,15 @@ def run(
 ) -> Result:
     """Do one run and return how it went, the robot with torque off.
 
-    `backend` and `policy` replace those that the settings name; a backend that has a `truth` is a simulation, which
-    starts itself and need not keep to real time. `on_tick` is called after each tick and must be quick.
-    `confirm` asks the person at a real robot, and returns when it may move. `script` repeats a recorded run. Raises
-    ConfigError before anything is connected, BackendError when the body cannot be reached.
+    `backend` and `policy` replace those that the settings name; a backend that offers a `simulation` starts itself and
+    need not keep to real time. `on_tick` is called after each tick and must be quick. `confirm` asks the person
+    at a real robot, and returns when it may move. `script` repeats a recorded run. Raises ConfigError before anything
+    is connected, BackendError when the body cannot be reached.
     """
     script = script or Script()
     robot = load_robot(settings.robot)
     task, gain = _task(settings, robot)
-    simulated = backend_kind(settings.backend).simulated if backend is None else hasattr(backend, "truth")
+    simulated = backend_kind(settings.backend).simulated if backend is None else backend.simulation is not None
     realtime = not simulated if settings.realtime is None else settings.realtime
     if not (simulated or settings.start or confirm):
         raise ConfigError(
@@ -121,9 +122,8 @@ def run(
         from servoid.stack.log.recorder import Recorder, check_new
 
         check_new(settings.record)
-    if script.velocities is not None and hasattr(task, "steer_by"):
-        task.steer_by(script.velocities, script.ended)
-    scene = start_task(task, settings.seed)
+    assignment = draw(task, settings.seed)
+    scene = assignment.episode.scene
     assembled, assembly = (robot, None) if simulated or backend is not None else calibrated(robot)
     body = backend or make_backend(
         settings.backend,
@@ -133,26 +133,30 @@ def run(
         port=settings.port,
         scene=scene,
     )
-    if scene is not None and simulated and getattr(body, "stage", None) is None:
+    surroundings = None if body.simulation is None else body.simulation.surroundings
+    if scene is not None and simulated and surroundings is None:
         raise ConfigError(
             f"task '{task.name}' has a scene: make the backend with it (servoid.stack.runtime.run.prepare does)"
         )
-    tasks: tuple[OtherTask, ...] = getattr(task, "others", ())
-    if tasks and policy is not None:
-        raise ConfigError(f"task '{task.name}' has {len(tasks) + 1} robots, each with its own policy: name one instead")
+    if scene is not None and scene.robots is not None and policy is not None:
+        robots = len(scene.robots) + 1
+        raise ConfigError(f"task '{task.name}' has {robots} robots, each with its own policy: name one instead")
     with ExitStack() as stack:
-        if hasattr(task, "close"):
-            stack.callback(task.close)
+        behaviour = (
+            SteeredAgain(script.velocities, script.ended)
+            if task.steered and script.velocities is not None
+            else task.behaviour(assignment.episode)
+        )
+        stack.callback(behaviour.close)
         interrupt = stack.enter_context(Interrupt(eager=True))
         pilot = make_policy(settings.policy, robot, task, realtime) if policy is None else policy
-        if script.plans is not None and hasattr(pilot, "only"):
-            pilot.only = script.plans
-        if hasattr(pilot, "close"):
-            stack.callback(pilot.close)
+        stack.callback(pilot.close)
+        if script.plans is not None:
+            pilot.repeat(script.plans)
         stack.callback(body.close)
         stack.callback(setattr, interrupt, "eager", False)  # a second Ctrl-C must not break off the closing
-        push = getattr(body, "push", None)
-        if push is None and _pushes(task):
+        push = None if body.simulation is None else body.simulation.push
+        if push is None and assignment.episode.pushes:
             raise ConfigError(f"backend '{body.name}' cannot push the robot: drop the task's push setting")
         pilot.reset(settings.seed)
         sensors, motors = body.connect()
@@ -166,18 +170,20 @@ def run(
         if assembly is not None:
             guard.note("system", assembly)
         estimator = Estimator(robot, odometry)
-        look = None if scene is None or not simulated else cast(Surroundings, body).look
-        director = Director(robot, guard, estimator, task, pilot, push, look)
+        look = None if surroundings is None else surroundings.look
+        director = Director(robot, guard, estimator, assignment, behaviour, pilot, push, look)
         tally = _Tally()
         listeners: list[Listener] = [tally]
         others = None
-        if tasks:
+        time = body.clock
+        if behaviour.teammates and body.simulation is not None:
             # Their planners never run beside the loop: the log, which is the first robot's, has to repeat them.
-            others = Others(
+            time = others = Others(
                 robot,
                 body,
-                tasks,
-                lambda its: make_policy(settings.policy, robot, its, realtime=False),
+                assignment,
+                behaviour.teammates,
+                lambda: make_policy(settings.policy, robot, task, realtime=False),
                 guard,
                 interrupt,
                 settings.seed,
@@ -194,7 +200,8 @@ def run(
                 header(
                     settings,
                     robot,
-                    task,
+                    assignment,
+                    source(settings.task),
                     body.name,
                     policy_fingerprint(settings.policy) if policy is None else {"name": type(policy).__qualname__},
                 ),
@@ -205,7 +212,7 @@ def run(
             listeners.append(on_tick)
         if realtime:
             stack.enter_context(steady(not simulated, lambda text: guard.note("system", text)))
-        clock = RealTime(body.clock) if realtime and not isinstance(body.clock, WallClock) else body.clock
+        clock = RealTime(time) if realtime and not isinstance(time, WallClock) else time
         requests = Stops(interrupt, lambda: recorder.error if recorder is not None else None, script.stops)
         loop = Loop(
             sensors, estimator, director, guard, Schedule(clock, robot.rate), interrupt, requests, tuple(listeners)
@@ -221,7 +228,7 @@ def run(
             raise
         last = guard.events()
         tally.events += last
-        result = replace(tally.result(director, guard, task, settings), interrupted=interrupt.count > 0)
+        result = replace(tally.result(director, guard, assignment, settings), interrupted=interrupt.count > 0)
         if recorder is not None:
             recorder.events(last)
             recorder.close(result.summary())
@@ -229,32 +236,31 @@ def run(
         return result
 
 
-def prepare(settings: Settings) -> tuple[Task, Backend]:
+def prepare(settings: RunSettings) -> tuple[Assignment, Backend]:
     """The task of a run, its episode drawn, and the simulated body with its scene, for `run` and for judging it.
 
     Raises ConfigError like `run`.
     """
     robot = load_robot(settings.robot)
     task, _ = _task(settings, robot)
-    scene = start_task(task, settings.seed)
+    assignment = draw(task, settings.seed)
     body = make_backend(
         settings.backend,
         robot,
         seed=settings.seed,
         randomise=settings.randomise,
         port=settings.port,
-        scene=scene,
+        scene=assignment.episode.scene,
     )
-    return task, body
+    return assignment, body
 
 
-def start_task(task: Task, seed: int) -> Scene | None:
-    """Draw the episode that a run with this seed does; its scene."""
-    task.reset(np.random.default_rng([seed, TASK_STREAM]))
-    return task.scene()
+def draw(task: Task, seed: int) -> Assignment:
+    """The episode that a run with this seed does."""
+    return Assignment(task, task.scenario(np.random.default_rng([seed, TASK_STREAM])))
 
 
-def _task(settings: Settings, robot: Robot) -> tuple[Task, float]:
+def _task(settings: RunSettings, robot: Robot) -> tuple[Task, float]:
     values = dict(settings.set)
     text = values.pop("gain", "1")
     try:
@@ -276,10 +282,6 @@ def _with_failure(result: Result, error: str | None) -> Result:
     return replace(result, events=(*result.events, Event(last.tick, last.time, "record", None, error)))
 
 
-def _pushes(task: Task) -> bool:
-    return bool(np.any(getattr(getattr(task, "settings", None), "push", 0.0)))
-
-
 class _Tally:
     """Counts while a run goes on."""
 
@@ -294,9 +296,9 @@ class _Tally:
             self._late.append(record.timing.late)
             self._missed += record.timing.missed
 
-    def result(self, director: Director, guard: Guard, task: Task, settings: Settings) -> Result:
+    def result(self, director: Director, guard: Guard, assignment: Assignment, settings: RunSettings) -> Result:
         trace = director.trace()
-        success = bool(director.ended is not None and task.success(trace))
+        success = bool(director.ended is not None and assignment.success(trace))
         late = np.array(self._late or [0], dtype=float) * 1e-6
         return Result(
             outcome=_outcome(director, guard, success, trace),
@@ -306,7 +308,7 @@ class _Tally:
             missed=self._missed,
             late_p50_ms=float(np.percentile(late, 50)),
             late_p99_ms=float(np.percentile(late, 99)),
-            metrics=task.metrics(trace) if director.task_ticks else {},
+            metrics=assignment.metrics(trace) if director.task_ticks else {},
             events=tuple(self.events),
             trace=trace,
             log=settings.record,

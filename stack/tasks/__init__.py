@@ -74,6 +74,12 @@ def find(name: str) -> Known:
     return Known(str(own["name"]), plugin.cls, str(own["description"]), plugin)
 
 
+def source(name: str) -> dict[str, Any] | None:
+    """Where a task of a user's own came from, for the flight log; None for one of Servoid's. Raises ConfigError."""
+    known = find(name)
+    return None if known.plugin is None else known.plugin.source()
+
+
 def load_settings(name: str, settings: dict[str, str] | None = None) -> Any:
     """A task's settings, from its file or its class, with those changed that `--set key=value` gives as text.
 
@@ -103,4 +109,4 @@ def load_task(name: str, settings: dict[str, str] | None = None, dt: float = 0.0
     return task
 
 
-__all__ = ["BaseBehaviour", "BaseTask", "Known", "Settings", "find", "load_settings", "load_task", "names"]
+__all__ = ["BaseBehaviour", "BaseTask", "Known", "Settings", "find", "load_settings", "load_task", "names", "source"]

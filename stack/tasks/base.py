@@ -18,7 +18,7 @@ from servoid.stack.tasks.guidance import Weights, total_cost
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of every task; `servoid tasks` shows what is said beside them. Raises ValueError outside their ranges."""
+    """Settings of every task; `servoid tasks` shows what is said beside them. Raises ValueError outside a range."""
 
     seconds: Annotated[float, Setting("length of an episode", "s", above=0)] = 60.0
     cost: Weights = field(default_factory=Weights)  # of the guidance cost

@@ -8,7 +8,6 @@ from typing import Annotated
 
 import numpy as np
 
-from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
@@ -85,6 +84,7 @@ class Cross(BaseTask):
         """How many robots are within the radius of their goals at the end."""
         if len(trace.displacement) == 0 or trace.robots is None:
             return 0
+        assert episode.goal is not None
         assert episode.scene is not None
         assert episode.scene.robots is not None
         places = np.vstack([trace.displacement[-1, :2], trace.robots[-1, :, :2]])
@@ -116,7 +116,7 @@ class _CrossOver(BaseBehaviour):
         self, episode: Episode, settings: CrossSettings, dt: float, teammates: tuple[_CrossOver, ...] = ()
     ) -> None:
         super().__init__(episode)
-        self.teammates = teammates
+        self.teammates = self._mates = teammates
         self.arrived = self.ended = False
         self._settings = settings
         self._bearing = 0.0  # rad in the odometry frame, of the way that was chosen
@@ -142,7 +142,7 @@ class _CrossOver(BaseBehaviour):
 
     def done(self, state: State) -> bool:
         """For the first robot, when it and all others have arrived, or cannot any more. The others stand meanwhile."""
-        return bool(self.teammates) and self.arrived and all(one.arrived or one.ended for one in self.teammates)
+        return bool(self.teammates) and self.arrived and all(mate.arrived or mate.ended for mate in self._mates)
 
     def lost(self) -> None:
         self.ended = True

@@ -96,7 +96,7 @@ class Velocity(BaseTask):
 
 
 class _FaceAndWalk(BaseBehaviour):
-    """Until it faces the way, the robot walks by the part of the velocity that lies ahead: it can hardly go sideways."""
+    """Until it faces the way, the robot walks by the part of the velocity that lies ahead: it can hardly sidestep."""
 
     def __init__(self, episode: Velocities, settings: VelocitySettings, ticks: int) -> None:
         super().__init__(episode)

@@ -13,7 +13,8 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, TextIO
 
 from servoid.hw.config import ConfigError, nearest
-from servoid.hw.contracts.body import Array, Backend, BackendError, Sensors
+from servoid.hw.contracts.backend import Backend
+from servoid.hw.contracts.body import Array, BackendError, Sensors
 from servoid.hw.robot.description import Robot
 from servoid.tools.bringup.line import add_line_arguments, assembled, is_virtual
 from servoid.tools.common import exit_codes

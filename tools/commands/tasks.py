@@ -38,11 +38,10 @@ def main(args: argparse.Namespace) -> int:
 
 def describe(name: str) -> dict[str, Any]:
     """Name, description, source and settings of a task. Raises ConfigError."""
-    known = tasks.find(name)
     return {
         "name": name,
-        "description": known.description,
-        "source": None if known.plugin is None else known.plugin.source(),
+        "description": tasks.find(name).description,
+        "source": tasks.source(name),
         "settings": [asdict(setting) for setting in explain(tasks.load_settings(name))],
     }
 

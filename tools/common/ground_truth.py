@@ -5,30 +5,25 @@ With other robots it is the frame of the scene, in which their goals are.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Trace
-from servoid.hw.contracts.world import Truth
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.guard import Phase
 from servoid.tools.common.motion_quality import Poses
 
-if TYPE_CHECKING:
-    from servoid.sim.scene import Stage
 
-
-class Witness:
-    """An `on_tick` listener: one row for each tick of the task. `stage` is the scene in play, where there is one.
+class GroundTruth:
+    """An `on_tick` listener: one row for each tick of the task.
 
     In a world of several robots it follows the first; that any of them fell or touched another counts. `fell_ending`:
     whether it fell after the task, while it came to rest or was lowered.
     """
 
-    def __init__(self, truth: Truth, dt: float, stage: Stage | None = None) -> None:
-        self._truth, self._dt, self._stage = truth, dt, stage
+    def __init__(self, simulation: Simulation, dt: float) -> None:
+        self._truth, self._surroundings, self._dt = simulation.truth, simulation.surroundings, dt
         self._rows: list[tuple[Array, float, Array, float, Array]] = []
         self._joints: list[Array] = []
         self._up: list[Array] = []
@@ -48,9 +43,9 @@ class Witness:
         self.upright += not self._fallen
         self._joints.append(truth.joints[0].copy())
         self._up.append(-truth.gravity[0])
-        if self._stage is not None:
+        if self._surroundings is not None:
             self._touched |= bool(truth.touching.any())
-            self._obstacles.append(self._stage.obstacles)
+            self._obstacles.append(self._surroundings.obstacles)
             self._robots.append(np.column_stack([truth.position[1:, :2], truth.yaw[1:]]))
         rate = -float(truth.gravity[0] @ truth.angular_velocity[0])
         self._rows.append(
@@ -64,7 +59,7 @@ class Witness:
             return Trace(self._dt, none, np.zeros(0), none, np.zeros(0), none, self._fallen)
         position, yaw, velocity, rate, command = (np.array(column) for column in zip(*self._rows, strict=True))
         yaw, (origin, heading) = np.unwrap(yaw), self._frame()
-        goal = None if self._stage is None else self._stage.scene.goal
+        goal = None if self._surroundings is None else self._surroundings.scene.goal
         if goal is not None:  # where it lies, which is where the robot sees it
             goal = np.tile(_turned(np.array([*goal, 0.0]) - origin, heading)[:2], (len(yaw), 1))
         return Trace(

@@ -39,7 +39,7 @@ def closed_loop_survival(
     robot, head = load_robot(robot_name), read_header(checkpoint)
     settings = planning(check_fit(checkpoint, head, robot), head["training"])
     settings = replace(settings, checkpoint=str(checkpoint))
-    runtime = load_runtime(robot, settings, load_task("walk", {}, robot.dt).cost)
+    runtime = load_runtime(robot, settings, load_task("walk", {}, robot.dt).objective)
     return survival_of(partial(PlannedWalker, runtime=runtime, seed=seed), robot, seconds, worlds, seed)
 
 

@@ -17,13 +17,13 @@ from fake_body import StillEstimator, observation
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Command, Mode
-from servoid.hw.contracts.control import Instruction, Plan
+from servoid.hw.contracts.control import Adopted, Instruction, Plan
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import load_robot
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.log.format import FORMAT
 from servoid.stack.log.recorder import Recorder
-from servoid.stack.log.tick import Adopted, Proposal, TickRecord, Timing
+from servoid.stack.log.tick import Proposal, TickRecord, Timing
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Phase
 

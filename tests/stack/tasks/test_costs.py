@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from task_bodies import DT, Drawn, moves, state
+from task_bodies import DT, moves, state
 
 from servoid.hw.contracts.control import Instruction
 from servoid.stack.navigation.frames import to_heading

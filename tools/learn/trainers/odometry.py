@@ -117,7 +117,7 @@ def driver(robot: Any, name: str) -> MakeDriver:
     from servoid.tools.learn.envs.planned import PlannedWalker
 
     settings = replace(load_settings(), checkpoint=name)
-    return partial(PlannedWalker, runtime=load_runtime(robot, settings, load_task("walk", {}, robot.dt).cost))
+    return partial(PlannedWalker, runtime=load_runtime(robot, settings, load_task("walk", {}, robot.dt).objective))
 
 
 def mixed(a: dict[str, Array], b: dict[str, Array], seed: int) -> dict[str, Array]:
