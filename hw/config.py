@@ -146,7 +146,8 @@ class _Reader:
 
     def dataclass(self, node: yaml.Node, cls: Any, key: str) -> Any:
         items = self.mapping(node, key)
-        hints = {f.name: typing.get_type_hints(cls)[f.name] for f in fields(cls) if f.init}
+        known = typing.get_type_hints(cls)
+        hints = {f.name: known[f.name] for f in fields(cls) if f.init}
         for name in items:
             if name not in hints:
                 self.fail(_join(key, name), f"unknown key; {nearest(name, hints)}")

@@ -31,17 +31,34 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class ReferenceFrames:
-    """Frames of a motion to track, `k` of them along the axis before the last."""
+    """`k` frames of a motion to track, along the axis before the last; of a number a frame, along the last.
+
+    A velocity is in the heading frame of its own frame. The root's pose is in the heading frame of the reference's
+    own root now: x along its heading at `ahead` 0, z up, and the origin on the ground below it. So a clip is tracked
+    wherever the robot is, by its displacement from now on; nothing says where it was recorded.
+    """
 
     position: Array  # (..., k, n_joints) rad
-    velocity: Array  # (..., k, 2) m/s of the base, heading frame
-    yaw_rate: Array  # (..., k) rad/s
+    joint_velocity: Array  # (..., k, n_joints) rad/s
+    velocity: Array  # (..., k, 2) m/s of the base, heading frame of the same frame
+    yaw_rate: Array  # (..., k) rad/s about the vertical
     height: Array  # (..., k) m of the base above the ground
+    root_position: Array  # (..., k, 3) m of the base, present heading frame of the reference; z is `height`
+    root_orientation: Array  # (..., k, 4) quaternion w x y z, base in the same frame; of no yaw at `ahead` 0
     contact: Array  # (..., k, n_feet) 0..1, planned
 
 
 class Reference(Protocol):
-    """A motion that a tracker follows: a gait, a clip, or a planner's output."""
+    """A motion that a tracker follows: a gait, a clip, or a planner's output; of one robot or of many worlds `...`."""
+
+    @property
+    def ended(self) -> Array:
+        """Whether the motion is over `(...)`: its last frame then holds, at rest. A gait and a loop never end."""
+        ...
+
+    def reset(self, where: Array | slice = slice(None)) -> None:
+        """Begin anew in the worlds `where` (default: all)."""
+        ...
 
     def frames(self, ahead: Array) -> ReferenceFrames:
         """Frames `ahead` ticks from now, `(k,)` integers, 0 being the frame to be in at the next tick."""

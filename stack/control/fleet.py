@@ -9,6 +9,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array, Command, Mode
 from servoid.hw.contracts.control import State
+from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import Robot
 from servoid.policy.mlp import Mlp
 from servoid.sim.truth import Truth
@@ -52,8 +53,8 @@ class Fleet:
         """The worlds' truth, for rewards and evaluation."""
         return self.worlds.truth
 
-    def reset(self, where: Array, joints: Array | None = None) -> None:
-        """Start new episodes in the worlds `where` `(n,)` bool, at pose `joints` `(n, n_joints)` (default: home).
+    def reset(self, where: Array, start: Start | None = None) -> None:
+        """Begin new episodes in the worlds `where` `(n,)` bool; `start` has a row for every world.
 
         Call `observe` afterwards: a reset changes what the sensors say.
         """
@@ -63,14 +64,14 @@ class Fleet:
         for i in ids:
             self.rngs[i] = np.random.default_rng([*self._stream, int(i), int(self._episodes[i])])
             self._episodes[i] += 1
-        pose = np.tile(self.robot.home, (len(ids), 1)) if joints is None else joints[ids]
-        self.worlds.reset(ids, [self.rngs[i] for i in ids], pose)
+        start = Start() if start is None else start.of(ids)
+        self.worlds.reset(ids, [self.rngs[i] for i in ids], start)
         bias = np.zeros((self.n, 3))
         for i in ids:
             bias[i] = self.worlds.bodies[i].gyro_bias + self.rngs[i].normal(0.0, _BIAS_LEFT, 3)  # type: ignore[union-attr]
         self.estimator.reset(where, bias)
         self.applied = self.applied.copy()  # `step` gave the old array away as a label
-        self.applied[ids] = pose
+        self.applied[ids] = self.robot.home if start.joints is None else start.joints
 
     def observe(self) -> State:
         """Read the sensors and estimate."""

@@ -14,7 +14,7 @@ from servoid.stack.safety.guard import Phase
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """What a pilot wants at a tick. Without a target the goal holds."""
+    """What a supervisor wants at a tick. Without a target the goal holds."""
 
     target: Array | None = None  # (n_joints,) rad
     instruction: Instruction | None = None

@@ -19,7 +19,7 @@ from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.clock import Schedule
 from servoid.stack.runtime.interrupt import Interrupt, Stops
 from servoid.stack.runtime.loop import Loop
-from servoid.stack.runtime.phases import Director
+from servoid.stack.runtime.phases import Phases
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import ENDED, Guard, Phase
 
@@ -73,10 +73,10 @@ class Others:
             assert other.simulation is not None
             assert other.simulation.surroundings is not None
             look = other.simulation.surroundings.look
-            director = Director(robot, guard, estimator, assignment, behaviour, policy, None, look)
+            phases = Phases(robot, guard, estimator, assignment, behaviour, policy, None, look)
             schedule = Schedule(other.clock, robot.rate)
             stops = Stops(Interrupt(), script=self._heard)
-            loop = Loop(sensors, estimator, director, guard, schedule, interrupt, stops, (self._listener(number),))
+            loop = Loop(sensors, estimator, phases, guard, schedule, interrupt, stops, (self._listener(number),))
             self._members.append(_Member(number, behaviour, guard, loop))
 
     def __call__(self, record: TickRecord) -> None:

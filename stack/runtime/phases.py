@@ -15,7 +15,7 @@ from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot
 from servoid.stack.estimation.sample_hold import missing
 from servoid.stack.log.tick import Proposal
-from servoid.stack.log.trace_buffer import Tape
+from servoid.stack.log.trace_buffer import TraceBuffer
 from servoid.stack.runtime.loop import Estimator
 from servoid.stack.safety.guard import Guard, Phase
 
@@ -25,8 +25,8 @@ DONE = "the task is done"
 SETTLE_SECONDS = 1.5  # standing still at home, in which the estimator learns the gyro's bias
 
 
-class Director:
-    """Pilot of a run. `push` changes the body's velocity, m/s `(2,)`; None where a body cannot be pushed.
+class Phases:
+    """Supervises a run. `push` changes the body's velocity, m/s `(2,)`; None where a body cannot be pushed.
 
     `look` sees what is around the robot (`world.Surroundings`); without it the behaviour says what should be there.
     """
@@ -48,12 +48,12 @@ class Director:
         self._push = push
         self._look = behaviour.percept if look is None else look
         self._settled = 0
-        self._tape = Tape(len(robot.joints), round(self._seconds / robot.dt))
+        self._buffer = TraceBuffer(len(robot.joints), round(self._seconds / robot.dt))
         self.ended: str | None = None  # "done" or "time", if the task ended by itself
 
     @property
     def task_ticks(self) -> int:
-        return len(self._tape)
+        return len(self._buffer)
 
     def act(self, tick: int, observation: Observation, state: State | None) -> Proposal:
         phase = self._guard.phase
@@ -75,7 +75,7 @@ class Director:
     def trace(self) -> Trace:
         """What the robot believes to have gone through in the task."""
         fallen = self._guard.phase is Phase.FAULT and self._guard.cause == "fall" and self.ended is None
-        return self._tape.trace(self._robot.dt, fallen)
+        return self._buffer.trace(self._robot.dt, fallen)
 
     def _wake(self, tick: int, observation: Observation, state: State | None) -> None:
         if state is not None:
@@ -88,7 +88,7 @@ class Director:
         tick = self.task_ticks
         percept = self._look(state)
         instruction = self._behaviour.instruct(tick, state, percept)
-        self._tape.add(state, instruction, percept)
+        self._buffer.add(state, instruction, percept)
         shown = Proposal(instruction=instruction, percept=percept)
         if self._behaviour.done(state):
             return self._end("done", DONE, shown, state)

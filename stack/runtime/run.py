@@ -27,8 +27,8 @@ from servoid.stack.runtime.clock import RealTime, Schedule, WallClock
 from servoid.stack.runtime.interrupt import Interrupt, Stops
 from servoid.stack.runtime.loop import Loop
 from servoid.stack.runtime.multi_robot import Others
-from servoid.stack.runtime.phases import Director
-from servoid.stack.runtime.realtime import steady
+from servoid.stack.runtime.phases import Phases
+from servoid.stack.runtime.realtime import undisturbed
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Guard, Phase
 from servoid.stack.tasks import load_task, source
@@ -171,7 +171,7 @@ def run(
             guard.note("system", assembly)
         estimator = Estimator(robot, odometry)
         look = None if surroundings is None else surroundings.look
-        director = Director(robot, guard, estimator, assignment, behaviour, pilot, push, look)
+        phases = Phases(robot, guard, estimator, assignment, behaviour, pilot, push, look)
         tally = _Tally()
         listeners: list[Listener] = [tally]
         others = None
@@ -211,11 +211,11 @@ def run(
         if on_tick is not None:
             listeners.append(on_tick)
         if realtime:
-            stack.enter_context(steady(not simulated, lambda text: guard.note("system", text)))
+            stack.enter_context(undisturbed(not simulated, lambda text: guard.note("system", text)))
         clock = RealTime(time) if realtime and not isinstance(time, WallClock) else time
         requests = Stops(interrupt, lambda: recorder.error if recorder is not None else None, script.stops)
         loop = Loop(
-            sensors, estimator, director, guard, Schedule(clock, robot.rate), interrupt, requests, tuple(listeners)
+            sensors, estimator, phases, guard, Schedule(clock, robot.rate), interrupt, requests, tuple(listeners)
         )
         try:
             loop.run()
@@ -228,7 +228,7 @@ def run(
             raise
         last = guard.events()
         tally.events += last
-        result = replace(tally.result(director, guard, assignment, settings), interrupted=interrupt.count > 0)
+        result = replace(tally.result(phases, guard, assignment, settings), interrupted=interrupt.count > 0)
         if recorder is not None:
             recorder.events(last)
             recorder.close(result.summary())
@@ -296,28 +296,28 @@ class _Tally:
             self._late.append(record.timing.late)
             self._missed += record.timing.missed
 
-    def result(self, director: Director, guard: Guard, assignment: Assignment, settings: RunSettings) -> Result:
-        trace = director.trace()
-        success = bool(director.ended is not None and assignment.success(trace))
+    def result(self, phases: Phases, guard: Guard, assignment: Assignment, settings: RunSettings) -> Result:
+        trace = phases.trace()
+        success = bool(phases.ended is not None and assignment.success(trace))
         late = np.array(self._late or [0], dtype=float) * 1e-6
         return Result(
-            outcome=_outcome(director, guard, success, trace),
+            outcome=_outcome(phases, guard, success, trace),
             success=success,
-            seconds=director.task_ticks * trace.dt,
-            ticks=director.task_ticks,
+            seconds=phases.task_ticks * trace.dt,
+            ticks=phases.task_ticks,
             missed=self._missed,
             late_p50_ms=float(np.percentile(late, 50)),
             late_p99_ms=float(np.percentile(late, 99)),
-            metrics=assignment.metrics(trace) if director.task_ticks else {},
+            metrics=assignment.metrics(trace) if phases.task_ticks else {},
             events=tuple(self.events),
             trace=trace,
             log=settings.record,
         )
 
 
-def _outcome(director: Director, guard: Guard, success: bool, trace: Trace) -> str:
-    if director.ended is not None:
-        return "succeeded" if success else "timed_out" if director.ended == "time" else "failed"
+def _outcome(phases: Phases, guard: Guard, success: bool, trace: Trace) -> str:
+    if phases.ended is not None:
+        return "succeeded" if success else "timed_out" if phases.ended == "time" else "failed"
     if trace.fallen:
         return "fell"
     return "interrupted" if guard.cause == "interrupt" else "stopped"

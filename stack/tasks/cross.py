@@ -11,9 +11,9 @@ import numpy as np
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
+from servoid.hw.geometry import to_heading, turned
 from servoid.hw.setting import Setting
 from servoid.stack.navigation.collision_avoidance import AvoidanceSettings, Motion, bearing_past
-from servoid.stack.navigation.frames import to_heading, turned
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
@@ -128,7 +128,7 @@ class _CrossOver(BaseBehaviour):
         goal = to_heading(self.episode.goal if percept.goal is None else percept.goal, state)
         robots = np.zeros((0, 3)) if percept.robots is None else percept.robots
         near = to_heading(robots[:, :2], state)
-        velocity = turned(self._motion.update(robots[:, :2]), -float(state.yaw))
+        velocity = turned(self._motion.update(robots[:, :2]), -state.yaw)
         self.arrived = bool(np.linalg.norm(goal) <= (1.0 if self.arrived else 0.7) * s.radius)
         if self.arrived:
             return Instruction(velocity=np.zeros(3), goal=goal)

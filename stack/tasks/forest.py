@@ -12,9 +12,9 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
+from servoid.hw.geometry import to_heading
 from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Setting
-from servoid.stack.navigation.frames import ahead, moving, to_heading
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.navigation.potential_field import FieldSettings, PotentialField
 from servoid.stack.tasks import metrics as measures
@@ -146,7 +146,7 @@ class _GoBetween(BaseBehaviour):
         return Instruction(
             velocity=go_to_point(far, self._settings.approach),
             goal=goal,
-            obstacles=moving(ahead(pillars, state), np.zeros(2)),
+            obstacles=np.pad(to_heading(pillars, state), ((0, 0), (0, 2))),  # they stand
         )
 
     def done(self, state: State) -> bool:

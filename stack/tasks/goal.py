@@ -14,10 +14,10 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
+from servoid.hw.geometry import to_heading
 from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Range, Setting
 from servoid.policy.text.captions import twist_of
-from servoid.stack.navigation.frames import to_heading
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings

@@ -14,11 +14,11 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Keyframes, State
 from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept
+from servoid.hw.geometry import to_heading, turned
 from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Setting
 from servoid.policy.diffusion.features import Layout, raw_layout
 from servoid.stack.log.flightlog import FlightLog, read_log
-from servoid.stack.navigation.frames import to_heading, turned
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 
 _SOON = 0.2  # s: nearer keyframes are not hurried to

@@ -11,8 +11,8 @@ import numpy as np
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
+from servoid.hw.geometry import to_heading
 from servoid.hw.setting import Setting
-from servoid.stack.navigation.frames import ahead, moving
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 
@@ -88,7 +88,7 @@ class _GetAway(BaseBehaviour):
         s = self._settings
         if percept.obstacles is None or not len(percept.obstacles):
             return Instruction(velocity=np.zeros(3))
-        obstacles = ahead(percept.obstacles, state)
+        obstacles = to_heading(percept.obstacles, state)
         nearest = obstacles[np.argmin(np.linalg.norm(obstacles[:, :2], axis=1)), :2]
         self._distance = float(np.linalg.norm(nearest))
         bearing = math.atan2(-nearest[1], -nearest[0])
@@ -100,7 +100,7 @@ class _GetAway(BaseBehaviour):
             ]
         )
         rolling = -s.sphere_speed * obstacles[:, :2] / np.linalg.norm(obstacles[:, :2], axis=1, keepdims=True)
-        return Instruction(velocity=velocity, obstacles=moving(obstacles, rolling))
+        return Instruction(velocity=velocity, obstacles=np.concatenate([obstacles, rolling], -1))
 
     def done(self, state: State) -> bool:
         """Escaped, as the robot sees it, with something to spare."""

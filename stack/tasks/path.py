@@ -12,8 +12,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
+from servoid.hw.geometry import to_heading
 from servoid.hw.setting import Setting
-from servoid.stack.navigation.frames import to_heading
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 

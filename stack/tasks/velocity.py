@@ -13,8 +13,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept
+from servoid.hw.geometry import turned
 from servoid.hw.setting import Range, Setting
-from servoid.stack.navigation.frames import turned
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 
@@ -88,9 +88,7 @@ class Velocity(BaseTask):
                     errors.append(np.linalg.norm(asked))
                     continue
                 rows = slice(first, first + cycle)
-                cos, sin = np.cos(trace.yaw[rows]), np.sin(trace.yaw[rows])
-                forward, left = trace.velocity[rows, 0], trace.velocity[rows, 1]
-                ground = np.stack([cos * forward - sin * left, sin * forward + cos * left], axis=-1).mean(0)
+                ground = turned(trace.velocity[rows, :2], trace.yaw[rows]).mean(0)
                 errors.append(np.linalg.norm(ground - asked))
         return float(np.mean(errors)) if errors else float("nan")
 
@@ -105,7 +103,7 @@ class _FaceAndWalk(BaseBehaviour):
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
         s, number = self._settings, min(tick // self._ticks, len(self.episode.velocity) - 1)
         velocity = self.episode.velocity[number]
-        ahead = turned(velocity, -float(state.yaw))
+        ahead = turned(velocity, -state.yaw)
         off = (self.episode.direction[number] - float(state.yaw) + math.pi) % (2.0 * math.pi) - math.pi
         turn = min(max(s.turn_gain * off, -s.yaw_rate), s.yaw_rate)
         if not velocity.any() and abs(off) < 0.05:

@@ -21,7 +21,7 @@ from servoid.hw.dynamixel import codec
 from servoid.hw.dynamixel.bus import BITS
 from servoid.hw.dynamixel.codec import Instruction
 from servoid.sim.rig.process.pty import Pty
-from servoid.stack.runtime.realtime import steady
+from servoid.stack.runtime.realtime import undisturbed
 
 CURRENT, VELOCITY = 7, -11  # raw values that every servo reports
 ALERT_SECONDS = 0.02  # after a packet, in which the next is watched for and not slept for
@@ -47,7 +47,7 @@ class Responder:
         both.register(self.pty.master, select.POLLIN)
         both.register(stdin, select.POLLIN | select.POLLHUP)
         gc.disable()
-        with steady(True, lambda text: None):  # servos are punctual, however busy the host is
+        with undisturbed(True, lambda text: None):  # servos are punctual, however busy the host is
             self._serve(both, poll, stdin)
 
     def _serve(self, both: select.poll, poll: select.poll, stdin: int) -> None:

@@ -71,7 +71,7 @@ def _jog(
     from servoid.stack.runtime.interrupt import Interrupt, Stops
     from servoid.stack.runtime.loop import Loop
     from servoid.stack.safety.guard import Guard
-    from servoid.tools.bringup.jogging import SPEED, JogPilot, Keys, There, reach, restrict
+    from servoid.tools.bringup.jogging import SPEED, JogSupervisor, Keys, There, reach, restrict
 
     i = robot.names.index(args.joint)
     clock = body.clock
@@ -94,9 +94,9 @@ def _jog(
         source = There(args.by, robot.dt) if args.by is not None else stack.enter_context(Keys())
         guard = Guard(restricted, motors)
         shown = _Shown(guard, i, args.joint, here, sys.stderr)
-        pilot = JogPilot(restricted, guard, i, source)
+        supervisor = JogSupervisor(restricted, guard, i, source)
         schedule = Schedule(clock, robot.rate)
-        loop = Loop(sensors, Estimator(robot), pilot, guard, schedule, interrupt, Stops(interrupt), (shown,))
+        loop = Loop(sensors, Estimator(robot), supervisor, guard, schedule, interrupt, Stops(interrupt), (shown,))
         try:
             loop.run()
         finally:
@@ -120,12 +120,12 @@ def _jog(
 
 def _pose(sensors: Sensors, clock: Any, robot: Robot) -> Array:
     """Where every joint is [rad], the newest of several reads. Raises BackendError naming a joint that is silent."""
-    from servoid.stack.estimation.sample_hold import Coast, missing
+    from servoid.stack.estimation.sample_hold import SampleHold, missing
 
-    coast = Coast()
+    hold = SampleHold()
     for _ in range(_READS):
         clock.sleep_until(clock.now_ns() + round(robot.dt * 1e9))
-        observation = coast.update(sensors.read())
+        observation = hold.update(sensors.read())
     if lacking := missing(observation, robot.names):
         raise BackendError(f"no sample from {', '.join(lacking)}: check cables and power, then servoid bringup scan")
     return observation.position.copy()

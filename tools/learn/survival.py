@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 _CHANGE = 125  # ticks between commands
 _PUSH_EVERY = 50  # ticks
-_PUSH = 0.3  # m/s, in a random direction
+_PUSH = 0.6  # of the top speed forward, in a random direction
+_LOW, _HIGH = np.array([[-0.2, -0.2, -0.8], [0.6, 0.2, 0.8]])  # of the top speeds: what is asked
 _RANDOMISED = 0.5  # share of worlds with a robot drawn at random
 _MEASURED = 2**31  # sets these worlds apart from those that data is collected in, with the same seed
 
@@ -66,10 +67,12 @@ def survival_of(
     Returns `survival`, the share of worlds that never fell, and `velocity_error`, the mean planar error [m/s] of
     those, smoothed over a cycle, from 2 s after each command.
     """
+    from servoid.policy.references.gait import load_gait
     from servoid.stack.control.fleet import Fleet
     from servoid.stack.estimation.odometry import load_odometry
 
     fleet = Fleet(robot, worlds, load_odometry(robot), randomise=_RANDOMISED, seed=seed, tag=_MEASURED)
+    cycle, low, high = load_gait().cycle, _LOW * robot.walking.scale, _HIGH * robot.walking.scale
     walker, everything = drive(fleet), np.ones(worlds, bool)
     fleet.reset(everything)
     walker.reset(everything)
@@ -78,14 +81,14 @@ def survival_of(
     smooth = np.zeros((worlds, 2))
     for tick in range(round(seconds * robot.rate)):
         if tick % _CHANGE == 25:
-            command = np.array([rng.uniform([-0.1, -0.1, -0.8], [0.3, 0.1, 0.8]) for rng in fleet.rngs])
+            command = np.array([rng.uniform(low, high) for rng in fleet.rngs])
         if tick % _PUSH_EVERY == 0 and tick:
             bearing = np.array([rng.uniform(-np.pi, np.pi) for rng in fleet.rngs])
-            fleet.worlds.push(_PUSH * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1))
+            fleet.worlds.push(_PUSH * robot.walking.forward * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1))
         fleet.observe()
         fleet.step(walker.act(command))
         alive &= ~fleet.truth.fallen
-        smooth += robot.dt / 0.48 * (fleet.truth.velocity[:, :2] - smooth)
+        smooth += robot.dt / cycle * (fleet.truth.velocity[:, :2] - smooth)
         if (tick - 25) % _CHANGE >= 100 and tick > 25:
             errors.append(np.where(alive, np.linalg.norm(smooth - command[:, :2], axis=-1), np.nan))
     mean = float(np.nanmean(errors)) if errors and alive.any() else float("nan")

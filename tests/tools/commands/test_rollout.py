@@ -89,7 +89,7 @@ def test_an_episode_that_cannot_be_done_does_not_take_the_others_with_it(
             raise BackendError("the rig did not answer")
         done.append(job.seed)
         return {
-            "seed": job.seed, "success": True, "fell": False, "broken_off": False, "fell_ending": False, "seconds": 3.0,
+            "seed": job.seed, "success": True, "fell": False, "aborted": False, "fell_ending": False, "seconds": 3.0,
             "metrics": {},
             "odometry_error_m": 0.01,
         }  # fmt: skip
@@ -142,7 +142,7 @@ def test_success_is_by_the_truth_and_only_of_whole_runs(
     monkeypatch.setattr(GroundTruth, "trace", lambda self: trace(fallen))
     monkeypatch.setattr(GroundTruth, "odometry_error", lambda self, estimate: 0.01)
     row = rollout.episode(RunSettings(task="walk", policy="gait"))
-    assert (row["success"], row["fell"], row["broken_off"]) == (success, fell, outcome == "stopped")
+    assert (row["success"], row["fell"], row["aborted"]) == (success, fell, outcome == "stopped")
 
 
 def test_a_run_that_is_told_to_end_is_no_episode_even_where_its_task_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,12 +166,12 @@ def test_a_run_that_never_began_is_counted_and_not_a_crash(monkeypatch: pytest.M
         result = SimpleNamespace(outcome="stopped", seconds=0.0, trace=trace(False), interrupted=False)
         monkeypatch.setattr("servoid.stack.runtime.run.run", lambda *a, result=result, **k: result)
         row = rollout.episode(RunSettings(task=task, policy="gait"))
-        assert (row["success"], row["fell"], row["broken_off"]) == (False, False, True)
+        assert (row["success"], row["fell"], row["aborted"]) == (False, False, True)
         assert row["metrics"] == ({"followed_share": 0.0} if task == "text" else {})
         good = {
             **row,
             "success": True,
-            "broken_off": False,
+            "aborted": False,
             "fell_ending": False,
             "metrics": {"distance_m": 2.0},
             "odometry_error_m": 0.02,
@@ -179,7 +179,7 @@ def test_a_run_that_never_began_is_counted_and_not_a_crash(monkeypatch: pytest.M
         }
         summary = rollout.summarise(options(), [row, good], 1.0)
         assert summary["metrics"] == {**row["metrics"], "distance_m": 2.0, "odometry_error_m": 0.02}
-        assert (summary["success_rate"], summary["broken_off_rate"]) == (0.5, 0.5)
+        assert (summary["success_rate"], summary["aborted_rate"]) == (0.5, 0.5)
         assert summary["failed_seeds"] == [row["seed"]]
 
 

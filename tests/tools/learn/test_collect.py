@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import resource
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from servoid.tools import cli
 from servoid.tools.learn.collect.disturbances import Disturbances, DisturbanceSettings, joint_noise
 from servoid.tools.learn.collect.episode_cutter import Recorder
 from servoid.tools.learn.collect.lerobot import DatasetWriter, Feature
-from servoid.tools.learn.collect.skills import SKILLS
+from servoid.tools.learn.collect.skills import SKILLS, skills_of
 from servoid.tools.learn.envs.walker import Walker
 
 TICKS = 250  # 5 s
@@ -158,9 +159,9 @@ def test_labels_are_clean_and_within_limits(collected: Path, robot: Robot) -> No
     assert 0 < noisy < len(recording.spans)
 
 
-def test_command_and_task_go_together_and_last(table: pa.Table) -> None:
+def test_command_and_task_go_together_and_last(table: pa.Table, robot: Robot) -> None:
     command, task = matrix(table, "command"), table["task_index"].to_numpy()
-    for number, skill in enumerate(SKILLS):
+    for number, skill in enumerate(skills_of(robot)):
         rows = command[task == number]
         inside = np.zeros(len(rows), bool)
         for box in skill.boxes:
@@ -247,6 +248,16 @@ def test_policy_that_always_falls_is_given_up(robot: Robot) -> None:
         list(recorder.episodes(10_000))
 
 
+def test_skills_are_asked_as_fast_as_the_robot_goes(robot: Robot) -> None:
+    """A command that no robot of this size can follow would be recorded beside what it did instead."""
+    small = replace(robot, walking=replace(robot.walking, forward=0.2, sideways=0.03))
+    for ours, theirs in zip(skills_of(robot), skills_of(small), strict=True):
+        for box, smaller in zip(ours.boxes, theirs.boxes, strict=True):
+            assert smaller.forward == pytest.approx(0.4 * np.array(box.forward))
+            assert smaller.left == pytest.approx(np.clip(0.4 * np.array(box.left), -0.03, 0.03))
+            assert smaller.turn == box.turn
+
+
 def test_noise_rises_to_the_feet_and_pushes_keep_their_pace(robot: Robot) -> None:
     settings = DisturbanceSettings(pushed_share=1.0)
     sizes = dict(zip(robot.names, joint_noise(robot, settings), strict=True))
@@ -267,7 +278,8 @@ def test_noise_rises_to_the_feet_and_pushes_keep_their_pace(robot: Robot) -> Non
     assert lag[slow].mean() > 0.1 > np.abs(lag[white]).mean()
     pushes = np.array([disturbances.push(rngs) for _ in range(ticks)])
     speed = np.linalg.norm(pushes, axis=-1)
-    assert 0.93 * settings.push_speed[1] < speed.max() <= settings.push_speed[1]
+    hardest = settings.push_speed[1] * robot.walking.forward
+    assert 0.93 * hardest < speed.max() <= hardest
     count = (speed > 0).sum(0)
     assert count.min() >= ticks / 50 / 3 - 1
     assert count.max() <= ticks / 50

@@ -46,6 +46,6 @@ def test_without_a_tag_an_episode_draws_by_seed_world_and_number() -> None:
     for _ in range(2):
         fleet.reset(np.arange(3) == 2)
     expected = np.random.default_rng([7, 2, 1])
-    fleet.worlds.reset(np.array([2]), [expected], ROBOT.home[None])
+    fleet.worlds.reset(np.array([2]), [expected])
     expected.normal(0.0, 1.0, 3)  # the bias that is left
     assert fleet.rngs[2].random() == expected.random()

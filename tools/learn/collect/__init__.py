@@ -179,11 +179,12 @@ def _provenance(
 
     from servoid.policy.checkpoint import git_commit
     from servoid.tools.learn.collect.episode_cutter import FALL_SECONDS, SHORTEST_SECONDS
-    from servoid.tools.learn.collect.skills import SKILLS
+    from servoid.tools.learn.collect.skills import skills_of
 
     def plain(values: Mapping[str, Any]) -> dict[str, Any]:
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
+    skills = skills_of(robot)
     options = {name: getattr(args, name) for name in ("frames", "worlds", "seconds", "randomise", "plain_odometry")}
     content = {
         "licence": LICENCE,
@@ -196,9 +197,9 @@ def _provenance(
         "mirroring": MIRRORING,
         "episodes": {"ticks": recorder.ticks, "dropped_before_fall": FALL_SECONDS, "shortest": SHORTEST_SECONDS},
         "commands": {
-            "segment_seconds": {skill.name: list(skill.seconds) for skill in SKILLS},
+            "segment_seconds": {skill.name: list(skill.seconds) for skill in skills},
             "skills": [
-                {"name": s.name, "weight": s.weight, "boxes": [plain(asdict(box)) for box in s.boxes]} for s in SKILLS
+                {"name": s.name, "weight": s.weight, "boxes": [plain(asdict(box)) for box in s.boxes]} for s in skills
             ],
         },
         "disturbances": plain(asdict(settings)),

@@ -54,7 +54,7 @@ class Recorder:
             raise ConfigError(
                 f"episodes of {seconds:g} s are too short: at least {FALL_SECONDS + SHORTEST_SECONDS:g} s are needed"
             )
-        self._commands = Commands(fleet.n, robot.rate)
+        self._commands = Commands(robot, fleet.n)
         self._disturbances = Disturbances(robot, fleet.n, settings)
         n = len(robot.joints)
         sizes = {"observation.state": raw_layout(n).size, "action": n, "action_applied": n, "command": 3}
