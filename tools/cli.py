@@ -14,6 +14,7 @@ from importlib import metadata
 from types import ModuleType
 
 from servoid.tools.common import exit_codes
+from servoid.tools.common.output import say
 from servoid.tools.common.parser import Parser, suggestion
 
 
@@ -92,8 +93,8 @@ def main(argv: list[str] | None = None) -> int:
         if debug:
             traceback.print_exc()
         for note in getattr(error, "__notes__", ()):  # a table, say: what the message is about
-            print(note, file=sys.stderr)
-        print(f"servoid: {exit_codes.explain(error)}", file=sys.stderr)
+            say(note, sys.stderr)
+        say(f"servoid: {exit_codes.explain(error)}", sys.stderr)
         return exit_codes.exit_code(error)
 
 

@@ -42,14 +42,14 @@ def _planner(source: str) -> DiffusionSettings:
 def _expert(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     from servoid.stack.control.tracker import ExpertPolicy
 
-    policy: Policy = ExpertPolicy(robot, task=task, realtime=realtime, checkpoint=source)
+    policy: Policy = ExpertPolicy(robot, source)
     return policy
 
 
 def _gait(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     from servoid.stack.control.gait import GaitPolicy
 
-    policy: Policy = GaitPolicy(robot, task=task, realtime=realtime)
+    policy: Policy = GaitPolicy(robot)
     return policy
 
 
@@ -62,9 +62,9 @@ def _own(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     plugin = _plugin(source)
     assert plugin is not None
     try:
-        policy: Policy = plugin.cls(robot, task=task, realtime=realtime)
+        policy: Policy = plugin.cls(robot)
     except TypeError as error:
-        raise plugin.error(f"a policy is made with (robot, task, realtime): {error}") from error
+        raise plugin.error(f"{plugin.cls.__name__}(robot): {error}") from error
     return policy
 
 

@@ -65,7 +65,7 @@ class Others:
         for number, (behaviour, other) in enumerate(zip(behaviours, body.simulation.teammates, strict=True), 1):
             policy = make()
             self._open.callback(policy.close)
-            policy.reset(int(np.random.SeedSequence([seed, number]).generate_state(1)[0]))
+            policy.reset(None, np.random.SeedSequence([seed, number]).generate_state(1)[0])
             sensors, motors = other.connect()
             self._open.callback(other.close)
             guard = Guard(robot, motors, gain)
