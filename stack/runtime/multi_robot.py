@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ import numpy as np
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.body import Clock
 from servoid.hw.contracts.control import Policy
-from servoid.hw.contracts.task import Task
+from servoid.hw.contracts.task import Assignment, Behaviour
 from servoid.hw.robot.description import Robot
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import load_odometry
@@ -30,7 +30,7 @@ _QUIET = {"phase", "task", "first"}  # kinds of events of others that the first 
 @dataclass(frozen=True)
 class _Member:
     number: int
-    task: Task
+    behaviour: Behaviour
     guard: Guard
     loop: Loop
 
@@ -47,22 +47,23 @@ class Others:
         self,
         robot: Robot,
         body: Backend,
-        tasks: tuple[Task, ...],
-        make: Callable[[Task], Policy],
+        assignment: Assignment,
+        behaviours: Sequence[Behaviour],
+        make: Callable[[], Policy],
         first: Guard,
         interrupt: Interrupt,
         seed: int,
         gain: float,
     ) -> None:
-        """`body` is the first robot's, whose world has a body for each of `tasks`; `make` makes a policy for a task."""
+        """`body` is the first robot's, whose world has one for each of `behaviours`; `make` makes a policy."""
         assert body.simulation is not None
         self._first, self._interrupt, self._robot = first, interrupt, robot
         self._clock: Clock = body.clock
         self._heard: list[Event] = []  # why the first robot ended: the others end with it
         self._open = ExitStack()
         self._members: list[_Member] = []
-        for number, (task, other) in enumerate(zip(tasks, body.simulation.teammates, strict=True), 1):
-            policy = make(task)
+        for number, (behaviour, other) in enumerate(zip(behaviours, body.simulation.teammates, strict=True), 1):
+            policy = make()
             self._open.callback(policy.close)
             policy.reset(None, np.random.SeedSequence([seed, number]).generate_state(1)[0])
             sensors, motors = other.connect()
@@ -72,11 +73,11 @@ class Others:
             assert other.simulation is not None
             assert other.simulation.surroundings is not None
             look = other.simulation.surroundings.look
-            phases = Phases(robot, guard, estimator, task, policy, None, look)
+            phases = Phases(robot, guard, estimator, assignment, behaviour, policy, None, look)
             schedule = Schedule(other.clock, robot.rate)
             stops = Stops(Interrupt(), script=self._heard)
             loop = Loop(sensors, estimator, phases, guard, schedule, interrupt, stops, (self._listener(number),))
-            self._members.append(_Member(number, task, guard, loop))
+            self._members.append(_Member(number, behaviour, guard, loop))
 
     def __call__(self, record: TickRecord) -> None:
         if record.phase in _ENDING and not self._heard:
@@ -98,7 +99,7 @@ class Others:
             if not member.guard.off:
                 member.loop.tick()
             if member.guard.phase in _ENDING:
-                member.task.lost()
+                member.behaviour.lost()
 
     def finish(self) -> None:
         """Time goes on until all have been lowered; at once off where a person interrupted twice."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array, Observation
 from servoid.hw.contracts.control import Instruction, Policy, State
-from servoid.hw.contracts.task import Task, Trace
+from servoid.hw.contracts.task import Assignment, Behaviour, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot
 from servoid.stack.estimation.sample_hold import missing
@@ -28,7 +28,7 @@ SETTLE_SECONDS = 1.5  # standing still at home, in which the estimator learns th
 class Phases:
     """Supervises a run. `push` changes the body's velocity, m/s `(2,)`; None where a body cannot be pushed.
 
-    `look` sees what is around the robot (`world.Surroundings`); without it the task says what should be there.
+    `look` sees what is around the robot (`world.Surroundings`); without it the behaviour says what should be there.
     """
 
     def __init__(
@@ -36,16 +36,19 @@ class Phases:
         robot: Robot,
         guard: Guard,
         estimator: Estimator,
-        task: Task,
+        assignment: Assignment,
+        behaviour: Behaviour,
         policy: Policy,
         push: Callable[[Array], None] | None = None,
         look: Callable[[State], Percept] | None = None,
     ) -> None:
-        self._robot, self._guard, self._estimator, self._task, self._policy = robot, guard, estimator, task, policy
+        self._robot, self._guard, self._estimator, self._policy = robot, guard, estimator, policy
+        self._behaviour, self._seconds = behaviour, assignment.task.seconds
+        self._pushes = assignment.episode.pushes
         self._push = push
-        self._look = task.percept if look is None else look
+        self._look = behaviour.percept if look is None else look
         self._settled = 0
-        self._buffer = TraceBuffer(len(robot.joints), round(task.seconds / robot.dt))
+        self._buffer = TraceBuffer(len(robot.joints), round(self._seconds / robot.dt))
         self.ended: str | None = None  # "done" or "time", if the task ended by itself
 
     @property
@@ -84,14 +87,14 @@ class Phases:
     def _do_task(self, state: State) -> Proposal:
         tick = self.task_ticks
         percept = self._look(state)
-        instruction = self._task.instruct(tick, state, percept)
+        instruction = self._behaviour.instruct(tick, state, percept)
         self._buffer.add(state, instruction, percept)
         shown = Proposal(instruction=instruction, percept=percept)
-        if self._task.done(state):
+        if self._behaviour.done(state):
             return self._end("done", DONE, shown, state)
-        if tick * self._robot.dt >= self._task.seconds:
-            return self._end("time", f"{self._task.seconds:g} s are over", shown, state)
-        velocity = self._task.disturbance(tick)
+        if tick * self._robot.dt >= self._seconds:
+            return self._end("time", f"{self._seconds:g} s are over", shown, state)
+        velocity = self._pushes.get(tick)
         if velocity is not None and self._push is not None:
             self._push(velocity)
         try:

@@ -15,8 +15,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Policy
-from servoid.hw.contracts.task import Task, Trace
-from servoid.hw.contracts.world import Scene
+from servoid.hw.contracts.task import Assignment, Task, Trace
 from servoid.hw.robot.calibration import calibrated
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.stack.control.policies import make_policy, policy_fingerprint
@@ -32,7 +31,8 @@ from servoid.stack.runtime.phases import Phases
 from servoid.stack.runtime.realtime import undisturbed
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Guard, Phase
-from servoid.stack.tasks import load_task
+from servoid.stack.tasks import load_task, source
+from servoid.stack.tasks.steer import SteeredAgain
 
 MAX_GAIN = 2.0  # times the firmware's configured gain; above, a servo of this class rings
 TASK_STREAM = 1  # distinguishes the task's random stream from others of the same seed
@@ -122,9 +122,8 @@ def run(
         from servoid.stack.log.recorder import Recorder, check_new
 
         check_new(settings.record)
-    if script.velocities is not None:
-        task.steer_by(script.velocities, script.ended)
-    scene = start_task(task, settings.seed)
+    assignment = draw(task, settings.seed)
+    scene = assignment.episode.scene
     assembled, assembly = (robot, None) if simulated or backend is not None else calibrated(robot)
     body = backend or make_backend(
         settings.backend,
@@ -139,11 +138,16 @@ def run(
         raise ConfigError(
             f"task '{task.name}' has a scene: make the backend with it (servoid.stack.runtime.run.prepare does)"
         )
-    if task.teammates and policy is not None:
-        robots = len(task.teammates) + 1
+    if scene is not None and scene.robots is not None and policy is not None:
+        robots = len(scene.robots) + 1
         raise ConfigError(f"task '{task.name}' has {robots} robots, each with its own policy: name one instead")
     with ExitStack() as stack:
-        stack.callback(task.close)
+        behaviour = (
+            SteeredAgain(script.velocities, script.ended)
+            if task.steered and script.velocities is not None
+            else task.behaviour(assignment.episode)
+        )
+        stack.callback(behaviour.close)
         interrupt = stack.enter_context(Interrupt(eager=True))
         pilot = make_policy(settings.policy, robot, task, realtime) if policy is None else policy
         stack.callback(pilot.close)
@@ -152,7 +156,7 @@ def run(
         stack.callback(body.close)
         stack.callback(setattr, interrupt, "eager", False)  # a second Ctrl-C must not break off the closing
         push = None if body.simulation is None else body.simulation.push
-        if push is None and task.pushes:
+        if push is None and assignment.episode.pushes:
             raise ConfigError(f"backend '{body.name}' cannot push the robot: drop the task's push setting")
         pilot.reset(None, np.array(settings.seed))
         sensors, motors = body.connect()
@@ -167,18 +171,19 @@ def run(
             guard.note("system", assembly)
         estimator = Estimator(robot, odometry)
         look = None if surroundings is None else surroundings.look
-        phases = Phases(robot, guard, estimator, task, pilot, push, look)
+        phases = Phases(robot, guard, estimator, assignment, behaviour, pilot, push, look)
         tally = _Tally()
         listeners: list[Listener] = [tally]
         others = None
         time = body.clock
-        if task.teammates and body.simulation is not None:
+        if behaviour.teammates and body.simulation is not None:
             # Their planners never run beside the loop: the log, which is the first robot's, has to repeat them.
             time = others = Others(
                 robot,
                 body,
-                task.teammates,
-                lambda its: make_policy(settings.policy, robot, its, realtime=False),
+                assignment,
+                behaviour.teammates,
+                lambda: make_policy(settings.policy, robot, task, realtime=False),
                 guard,
                 interrupt,
                 settings.seed,
@@ -195,7 +200,8 @@ def run(
                 header(
                     settings,
                     robot,
-                    task,
+                    assignment,
+                    source(settings.task),
                     body.name,
                     policy_fingerprint(settings.policy) if policy is None else {"name": type(policy).__qualname__},
                 ),
@@ -222,7 +228,7 @@ def run(
             raise
         last = guard.events()
         tally.events += last
-        result = replace(tally.result(phases, guard, task, settings), interrupted=interrupt.count > 0)
+        result = replace(tally.result(phases, guard, assignment, settings), interrupted=interrupt.count > 0)
         if recorder is not None:
             recorder.events(last)
             recorder.close(result.summary())
@@ -230,29 +236,28 @@ def run(
         return result
 
 
-def prepare(settings: RunSettings) -> tuple[Task, Backend]:
+def prepare(settings: RunSettings) -> tuple[Assignment, Backend]:
     """The task of a run, its episode drawn, and the simulated body with its scene, for `run` and for judging it.
 
     Raises ConfigError like `run`.
     """
     robot = load_robot(settings.robot)
     task, _ = _task(settings, robot)
-    scene = start_task(task, settings.seed)
+    assignment = draw(task, settings.seed)
     body = make_backend(
         settings.backend,
         robot,
         seed=settings.seed,
         randomise=settings.randomise,
         port=settings.port,
-        scene=scene,
+        scene=assignment.episode.scene,
     )
-    return task, body
+    return assignment, body
 
 
-def start_task(task: Task, seed: int) -> Scene | None:
-    """Draw the episode that a run with this seed does; its scene."""
-    task.reset(np.random.default_rng([seed, TASK_STREAM]))
-    return task.scene()
+def draw(task: Task, seed: int) -> Assignment:
+    """The episode that a run with this seed does."""
+    return Assignment(task, task.scenario(np.random.default_rng([seed, TASK_STREAM])))
 
 
 def _task(settings: RunSettings, robot: Robot) -> tuple[Task, float]:
@@ -291,9 +296,9 @@ class _Tally:
             self._late.append(record.timing.late)
             self._missed += record.timing.missed
 
-    def result(self, phases: Phases, guard: Guard, task: Task, settings: RunSettings) -> Result:
+    def result(self, phases: Phases, guard: Guard, assignment: Assignment, settings: RunSettings) -> Result:
         trace = phases.trace()
-        success = bool(phases.ended is not None and task.success(trace))
+        success = bool(phases.ended is not None and assignment.success(trace))
         late = np.array(self._late or [0], dtype=float) * 1e-6
         return Result(
             outcome=_outcome(phases, guard, success, trace),
@@ -303,7 +308,7 @@ class _Tally:
             missed=self._missed,
             late_p50_ms=float(np.percentile(late, 50)),
             late_p99_ms=float(np.percentile(late, 99)),
-            metrics=task.metrics(trace) if phases.task_ticks else {},
+            metrics=assignment.metrics(trace) if phases.task_ticks else {},
             events=tuple(self.events),
             trace=trace,
             log=settings.record,
