@@ -10,6 +10,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array, Command, Mode
 from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import Robot
+from servoid.hw.seeds import generator
 from servoid.policy.mlp import Mlp
 from servoid.sim.truth import Truth
 from servoid.sim.worlds import Worlds
@@ -61,7 +62,7 @@ class Fleet:
         if not len(ids):
             return
         for i in ids:
-            self.rngs[i] = np.random.default_rng([*self._stream, int(i), int(self._episodes[i])])
+            self.rngs[i] = generator(*self._stream, int(i), int(self._episodes[i]))
             self._episodes[i] += 1
         pose = np.tile(self.robot.home, (len(ids), 1)) if joints is None else joints[ids]
         self.worlds.reset(ids, [self.rngs[i] for i in ids], pose)

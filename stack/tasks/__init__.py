@@ -54,7 +54,7 @@ def load_settings(name: str, settings: dict[str, str] | None = None) -> Settings
     """A task's settings from its file, overridden by text as given to `--set key=value`. Raises ConfigError."""
     cls = task_class(name)
     base = load_yaml(resolve("tasks", name), cls.settings_type)
-    return override(base, cls.complete(settings or {}), beside=("gain",))  # which a run takes for the servos
+    return override(base, cls.complete(settings or {}))
 
 
 def load_task(name: str, settings: dict[str, str] | None = None, dt: float = 0.02, robot: Robot | None = None) -> Task:

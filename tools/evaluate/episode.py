@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from servoid.stack.runtime.run import RunSettings
 
 PATH_STEP = 0.2  # s between the points of a path that is kept
-_STREAM = 20_250_417  # any number but 0: the episodes are not those of `servoid rollout`, on which settings are tried
 
 
 @dataclass(frozen=True)
@@ -36,11 +35,6 @@ class Done:
     job: Job
     record: dict[str, Any]
     refused: str | None = None
-
-
-def episode_seed(seed: int, episode: int) -> int:
-    """The seed of an episode, which repeats it with `servoid run`."""
-    return int(np.random.SeedSequence([seed, episode, _STREAM]).generate_state(1)[0])
 
 
 def do(job: Job) -> Done:

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
+from servoid.hw.seeds import evaluation_seed
 from servoid.tools.common.exit_codes import explain
 from servoid.tools.common.worker_pool import each
 from servoid.tools.evaluate.cache import EpisodeCache, key
 from servoid.tools.evaluate.code_hash import read_anew
-from servoid.tools.evaluate.episode import Job, do, episode_seed
+from servoid.tools.evaluate.episode import Job, do
 from servoid.tools.evaluate.policies import Pilots, spec
 from servoid.tools.evaluate.spec import Row, Run
 from servoid.tools.evaluate.summary import Measured
@@ -154,7 +155,7 @@ def _jobs(runs: Sequence[_Work], seed: int) -> Iterator[Job]:
     for episode in range(max((work.episodes for work in runs), default=0)):
         for number, work in enumerate(runs):
             if episode < work.episodes and episode not in work.cache.records and work.refused is None:
-                yield Job(number, episode, replace(work.settings, seed=episode_seed(seed, episode)))
+                yield Job(number, episode, replace(work.settings, seed=evaluation_seed(seed, episode)))
 
 
 def _progress(done: Iterator[Any], total: int) -> Iterator[Any]:
