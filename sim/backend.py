@@ -11,7 +11,7 @@ import numpy as np
 
 from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array, Command, Mode, Observation
-from servoid.hw.contracts.world import Scene, World
+from servoid.hw.contracts.world import Scene, Start, World
 from servoid.hw.robot.description import Robot
 from servoid.hw.seeds import Stream, generator
 from servoid.sim.model import build
@@ -35,10 +35,11 @@ class SimBackend:
             generator(seed, Stream.BODY),
             *(generator(seed, Stream.TEAMMATES, number) for number in range(1, n)),
         ]
-        places = np.zeros((n, 3))
+        start, places = Start(), np.zeros((n, 3))
         if scene is not None and scene.robots is not None:
             places[1:] = scene.robots[:, :3]
-        self._worlds.reset(np.arange(n), rngs, places=places if n > 1 else None)
+            start = Start(position=places * [1.0, 1.0, np.nan], heading=places[:, 2])
+        self._worlds.reset(np.arange(n), rngs, start)
         self._commands = [Command(robot.home, np.zeros(len(robot.joints)), Mode.OFF)] * n
         self.clock = SimClock(self)
         self.stage: Stage | None = None

@@ -14,6 +14,7 @@ from importlib import metadata
 from types import ModuleType
 
 from servoid.tools.common import exit_codes
+from servoid.tools.common.output import say
 from servoid.tools.common.parser import Parser, suggestion
 
 
@@ -39,6 +40,7 @@ VERBS: dict[str, Verb] = {
             "scan": Verb("ask who is on the bus", "servoid.tools.bringup.scan"),
             "setup": Verb("give a servo its ID and baud", "servoid.tools.bringup.setup"),
             "check": Verb("compare every servo with the robot's file", "servoid.tools.bringup.check"),
+            "off": Verb("switch torque off", "servoid.tools.bringup.off"),
             "calibrate": Verb("measure zeros and directions, moved by hand", "servoid.tools.bringup.calibrate"),
             "jog": Verb("move one joint, slowly and a little", "servoid.tools.bringup.jog"),
             "watch": Verb("watch temperatures, voltages, loads and the bus", "servoid.tools.bringup.watch"),
@@ -56,14 +58,7 @@ VERBS: dict[str, Verb] = {
             "diffusion": Verb("the diffusion planner-controller", "servoid.tools.learn.trainers.diffusion"),
         },
     ),
-    "evaluate": Verb(
-        "measure a policy the way that papers do",
-        verbs={
-            "papers": Verb(
-                "the tables of UniPhys and Diffuse-CLoC, with a column of one's own", "servoid.tools.evaluate.papers"
-            )
-        },
-    ),
+    "evaluate": Verb("measure a policy the way that papers do, or yours", "servoid.tools.commands.evaluate"),
     "bench": Verb(
         "measure speed and what faults do, on this machine",
         verbs={
@@ -98,8 +93,8 @@ def main(argv: list[str] | None = None) -> int:
         if debug:
             traceback.print_exc()
         for note in getattr(error, "__notes__", ()):  # a table, say: what the message is about
-            print(note, file=sys.stderr)
-        print(f"servoid: {exit_codes.explain(error)}", file=sys.stderr)
+            say(note, sys.stderr)
+        say(f"servoid: {exit_codes.explain(error)}", sys.stderr)
         return exit_codes.exit_code(error)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
+
+import numpy as np
 
 from servoid.hw.contracts.body import Array
 
@@ -31,17 +33,34 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class ReferenceFrames:
-    """Frames of a motion to track, `k` of them along the axis before the last."""
+    """`k` frames of a motion to track, along the axis before the last; of a number a frame, along the last.
+
+    A velocity is in the heading frame of its own frame. The root's pose is in the heading frame of the reference's
+    own root now: x along its heading at `ahead` 0, z up, and the origin on the ground below it. So a clip is tracked
+    wherever the robot is, by its displacement from now on; nothing says where it was recorded.
+    """
 
     position: Array  # (..., k, n_joints) rad
-    velocity: Array  # (..., k, 2) m/s of the base, heading frame
-    yaw_rate: Array  # (..., k) rad/s
+    joint_velocity: Array  # (..., k, n_joints) rad/s
+    velocity: Array  # (..., k, 2) m/s of the base, heading frame of the same frame
+    yaw_rate: Array  # (..., k) rad/s about the vertical
     height: Array  # (..., k) m of the base above the ground
+    root_position: Array  # (..., k, 3) m of the base, present heading frame of the reference; z is `height`
+    root_orientation: Array  # (..., k, 4) quaternion w x y z, base in the same frame; of no yaw at `ahead` 0
     contact: Array  # (..., k, n_feet) 0..1, planned
 
 
 class Reference(Protocol):
-    """A motion that a tracker follows: a gait, a clip, or a planner's output."""
+    """A motion that a tracker follows: a gait, a clip, or a planner's output; of one robot or of many worlds `...`."""
+
+    @property
+    def ended(self) -> Array:
+        """Whether the motion is over `(...)`: its last frame then holds, at rest. A gait and a loop never end."""
+        ...
+
+    def reset(self, where: Array | slice = slice(None)) -> None:
+        """Begin anew in the worlds `where` (default: all)."""
+        ...
 
     def frames(self, ahead: Array) -> ReferenceFrames:
         """Frames `ahead` ticks from now, `(k,)` integers, 0 being the frame to be in at the next tick."""
@@ -75,13 +94,18 @@ class Instruction:
 
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
-    """What a planner is asked at `tick`: the newest `history` of features and the actions that run meanwhile."""
+    """What a planner is asked at `tick`: the newest `history` of features and the actions that run meanwhile.
+
+    All that the plan depends on is in it: a plan draws its noise from the episode's seed and age.
+    """
 
     tick: int
-    states: Array  # (history, state features), oldest first, the last one being now
-    actions: Array  # (history - 1 + delay, action size) of each past state's tick, then those yet to run; as in a Plan
+    states: Array  # (..., history, state features), oldest first, the last one being now
+    actions: Array  # (..., history - 1 + delay, action size) of past states' ticks, then those yet to run; as in a Plan
     instruction: Instruction
     previous: Plan | None = None  # the plan that runs, for planners that go on from it
+    seeds: Array = field(default_factory=lambda: np.zeros((), int))  # (...,) int of the episodes
+    ages: Array | None = None  # (...,) int, ticks that the episodes have lasted; None: `tick`
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +117,9 @@ class Plan:
     """
 
     tick: int
-    actions: Array  # (horizon, action size), action size: n_joints, or that of a latent
-    states: Array  # (horizon, state features)
-    path: Array  # (horizon, 2) m: predicted displacement in the heading frame of `tick`, to be drawn and logged
+    actions: Array  # (..., horizon, action size), action size: n_joints, or that of a latent
+    states: Array  # (..., horizon, state features)
+    path: Array  # (..., horizon, 2) m: predicted displacement in the heading frame of `tick`, to be drawn and logged
     seconds: float  # how long planning took
     error: str = ""  # why there is no plan, where there is none: its arrays are NaN then
 
@@ -113,8 +137,11 @@ class Policy(Protocol):
     """A controller. `stack.control.base.BasePolicy` answers all but `act` for one that neither plans nor holds
     anything."""
 
-    def reset(self, seed: int) -> None:
-        """Begin an episode, whose random numbers all come from `seed`."""
+    def reset(self, where: Array | None, seeds: Array) -> None:
+        """Begin an episode in the worlds `where` `(...,)` bool, None being all; one robot is a world of shape `()`.
+
+        Their random numbers all come from `seeds` `(...,)` int.
+        """
         ...
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from servoid.hw.contracts.body import Array, BackendError, Command, Mode
-from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel import arming, codec
 from servoid.hw.dynamixel.bus import Bus
 from servoid.hw.dynamixel.codec import SyncWriter
 from servoid.hw.dynamixel.group_read import GroupRead
@@ -24,7 +24,6 @@ OFF_SECONDS, ON_SECONDS = 0.25, 0.1  # and for how long: a host or an adapter ma
 OUTSIDE = 12  # ticks (1 degree) that a joint may be beyond its servo's limits when torque comes on
 AWAY = 68  # ticks (6 degrees) that a joint may have moved since it was read, for its first goal is gone to at once
 _GAINS = struct.Struct("<HHH")  # D, I, P in the order of their registers
-_CHECKED = struct.Struct("<HHH")
 
 
 class DynamixelMotors:
@@ -47,7 +46,6 @@ class DynamixelMotors:
         self._ids = [servo.joint.id for servo in found]
         self._goal = table.item("goal_position")
         self._torque, self._watchdog = table.item("torque_enable"), table.item("bus_watchdog")
-        self._profile = table.item("profile_acceleration").address
         self._d_gain = table.item("position_d_gain")
         self._goals = SyncWriter(self._ids, self._goal.address, self._goal.width, signed=True)
         self._default_d = [servo.table.item("position_d_gain").default or 0 for servo in found]
@@ -116,18 +114,7 @@ class DynamixelMotors:
             )
         self._monitor.expect(False)
         self._gain = None
-        for _ in self._attempts(ON_SECONDS):
-            self._write(self._watchdog.address, everyone, [b"\0"] * len(everyone))  # lifts an expired one, too
-            self._write(self._profile, everyone, [bytes(8)] * len(everyone))
-            self._bus.send(self._goals.packet(goals.tolist()))
-            unready = self._unprepared(goals)
-            if not unready:  # with torque on already, gains would pull at once to a goal that is not from here
-                self._send_gains(gain)
-                unready = self._unprepared(goals, gain)
-            if not unready:
-                break
-        else:
-            raise BackendError(f"{self._names(unready)} did not take goal and gains: torque stays off")
+        self._prepare(goals, gain)
         left = everyone
         for _ in self._attempts(ON_SECONDS):
             self._write(self._torque.address, left, [b"\1"] * len(left))
@@ -139,6 +126,40 @@ class DynamixelMotors:
         names = self._names(left)
         self.off()
         raise BackendError(f"{names} did not switch torque on: does it report an error? Switch its power off and on")
+
+    def _prepare(self, goals: Array, gain: Array) -> None:
+        """Write what RAM must hold before torque, and read it back. Raises BackendError naming what was not taken."""
+        motion = [arming.motion(goal) for goal in goals.tolist()]
+        strength = [arming.strength(servo, each) for servo, each in zip(self._found, gain.tolist(), strict=True)]
+        both = [{**first, **then} for first, then in zip(motion, strength, strict=True)]
+        places = [{"goal_position": goal} for goal in goals.tolist()]
+        for _ in self._attempts(ON_SECONDS):
+            self._set(motion)
+            wrong = self._differing(places, (self._goal.address, self._goal.width))
+            if not any(wrong):  # with torque on already, gains would pull at once to a goal that is not from here
+                self._set(strength)
+                wrong = self._differing(both, arming.span(self._found[0].table))
+            if not any(wrong):
+                self._gain = gain
+                return
+        unready = [i for i, registers in enumerate(wrong) if registers]
+        raise BackendError(
+            f"{self._names(unready)} did not take {', '.join(wrong[unready[0]])}: torque stays off; switch its power "
+            "off and on"
+        )
+
+    def _set(self, values: Sequence[arming.Values]) -> None:
+        for packet in arming.packets(self._found, values):
+            self._bus.send(packet)
+
+    def _differing(self, values: Sequence[arming.Values], place: tuple[int, int]) -> list[list[str]]:
+        """Of each joint, the registers that do not read back; `place` is the address and length of what is read."""
+        group = GroupRead([(id, *place) for id in self._ids])
+        self._bus.read_group(group)
+        return [
+            arming.differing(servo, wanted, data, place[0])
+            for servo, wanted, data in zip(self._found, values, group.data, strict=True)
+        ]
 
     def _attempts(self, seconds: float) -> Iterator[int]:
         """Counts attempts: TRIES at least, and for at least so long."""
@@ -177,21 +198,6 @@ class DynamixelMotors:
     def _write(self, address: int, joints: Sequence[int], values: Sequence[bytes]) -> None:
         data = {self._ids[i]: value for i, value in zip(joints, values, strict=True)}
         self._bus.send(codec.sync_write(address, len(values[0]), data))
-
-    def _unprepared(self, goals: Array, gain: Array | None = None) -> list[int]:
-        """Joints whose goal, or P gain where it was sent, does not read back."""
-        start = self._d_gain.address
-        group = GroupRead([(id, start, self._goal.end - start) for id in self._ids])
-        self._bus.read_group(group)
-        left = []
-        for i, data in enumerate(group.data):
-            if (
-                data is None
-                or (gain is not None and _CHECKED.unpack_from(data)[2] != gain[i])
-                or self._goal.decode(data[self._goal.address - start :]) != goals[i]
-            ):
-                left.append(i)
-        return left
 
     def _unconfirmed(self, joints: Sequence[int], torque: bytes, watchdog: bytes | None = None) -> list[int]:
         """Of `joints`, those whose torque enable (and watchdog) does not read back."""

@@ -164,6 +164,11 @@ class VirtualTruth:
         return self._now().position
 
     @property
+    def orientation(self) -> Array:
+        """Base quaternion `(1, 4)` w x y z."""
+        return self._now().orientation
+
+    @property
     def yaw(self) -> Array:
         """Heading `(1,)` rad in -pi..pi."""
         return self._now().yaw

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 
+import numpy as np
+
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.body import Clock
 from servoid.hw.contracts.task import Task
@@ -62,7 +64,7 @@ class Teammates:
             # Its planner never runs beside the loop: the log, which is the first robot's, has to repeat it.
             policy = make_policy(settings.policy, robot, task, realtime=False)
             self._open.callback(policy.close)
-            policy.reset(teammate_seed(settings.seed, number))
+            policy.reset(None, np.array(teammate_seed(settings.seed, number)))
             sensors, motors = other.connect()
             self._open.callback(other.close)
             guard = Guard(robot, motors, settings.gain)

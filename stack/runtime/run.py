@@ -7,6 +7,8 @@ from contextlib import ExitStack
 from dataclasses import replace
 from types import TracebackType
 
+import numpy as np
+
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.control import Policy
@@ -162,7 +164,7 @@ class Run:
             self.policy.repeat(self._script.plans)
         self._open.callback(body.close)
         self._open.callback(setattr, self._interrupt, "eager", False)  # a second Ctrl-C must not break off the closing
-        self.policy.reset(settings.seed)
+        self.policy.reset(None, np.array(settings.seed))
         sensors, motors = body.connect()
         if body.simulation is None and not settings.start and self._confirm is not None:
             known = f"{self._assembly}. " if self._assembly is not None else ""

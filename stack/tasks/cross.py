@@ -12,8 +12,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept, Scene
+from servoid.hw.geometry import to_heading, turned
 from servoid.stack.navigation.collision_avoidance import Motion, Passing, way
-from servoid.stack.navigation.frames import to_heading, turned
 from servoid.stack.navigation.go_to_point import Approach, approach
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseTask, Settings, require_positive
@@ -95,7 +95,7 @@ class Cross(BaseTask):
         goal = to_heading(self.goal if percept.goal is None else percept.goal, state)
         robots = np.zeros((0, 3)) if percept.robots is None else percept.robots
         near = to_heading(robots[:, :2], state)
-        velocity = turned(self._motion.update(robots[:, :2]), -float(state.yaw))
+        velocity = turned(self._motion.update(robots[:, :2]), -state.yaw)
         self.arrived = bool(np.linalg.norm(goal) <= (1.0 if self.arrived else 0.7) * s.radius)
         if self.arrived:
             return Instruction(velocity=np.zeros(3), goal=goal)

@@ -56,8 +56,10 @@ def test_each_robot_has_a_block_of_its_own(robot: Robot, robots: int) -> None:
         servos = [int(model.actuator(own + name).id) for name in robot.names]
         assert servos == [number * one.nu + int(one.actuator(name).id) for name in robot.names]
         size = model.nsensordata // robots
-        assert int(model.sensor(own + "gyro").adr[0]) == number * size
-        assert int(model.sensor(own + "right_up").adr[0]) == number * size + int(one.sensor("right_up").adr[0])
+        assert int(model.sensor(own + "servoid/gyro").adr[0]) == number * size
+        assert int(model.sensor(own + "servoid/right_up").adr[0]) == number * size + int(
+            one.sensor("servoid/right_up").adr[0]
+        )
 
 
 def test_rows_are_views_of_the_one_world(robot: Robot) -> None:

@@ -133,8 +133,7 @@ def refuse(found: list[Found]) -> None:
     """Raise BackendError for servos that cannot be measured: with torque, or with registers that bend angles."""
     if stiff := [servo.joint.name for servo in found if servo.get("torque_enable")]:
         raise BackendError(
-            f"{', '.join(stiff)} has torque on: end the program that drives the robot, or hold it and switch its power "
-            "off and on"
+            f"{', '.join(stiff)} has torque on: end the program that drives it, hold it, then servoid bringup off"
         )
     for register in ("homing_offset", "drive_mode"):
         if bent := [servo.joint.name for servo in found if servo.get(register)]:

@@ -49,7 +49,9 @@ def main(args: argparse.Namespace) -> int:
                 wanted = robot.servos[robot.names.index(args.joint)].name
                 raise BackendError(f"{device} is not the {wanted} that {robot.name} has at {args.joint}: take another")
             if device.get("torque_enable"):
-                raise BackendError(f"{device} has torque on, which locks its EEPROM: switch its power off and on")
+                raise BackendError(
+                    f"{device} has torque on, which locks its EEPROM: servoid bringup off --baud {device.baud}"
+                )
             changes = _changes(device, id, baud)
             if changes:
                 report.line(f"will be written: {', '.join(changes)}")

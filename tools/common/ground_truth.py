@@ -10,6 +10,7 @@ import numpy as np
 from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Trace
+from servoid.hw.geometry import turned
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.guard import Phase
 from servoid.tools.common.motion_quality import Poses
@@ -61,10 +62,10 @@ class GroundTruth:
         yaw, (origin, heading) = np.unwrap(yaw), self._frame()
         goal = None if self._surroundings is None else self._surroundings.scene.goal
         if goal is not None:  # where it lies, which is where the robot sees it
-            goal = np.tile(_turned(np.array([*goal, 0.0]) - origin, heading)[:2], (len(yaw), 1))
+            goal = np.tile(turned(np.array([*goal, 0.0]) - origin, -heading)[:2], (len(yaw), 1))
         return Trace(
             dt=self._dt,
-            displacement=_turned(position - origin, heading),
+            displacement=turned(position - origin, -heading),
             yaw=yaw - heading,
             velocity=velocity,
             yaw_rate=rate,
@@ -72,8 +73,8 @@ class GroundTruth:
             fallen=self._fallen,
             joints=np.array(self._joints),
             goal=goal,
-            obstacles=_turned(np.array(self._obstacles) - origin, heading) if self._obstacles else None,
-            robots=_turned(np.array(self._robots) - [*origin[:2], heading], heading) if self._others() else None,
+            obstacles=turned(np.array(self._obstacles) - origin, -heading) if self._obstacles else None,
+            robots=turned(np.array(self._robots) - [*origin[:2], heading], -heading) if self._others() else None,
             touched=self._touched if self._obstacles else None,
         )
 
@@ -105,12 +106,5 @@ class GroundTruth:
         if not self._rows:
             return float("nan")
         origin, heading = self._start()
-        end = _turned(self._rows[-1][0] - origin, heading)[:2]
+        end = turned(self._rows[-1][0] - origin, -heading)[:2]
         return float(np.linalg.norm(end - estimate.displacement[-1, :2]))
-
-
-def _turned(points: Array, yaw: float) -> Array:
-    """Points `(..., 3)` seen in a frame that is turned by `yaw` about the vertical; their third value stays."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    x, y = points[..., 0], points[..., 1]
-    return np.stack([c * x + s * y, c * y - s * x, points[..., 2]], -1)

@@ -22,12 +22,9 @@ class ExpertSettings:
     mirror: float
     episode_seconds: float
     randomised: float
-    push: float
+    hardest_push: float
     push_every: tuple[float, float]
     command_every: tuple[float, float]
-    vx: tuple[float, float]
-    vy: tuple[float, float]
-    yaw_rate: tuple[float, float]
     stand: float
     forward: float
     single: float

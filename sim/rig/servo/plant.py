@@ -16,7 +16,7 @@ from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
 from servoid.hw.seeds import Stream, generator
-from servoid.sim.model import TIMESTEP, build
+from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.randomise import Body, draw
 from servoid.sim.scene import robot_bodies, scene_sensors
 from servoid.sim.truth import Truth
@@ -74,7 +74,7 @@ class Plant:
         self.model.body_mass[own] = self._nominal["body_mass"][own] * self.body.mass
         self.model.body_inertia[own] = self._nominal["body_inertia"][own] * self.body.mass[:, None]
         self.model.geom_friction[:] = self._nominal["geom_friction"]
-        self.model.geom_friction[self.model.geom("floor").id, 0] = self.body.friction
+        self.model.geom_friction[self.model.geom(FLOOR).id, 0] = self.body.friction
         mujoco.mj_setConst(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
         self.held, self._noise_block, self._ticks = True, -1, 0

@@ -133,12 +133,12 @@ def test_a_folder_of_another_run_is_not_gone_on_with(trained: tuple[Path, Traine
 def test_commands_of_training_are_spread_over_what_is_asked() -> None:
     """Backward while turning is where the tracker fell most, and top speed what it lacked: both must be seen often."""
     rng = np.random.default_rng(0)
-    commands = np.array([_draw(rng, SETTINGS) for _ in range(4000)])
-    assert (commands[:, 0] >= SETTINGS.vx[0]).all()
-    assert (commands[:, 0] <= SETTINGS.vx[1]).all()
+    commands = np.array([_draw(rng, SETTINGS, ROBOT.walking) for _ in range(4000)])
+    assert (commands >= ROBOT.walking.lower).all()
+    assert (commands <= ROBOT.walking.upper).all()
     still = (commands == 0).all(1)
     mixed_back = (commands[:, 0] < 0) & (commands[:, 1:] != 0).all(1)
-    fast = commands[:, 0] > 0.35
+    fast = commands[:, 0] > 0.7 * ROBOT.walking.forward
     assert still.mean() == pytest.approx(SETTINGS.stand, abs=0.02)
     assert mixed_back.mean() > SETTINGS.backward
     assert fast.mean() > 0.08
