@@ -54,7 +54,7 @@ def _parse(text: str, hint: Any) -> Any:
     """A value from a command line's text. Raises ValueError saying what was expected."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
-        if type(None) in arguments and text.lower() in ("none", "null", ""):
+        if type(None) in arguments and text.lower() in ("none", "null"):
             return None
         expected = []
         for option in (a for a in arguments if a is not type(None)):
@@ -84,6 +84,8 @@ def _parse(text: str, hint: Any) -> Any:
             raise ValueError(f"one of {', '.join(map(str, arguments))}")
         return text
     if hint is str:
+        if not text:
+            raise ValueError("words, such as 'walk forward', or none")
         return text
     if hint is Path:
         return Path(text)

@@ -68,6 +68,7 @@ VERBS: dict[str, Verb] = {
             "kill": Verb("what becomes of the servos when the controller is killed", "servoid.tools.faults.kill"),
             "interrupt": Verb("whether torque is off after Ctrl-C at any instant", "servoid.tools.faults.interrupt"),
             "bus": Verb("time of a control cycle on the servo bus", "servoid.tools.bench.bus"),
+            "clients": Verb("what other people's clients do, against the virtual rig", "servoid.tools.bench.clients"),
             "faults": Verb("what faults of the rig do to a walking robot", "servoid.tools.faults.campaign"),
             "soak": Verb("long walk over a line that loses packets", "servoid.tools.faults.soak"),
             "fuzz": Verb("random bytes into everything that reads bytes", "servoid.tools.faults.fuzz"),

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.body import Clock
-from servoid.hw.contracts.task import Task
+from servoid.hw.contracts.task import Assignment, Behaviour
 from servoid.hw.robot.description import Robot
 from servoid.hw.seeds import teammate_seed
 from servoid.stack.control.policies import make_policy
@@ -31,7 +31,7 @@ _QUIET = {"phase", "task", "first"}  # kinds of events of others that the first 
 
 @dataclass(frozen=True)
 class _Member:
-    task: Task
+    behaviour: Behaviour
     guard: Guard
     loop: Loop
 
@@ -48,31 +48,33 @@ class Teammates:
         self,
         settings: RunSettings,
         robot: Robot,
-        tasks: tuple[Task, ...],
+        assignment: Assignment,
+        behaviours: Sequence[Behaviour],
         body: Backend,
         first: Guard,
         interrupt: Interrupt,
     ) -> None:
-        """`body` is the first robot's, whose world has a body for each of `tasks`, and `first` its guard."""
+        """`body` is the first robot's, whose world has a body for each of `behaviours`, and `first` its guard."""
         assert body.simulation is not None
         self._first, self._interrupt, self._robot = first, interrupt, robot
         self._clock: Clock = body.clock
         self._heard: list[Event] = []  # why the first robot ended: the others end with it
         self._open = ExitStack()
         self._members: list[_Member] = []
-        for number, (task, other) in enumerate(zip(tasks, body.simulation.teammates, strict=True), 1):
+        unpushed = replace(assignment, episode=replace(assignment.episode, pushes={}))  # it is the first that is pushed
+        for number, (behaviour, other) in enumerate(zip(behaviours, body.simulation.teammates, strict=True), 1):
             # Its planner never runs beside the loop: the log, which is the first robot's, has to repeat it.
-            policy = make_policy(settings.policy, robot, task, realtime=False)
+            policy = make_policy(settings.policy, robot, assignment.task, realtime=False)
             self._open.callback(policy.close)
             policy.reset(None, np.array(teammate_seed(settings.seed, number)))
             sensors, motors = other.connect()
             self._open.callback(other.close)
             guard = Guard(robot, motors, settings.gain)
             controlled = ControlledRobot(robot, sensors, Estimator(robot, load_odometry(robot)), guard)
-            phases = Phases(controlled, task, policy, other.simulation)
+            phases = Phases(controlled, unpushed, behaviour, policy, other.simulation)
             schedule, stops = Schedule(other.clock, robot.rate), Stops(Interrupt(), script=self._heard)
             loop = Loop(controlled, phases, schedule, interrupt, stops, (self._listener(number),))
-            self._members.append(_Member(task, guard, loop))
+            self._members.append(_Member(behaviour, guard, loop))
 
     def __call__(self, record: TickRecord) -> None:
         if record.phase in _ENDING and not self._heard:
@@ -94,7 +96,7 @@ class Teammates:
             if not member.guard.off:
                 member.loop.tick()
             if member.guard.phase in _ENDING:
-                member.task.lost()
+                member.behaviour.lost()
 
     def finish(self) -> None:
         """Time goes on until all have been lowered; at once off where a person interrupted twice."""

@@ -10,7 +10,7 @@ import numpy as np
 from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Observation
 from servoid.hw.contracts.control import Instruction, Policy, State
-from servoid.hw.contracts.task import Task, Trace
+from servoid.hw.contracts.task import Assignment, Behaviour, Trace
 from servoid.stack.estimation.sample_hold import missing
 from servoid.stack.log.tick import Proposal
 from servoid.stack.log.trace_buffer import TraceBuffer
@@ -25,17 +25,23 @@ SETTLE_SECONDS = 1.5  # standing still at home, in which the estimator learns th
 
 class Phases:
     """Supervises a run. On hardware, without a `simulation`, nothing pushes the robot; where no surroundings are seen,
-    the task says what should be there."""
+    the behaviour says what should be there."""
 
     def __init__(
-        self, controlled: ControlledRobot, task: Task, policy: Policy, simulation: Simulation | None = None
+        self,
+        controlled: ControlledRobot,
+        assignment: Assignment,
+        behaviour: Behaviour,
+        policy: Policy,
+        simulation: Simulation | None = None,
     ) -> None:
         self._robot, self._guard, self._estimator = controlled.robot, controlled.guard, controlled.estimator
-        self._task, self._policy, self._simulation = task, policy, simulation
+        self._behaviour, self._policy, self._simulation = behaviour, policy, simulation
+        self._seconds, self._pushes = assignment.task.seconds, assignment.episode.pushes
         surroundings = None if simulation is None else simulation.surroundings
-        self._look = task.percept if surroundings is None else surroundings.look
+        self._look = behaviour.percept if surroundings is None else surroundings.look
         self._settled = 0
-        self._buffer = TraceBuffer(len(self._robot.joints), round(task.seconds / self._robot.dt))
+        self._buffer = TraceBuffer(len(self._robot.joints), round(self._seconds / self._robot.dt))
         self.ended: str | None = None  # "done" or "time", if the task ended by itself
 
     @property
@@ -74,14 +80,14 @@ class Phases:
     def _do_task(self, state: State) -> Proposal:
         tick = self.task_ticks
         percept = self._look(state)
-        instruction = self._task.instruct(tick, state, percept)
+        instruction = self._behaviour.instruct(tick, state, percept)
         self._buffer.add(state, instruction, percept)
         shown = Proposal(instruction=instruction, percept=percept)
-        if self._task.done(state):
+        if self._behaviour.done(state):
             return self._end("done", DONE, shown, state)
-        if tick * self._robot.dt >= self._task.seconds:
-            return self._end("time", f"{self._task.seconds:g} s are over", shown, state)
-        velocity = self._task.disturbance(tick)
+        if tick * self._robot.dt >= self._seconds:
+            return self._end("time", f"{self._seconds:g} s are over", shown, state)
+        velocity = self._pushes.get(tick)
         if velocity is not None and self._simulation is not None:
             self._simulation.push(velocity)
         try:

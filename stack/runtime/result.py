@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from servoid.hw.contracts.task import Task, Trace
+from servoid.hw.contracts.task import Assignment, Trace
 from servoid.stack.log.format import event_message, plain
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.phases import Phases
@@ -56,10 +56,12 @@ class Tally:
             self._late.append(record.timing.late)
             self._missed += record.timing.missed
 
-    def result(self, phases: Phases, guard: Guard, task: Task, log: Path | None, interrupted: bool) -> Result:
+    def result(
+        self, phases: Phases, guard: Guard, assignment: Assignment, log: Path | None, interrupted: bool
+    ) -> Result:
         """How the run went, once it has ended."""
         trace = phases.trace()
-        success = bool(phases.ended is not None and task.success(trace))
+        success = bool(phases.ended is not None and assignment.success(trace))
         late = np.array(self._late or [0], dtype=float) * 1e-6
         return Result(
             outcome=_outcome(phases, guard, success, trace),
@@ -69,7 +71,7 @@ class Tally:
             missed=self._missed,
             late_p50_ms=float(np.percentile(late, 50)),
             late_p99_ms=float(np.percentile(late, 99)),
-            metrics=task.metrics(trace) if phases.task_ticks else {},
+            metrics=assignment.metrics(trace) if phases.task_ticks else {},
             events=tuple(self.events),
             trace=trace,
             log=log,

@@ -12,7 +12,7 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.control import Policy
-from servoid.hw.contracts.task import Task
+from servoid.hw.contracts.task import Assignment, Behaviour, Task
 from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.calibration import calibrated
 from servoid.hw.robot.description import Robot, load_robot
@@ -34,7 +34,8 @@ from servoid.stack.runtime.result import Result, Tally
 from servoid.stack.runtime.settings import RunSettings, Script
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Guard
-from servoid.stack.tasks import load_task
+from servoid.stack.tasks import load_task, source
+from servoid.stack.tasks.steer import SteeredAgain
 
 Confirm = Callable[[str], None]
 
@@ -62,20 +63,19 @@ def run(
         return one.report()
 
 
-def prepare(settings: RunSettings) -> tuple[Task, Backend]:
+def prepare(settings: RunSettings) -> tuple[Assignment, Backend]:
     """The task of a run, its episode drawn, and the simulated body with its scene, for `run` and for judging it.
 
     Raises ConfigError like `run`.
     """
     robot = load_robot(settings.robot)
-    task = _task(settings, robot)
-    return task, _body(settings, robot, start_task(task, settings.seed))
+    assignment = draw(_task(settings, robot), settings.seed)
+    return assignment, _body(settings, robot, assignment.episode.scene)
 
 
-def start_task(task: Task, seed: int) -> Scene | None:
-    """Draw the episode that a run with this seed does; its scene."""
-    task.reset(generator(seed, Stream.TASK))
-    return task.scene()
+def draw(task: Task, seed: int) -> Assignment:
+    """The episode that a run with this seed does."""
+    return Assignment(task, task.scenario(generator(seed, Stream.TASK)))
 
 
 class Run:
@@ -83,7 +83,8 @@ class Run:
     holds."""
 
     robot: Robot
-    task: Task
+    assignment: Assignment
+    behaviour: Behaviour
     body: Backend
     policy: Policy
     guard: Guard
@@ -118,7 +119,7 @@ class Run:
         """Choose robot, task and body, and check that they go together; nothing is connected. Raises ConfigError."""
         settings, backend = self.settings, self._backend
         self.robot = load_robot(settings.robot)
-        self.task = _task(settings, self.robot)
+        task = _task(settings, self.robot)
         simulated = backend_kind(settings.backend).simulated if backend is None else backend.simulation is not None
         self.realtime = not simulated if settings.realtime is None else settings.realtime
         if not (simulated or settings.start or self._confirm):
@@ -128,26 +129,25 @@ class Run:
         self._odometry = load_odometry(self.robot)
         if settings.record is not None:
             check_new(settings.record)
-        if self._script.velocities is not None:
-            self.task.steer_by(self._script.velocities, self._script.ended)
-        scene = start_task(self.task, settings.seed)
+        self.assignment = draw(task, settings.seed)
         assembled = self.robot
         if not simulated and backend is None:
             assembled, self._assembly = calibrated(self.robot)
-        self.body = backend or _body(settings, assembled, scene)
-        self._check(scene)
+        self.body = backend or _body(settings, assembled, self.assignment.episode.scene)
+        self._check()
 
-    def _check(self, scene: Scene | None) -> None:
+    def _check(self) -> None:
         """Raise ConfigError where the task asks for what body or policy do not have."""
-        task, simulation = self.task, self.body.simulation
+        name, episode, simulation = self.assignment.task.name, self.assignment.episode, self.body.simulation
+        scene = episode.scene
         if scene is not None and simulation is not None and simulation.surroundings is None:
             raise ConfigError(
-                f"task '{task.name}' has a scene: make the backend with it (servoid.stack.runtime.run.prepare does)"
+                f"task '{name}' has a scene: make the backend with it (servoid.stack.runtime.run.prepare does)"
             )
-        if task.teammates and self._policy is not None:
-            robots = len(task.teammates) + 1
-            raise ConfigError(f"task '{task.name}' has {robots} robots, each with its own policy: name one instead")
-        if task.pushes and simulation is None:
+        if scene is not None and scene.robots is not None and self._policy is not None:
+            robots = len(scene.robots) + 1
+            raise ConfigError(f"task '{name}' has {robots} robots, each with its own policy: name one instead")
+        if episode.pushes and simulation is None:
             raise ConfigError(f"backend '{self.body.name}' cannot push the robot: drop the task's push setting")
 
     def connect(self) -> None:
@@ -155,8 +155,9 @@ class Run:
 
         Raises ConfigError where the policy does not fit, BackendError where the body cannot be reached.
         """
-        settings, task, body, robot = self.settings, self.task, self.body, self.robot
-        self._open.callback(task.close)
+        settings, task, body, robot = self.settings, self.assignment.task, self.body, self.robot
+        self.behaviour = self._behaviour()
+        self._open.callback(self.behaviour.close)
         self._open.enter_context(self._interrupt)
         self.policy = self._policy or make_policy(settings.policy, robot, task, self.realtime)
         self._open.callback(self.policy.close)
@@ -174,15 +175,15 @@ class Run:
         if self._assembly is not None:
             self.guard.note("system", self._assembly)
         self._controlled = ControlledRobot(robot, sensors, Estimator(robot, self._odometry), self.guard)
-        self.phases = Phases(self._controlled, task, self.policy, body.simulation)
+        self.phases = Phases(self._controlled, self.assignment, self.behaviour, self.policy, body.simulation)
 
     def loop(self) -> None:
         """Do the ticks of the run, until torque is off. Raises BackendError where the body cannot be reached."""
         listeners: list[Listener] = [self._tally]
         clock = self.body.clock
-        if self.task.teammates:
+        if behaviours := self.behaviour.teammates:
             clock = self._teammates = Teammates(
-                self.settings, self.robot, self.task.teammates, self.body, self.guard, self._interrupt
+                self.settings, self.robot, self.assignment, behaviours, self.body, self.guard, self._interrupt
             )
             self._open.callback(self._teammates.close)
             listeners.append(self._teammates)
@@ -211,18 +212,24 @@ class Run:
         last = self.guard.events()
         self._tally.events += last
         told = self._interrupt.count > 0
-        result = self._tally.result(self.phases, self.guard, self.task, self.settings.record, told)
+        result = self._tally.result(self.phases, self.guard, self.assignment, self.settings.record, told)
         if self._recorder is not None:
             self._recorder.events(last)
             self._recorder.close(result.summary())
             result = _with_failure(result, self._recorder.error)
         return result
 
+    def _behaviour(self) -> Behaviour:
+        assignment, steered = self.assignment, self._script.velocities
+        if assignment.task.steered and steered is not None:
+            return SteeredAgain(steered, self._script.ended)
+        return assignment.task.behaviour(assignment.episode)
+
     def _record(self) -> Recorder:
         settings, own = self.settings, self._policy
         assert settings.record is not None
         policy = policy_fingerprint(settings.policy) if own is None else {"name": type(own).__qualname__}
-        facts = header(settings, self.robot, self.task, self.body.name, policy)
+        facts = header(settings, self.robot, self.assignment, source(settings.task), self.body.name, policy)
         wait = self.body.simulation is not None and not self.realtime
         self._recorder = Recorder.create(settings.record, facts, wait=wait)
         return self._recorder
@@ -260,4 +267,4 @@ def _with_failure(result: Result, error: str | None) -> Result:
     return replace(result, events=(*result.events, Event(last.tick, last.time, "record", None, error)))
 
 
-__all__ = ["Result", "Run", "RunSettings", "Script", "prepare", "run", "start_task"]
+__all__ = ["Result", "Run", "RunSettings", "Script", "draw", "prepare", "run"]

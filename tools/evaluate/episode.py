@@ -57,9 +57,9 @@ def record(settings: RunSettings) -> dict[str, Any]:
     from servoid.tools.common.motion_quality import quality
 
     judged = judge(settings)
-    trace, task = judged.trace, judged.task
-    limit = round(task.seconds / trace.dt)
-    goal = task.goal if trace.goal is None else trace.goal[-1]
+    trace, assignment = judged.trace, judged.assignment
+    limit = round(assignment.task.seconds / trace.dt)
+    goal = assignment.episode.goal if trace.goal is None else trace.goal[-1]
     return {
         **judged.row,
         "ticks": min(judged.ground_truth.upright, limit),
