@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from servoid.hw.config import ConfigError, nearest
-from servoid.hw.dynamixel.tables import ControlTable, table
+from servoid.hw.dynamixel.protocol.tables import ControlTable, table
 from servoid.hw.robot.description import Robot
 from servoid.hw.seeds import Stream, generator
 

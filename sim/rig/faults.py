@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from servoid.hw.config import ConfigError, load_yaml, nearest
-from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.protocol import codec
 from servoid.hw.faults import ENCODER, INPUT_VOLTAGE, OVERHEATING, OVERLOAD, SHOCK
 from servoid.hw.robot.description import Robot
 from servoid.hw.seeds import Stream, generator

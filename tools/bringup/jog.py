@@ -137,8 +137,8 @@ def _announce(
 ) -> None:
     import numpy as np
 
+    from servoid.tools.bringup.calibration.turning import describe_turns
     from servoid.tools.bringup.jogging import SPEED
-    from servoid.tools.bringup.turning import describe_turns
 
     joint = robot.joints[i]
     report.line(

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from servoid.hw.clock import WallClock
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.port import SerialPort
-from servoid.hw.dynamixel.tables import table
+from servoid.hw.dynamixel.protocol.tables import table
+from servoid.hw.dynamixel.transport.bus import Bus
+from servoid.hw.dynamixel.transport.port import SerialPort
 from servoid.hw.robot.description import load_robot
 from servoid.sim.rig.process.control import RigProcess
 from servoid.stack.log.flightlog import read_log
