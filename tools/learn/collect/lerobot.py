@@ -89,8 +89,7 @@ def _part(out: Path) -> Path:
 class DatasetWriter:
     """A dataset being written to `out`; as a context manager, it leaves nothing behind when the block raises.
 
-    Every method raises ConfigError when
-    the disk does not take what is written.
+    Every method raises ConfigError when the disk does not take what is written.
     """
 
     def __init__(self, out: Path, schema: Schema, force: bool = False) -> None:
