@@ -48,7 +48,9 @@ def planner(settings: DiffusionSettings) -> Runtime:
 def actions(runtime: Runtime, requests: Sequence[PlanRequest], velocity: Sequence[float]) -> Array:
     """Planned actions `(requests, seeds, ticks, joints)` rad, without those that were committed."""
     asked = Instruction(np.array(velocity), text=AHEAD)
-    plans = [[runtime.plan(replace(one, instruction=asked), seed) for seed in SEEDS] for one in requests]
+    plans = [
+        [runtime.plan(replace(one, instruction=asked, seeds=np.array(seed))) for seed in SEEDS] for one in requests
+    ]
     return np.array([[plan.actions[SHIPPED.delay :] for plan in row] for row in plans])
 
 
@@ -78,8 +80,8 @@ class Told(BasePolicy):
     def __init__(self, policy: DiffusionPolicy) -> None:
         self._policy = policy
 
-    def reset(self, seed: int) -> None:
-        self._policy.reset(seed)
+    def reset(self, where: Array | None, seeds: Array) -> None:
+        self._policy.reset(where, seeds)
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         return self._policy.act(state, applied, replace(instruction, text=AHEAD))

@@ -163,7 +163,7 @@ def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path) -> None
     ran = []
 
     def do(job: EpisodeJob) -> EpisodeResult:
-        ran.append(load_settings(job.settings.policy).replan)
+        ran.append(load_settings(job.settings.policy).execution_horizon)
         mine.write_text("checkpoint: diffusion\nreplan: 8\n")
         return EpisodeResult(job, {"success": True})
 
@@ -173,7 +173,7 @@ def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path) -> None
 
 def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done: Episodes) -> None:
     stand = Row("t/stand", "Stand", Experiment("stand", episodes=3), SUCCESS)
-    variant = Row("t/variant", "Variant", Experiment("goal-near", plan={"replan": "8"}), SUCCESS)
+    variant = Row("t/variant", "Variant", Experiment("goal-near", plan={"execution_horizon": "8"}), SUCCESS)
     measured = evaluate([stand, variant, FAR], options(tmp_path), done)
     assert measured["t/stand"].refused == "the floor is missing"
     assert sum(job.settings.task == "stand" for job in done.jobs) == 1
