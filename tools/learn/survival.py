@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from servoid.hw.robot.description import load_robot
+from servoid.tools.learn.progress import counted
 
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
@@ -76,7 +77,7 @@ def survival_of(
     command = np.zeros((worlds, 3))
     alive, errors = everything.copy(), []
     smooth = np.zeros((worlds, 2))
-    for tick in range(round(seconds * robot.rate)):
+    for tick in counted(round(seconds * robot.rate), "walking"):
         if tick % _CHANGE == 25:
             command = np.array([rng.uniform([-0.1, -0.1, -0.8], [0.3, 0.1, 0.8]) for rng in fleet.rngs])
         if tick % _PUSH_EVERY == 0 and tick:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from servoid.hw.config import ConfigError
-from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.config import DenoiserConfig, Objective
 from servoid.policy.diffusion.denoiser import Denoiser
 from servoid.policy.diffusion.sampler import Diverged, Guidance, Known, Sampler, classifier_free
 from servoid.policy.diffusion.schedule import autoregressive, cosine_signal, full_sequence, rolling
@@ -229,7 +229,9 @@ def planner() -> tuple[Denoiser, Sampler]:
         z = torch.randn(64, 1, 1, generator=generator)
         states = z.repeat(1, 5, 1)
         states[:, 0] = 0.0  # the present says nothing
-        loss = sum(losses(denoiser, states, z.repeat(1, 4, 1), None, signal, 0, generator))
+        loss = sum(
+            losses(denoiser, states, z.repeat(1, 4, 1), None, signal, generator, Objective(committed=0, monotone=0.0))
+        )
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

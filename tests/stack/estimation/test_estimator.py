@@ -15,7 +15,7 @@ from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import load_odometry
 from servoid.tools.learn.envs.fleet import Fleet
 from servoid.tools.learn.envs.walker import Walker, load_tracker
-from servoid.tools.learn.trainers.odometry import drift, driver
+from servoid.tools.learn.walks import drift, driver
 
 ROBOT = load_robot()
 
