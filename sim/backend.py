@@ -5,13 +5,13 @@ Where the scene has other robots, they are in the same world, each a body of its
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
+from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array, Command, Mode, Observation
-from servoid.hw.contracts.control import State
-from servoid.hw.contracts.world import Percept, Scene, World
+from servoid.hw.contracts.world import Scene, World
 from servoid.hw.robot.description import Robot
 from servoid.sim.model import build
 from servoid.sim.scene import Stage, count_robots
@@ -22,11 +22,7 @@ OTHERS_STREAM = 2  # distinguishes the other robots' random streams from others 
 
 
 class SimBackend:
-    """A robot in MuJoCo. `truth` and `stage` are for evaluation; of them, the loop is only shown what `look` sees.
-
-    `stage` is the scene in play, None without one. `others` are the bodies of the scene's other robots; `before_step`
-    is called before time goes on by a tick, for whoever drives them.
-    """
+    """A robot in MuJoCo. `stage` is the scene in play, None without one."""
 
     name = "sim"
 
@@ -45,12 +41,12 @@ class SimBackend:
         self._worlds.reset(np.arange(n), rngs, places=places if n > 1 else None)
         self._commands = [Command(robot.home, np.zeros(len(robot.joints)), Mode.OFF)] * n
         self.clock = SimClock(self)
-        self.before_step: Callable[[], None] = lambda: None
         self.stage: Stage | None = None
-        self.others: tuple[OtherBody, ...] = ()
+        teammates: tuple[Teammate, ...] = ()
         if scene is not None:
             self.stage = Stage(scene, self.truth, robot.dt, lambda places: self._worlds.move(0, places))
-            self.others = tuple(OtherBody(self, scene, number) for number in range(1, n))
+            teammates = tuple(Teammate(self, scene, number) for number in range(1, n))
+        self.simulation = Simulation(self.truth, self.push, self.stage, teammates)
 
     @property
     def truth(self) -> Truth:
@@ -68,42 +64,36 @@ class SimBackend:
 
     def push(self, velocity: Array) -> None:
         """Change the base's velocity by `(2,)` m/s, world frame."""
-        changes = np.zeros((self._worlds.n, 2))
-        changes[0] = velocity
-        self._worlds.push(changes)
-
-    def look(self, state: State) -> Percept:
-        """What the robot sees of the scene (see `servoid.hw.contracts.world.Surroundings`)."""
-        assert self.stage is not None, "there is no scene"
-        return self.stage.look(state)
+        self._push(0, velocity)
 
     def close(self) -> None:
         self._commands[0] = _off(self._commands[0])
 
     def _step(self) -> None:
         """Let time go on by a tick."""
-        self.before_step()
         position, gain = (np.stack([getattr(c, part) for c in self._commands]) for part in ("position", "gain"))
         modes = np.array([command.mode for command in self._commands])
         self._worlds.step(Command(position, gain, self._commands[0].mode), modes)
 
+    def _push(self, number: int, velocity: Array) -> None:
+        changes = np.zeros((self._worlds.n, 2))
+        changes[number] = velocity
+        self._worlds.push(changes)
 
-class OtherBody:
+
+class Teammate:
     """Another robot of the same world, by its number from 1 on. Its time goes on with the first one's."""
 
     def __init__(self, world: SimBackend, scene: Scene, number: int) -> None:
         self.name = world.name
         self._world, self._number = world, number
-        self._stage = Stage(scene, world.truth, world._robot.dt, lambda places: None, number)
-        self.clock = OtherClock(world.clock)
+        self.clock = TeammateClock(world.clock)
+        stage = Stage(scene, world.truth, world._robot.dt, lambda places: None, number)
+        self.simulation = Simulation(world.truth, partial(world._push, number), stage)
 
     def connect(self) -> tuple[SimSensors, SimMotors]:
         """It stands where the scene puts it, at its home pose with torque off."""
         return SimSensors(self._world._worlds, self._number), SimMotors(self._world, self._number)
-
-    def look(self, state: State) -> Percept:
-        """What it sees of the scene (see `servoid.hw.contracts.world.Surroundings`)."""
-        return self._stage.look(state)
 
     def close(self) -> None:
         self._world._commands[self._number] = _off(self._world._commands[self._number])
@@ -124,7 +114,7 @@ class SimClock:
             self._backend._step()
 
 
-class OtherClock:
+class TeammateClock:
     """Simulated time [ns] of a robot that is driven between two steps of the world, and never sleeps by itself."""
 
     def __init__(self, clock: SimClock) -> None:

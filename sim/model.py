@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -10,39 +14,61 @@ import mujoco
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.description import Robot, Servo
-from servoid.sim.multi_robot import add_others, prefix
-from servoid.sim.scene import FOUND, PREFIX, add_scene, count_robots
+from servoid.sim.multi_robot import ADDED, prefix, tell_apart
+from servoid.sim.scene import FOUND, SCENE, add_scene, count_robots
 
 TIMESTEP = 0.004  # s
+FLOOR = f"{ADDED}floor"
+# MuJoCo warns that such a model cannot be saved, which nobody does, and that options differ, which are left out.
+_EXPECTED = "Attaching a spec with an empty prefix|Attach conflict"
 _FORCE, _NET = 2, 3  # data bit beside FOUND, and reduction, of MuJoCo's contact sensor
 
 
 def build(robot: Robot, scene: Scene | None = None) -> mujoco.MjModel:
     """Compile the model of `robot` on a floor, with a scene. Actuator i drives joint i of the robot's file.
 
-    The MJCF's own actuators, sensors and keyframes are replaced. Raises ConfigError naming what the MJCF lacks or the
-    joint whose servo cannot be simulated beside the others, and for a scene of other robots and obstacles: what a robot
-    feels is told by its place among robots alone.
+    Raises ConfigError like `spec`, where MuJoCo cannot compile the body, and for a scene of other robots and obstacles:
+    what a robot feels is told by its place among robots alone.
     """
     result = spec(robot, robots := count_robots(scene))
     if scene is not None:
         if robots > 1 and len(scene.pillars) + len(scene.spheres):
             raise ConfigError("a scene has other robots, or pillars and spheres, but not yet both")
         add_scene(result, scene)
-    return result.compile()
+    model = compiled(result, robot)
+    _check_soles(model, robot)
+    return model
+
+
+def compiled(model: mujoco.MjSpec, robot: Robot) -> mujoco.MjModel:
+    """The model that `spec` made. Raises ConfigError where MuJoCo cannot compile the body."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", _EXPECTED)
+        try:
+            return model.compile()
+        except ValueError as error:
+            raise ConfigError(f"{robot.mjcf}: MuJoCo cannot compile it: {' '.join(str(error).split())}") from error
 
 
 def spec(robot: Robot, robots: int = 1) -> mujoco.MjSpec:
-    """The editable model of so many times `robot`, for scenes that add bodies to it. Raises ConfigError."""
+    """The editable model of so many times `robot`, for scenes that add bodies to it.
+
+    Of the MJCF only the robot's base and what hangs on it are taken: its actuators, sensors, keyframes, options, floor
+    and other bodies are left out, its defaults hold for its own elements alone. Raises ConfigError naming what the MJCF
+    lacks, or the joint whose servo cannot be simulated beside the others.
+    """
     _check_delays(robot)
-    result = _load(robot)
+    result = mujoco.MjSpec()
+    result.modelname = robot.name
     result.option.timestep = TIMESTEP
     result.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     result.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # 4.0.0's sparse Newton solver has a bug
     result.option.iterations, result.option.ls_iterations = 10, 10
-    _add_floor(result)
+    for number in range(robots):
+        _add_body(result, robot, number)
     if robots > 1:
-        add_others(result, robot.base, lambda: _load(robot), robots)
+        tell_apart(result, robot.base, robots)
+    _add_floor(result)
     for number in range(robots):
         for joint, servo in zip(robot.joints, robot.servos, strict=True):
             _add_servo(result, prefix(number) + joint.name, servo)
@@ -50,23 +76,42 @@ def spec(robot: Robot, robots: int = 1) -> mujoco.MjSpec:
     return result
 
 
-def _load(robot: Robot) -> mujoco.MjSpec:
-    """The body of `robot` alone. Raises ConfigError."""
+def _add_body(model: mujoco.MjSpec, robot: Robot, number: int) -> None:
+    """Put the body of the robot with this number into the world. Raises ConfigError."""
     path = Path(robot.mjcf)
     if not path.is_file():
         raise ConfigError(f"{robot.name}: mjcf: no such file: {path}")
     try:
-        result = mujoco.MjSpec.from_file(str(path))
+        body = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise ConfigError(f"{path}: not a valid MJCF: {error}") from error
-    _check(result, robot, path)
-    for element in [*result.actuators, *result.sensors, *result.keys]:
-        result.delete(element)
-    return result
+    _check(body, robot, path)
+    for element in [*body.actuators, *body.sensors, *body.keys]:
+        body.delete(element)
+    with _heard() as warned:
+        model.worldbody.add_frame().attach_body(body.body(robot.base), prefix(number), "")
+    for text in warned:
+        if not re.match(_EXPECTED, text):
+            warnings.warn(f"{path}: {text}", stacklevel=2)
+    base = model.body(prefix(number) + robot.base)
+    for part in [base, *base.find_all("body")]:
+        part.gravcomp = 0.0
+
+
+@contextmanager
+def _heard() -> Iterator[list[str]]:
+    """What MuJoCo warns of meanwhile, instead of its standard error and a file in whatever folder this is."""
+    warned: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(warned.append)
+    try:
+        yield warned
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
-    """Refuse a model that lacks what the robot's file names."""
+    """Refuse a model that lacks what the robot's file names, or whose base and joints are of another kind."""
 
     def need(kind: str, wanted: str, present: list[str]) -> None:
         if wanted not in present:
@@ -74,18 +119,41 @@ def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
             hint = f"; nearest: {near[0]}" if near else ""
             raise ConfigError(f"{path}: no {kind} named {wanted!r}, which robot {robot.name!r} needs{hint}")
 
-    joints = [joint.name for joint in model.joints]
-    for joint in robot.joints:
-        need("joint", joint.name, joints)
     need("body", robot.base, [body.name for body in model.bodies])
-    need("site (the IMU's)", robot.imu_site, [site.name for site in model.sites])
-    geoms = [geom.name for geom in model.geoms]
+    base = model.body(robot.base)
+    if base.parent.name != "world":
+        raise ConfigError(
+            f"{path}: body {robot.base!r} hangs on {base.parent.name!r}: a robot's base must be a child of <worldbody>"
+        )
+    if [joint.type for joint in base.joints] != [mujoco.mjtJoint.mjJNT_FREE]:
+        raise ConfigError(
+            f"{path}: body {robot.base!r} has no joint of its own but <freejoint/>, as a base needs: "
+            f"it has {', '.join(repr(joint.name) for joint in base.joints) or 'none'}"
+        )
+    kinds = {joint.name: joint.type for joint in base.find_all("joint")}
+    for joint in robot.joints:
+        need("joint", joint.name, list(kinds))
+        if kinds[joint.name] != mujoco.mjtJoint.mjJNT_HINGE:
+            raise ConfigError(f"{path}: joint {joint.name!r} is no hinge, and a servo turns")
+    need("site (the IMU's)", robot.imu_site, [site.name for site in base.find_all("site")])
+    geoms = [geom.name for geom in base.find_all("geom")]
     for foot in robot.feet.values():
         for geom in foot.geoms:
             need("geom (of a sole)", geom, geoms)
-    extra = [name for joint in model.joints if (name := joint.name) not in robot.names and joint.type != 0]
+    own = [joint.name for joint in base.joints]
+    extra = [name for name in kinds if name not in robot.names and name not in own]
     if extra:
         raise ConfigError(f"{path}: joints that robot {robot.name!r} does not list: {', '.join(extra)}")
+
+
+def _check_soles(model: mujoco.MjModel, robot: Robot) -> None:
+    """Refuse soles that the robot cannot stand on."""
+    for geom in (model.geom(name) for foot in robot.feet.values() for name in foot.geoms):
+        if not (int(geom.contype[0]) | int(geom.conaffinity[0])) & 1:
+            raise ConfigError(
+                f"{robot.mjcf}: geom {geom.name!r}, of a sole, passes through the floor: "
+                "give its contype or conaffinity the bit 1"
+            )
 
 
 def _check_delays(robot: Robot) -> None:
@@ -102,10 +170,8 @@ def _check_delays(robot: Robot) -> None:
 
 
 def _add_floor(model: mujoco.MjSpec) -> None:
-    if any(geom.name == "floor" for geom in model.geoms):
-        return
     model.add_texture(
-        name="floor",
+        name=FLOOR,
         type=mujoco.mjtTexture.mjTEXTURE_2D,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
         rgb1=[0.78, 0.80, 0.83],
@@ -114,10 +180,10 @@ def _add_floor(model: mujoco.MjSpec) -> None:
         height=256,
     )
     textures = [""] * mujoco.mjtTextureRole.mjNTEXROLE
-    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
-    model.add_material(name="floor", textures=textures, texrepeat=[5, 5], texuniform=True)
+    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = FLOOR
+    model.add_material(name=FLOOR, textures=textures, texrepeat=[5, 5], texuniform=True)
     model.add_texture(
-        name="sky",
+        name=f"{ADDED}sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
         rgb1=[0.90, 0.94, 0.98],
@@ -126,12 +192,12 @@ def _add_floor(model: mujoco.MjSpec) -> None:
         height=128,
     )
     model.worldbody.add_geom(
-        name="floor",
+        name=FLOOR,
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=[0, 0, 0.05],
-        material="floor",
+        material=FLOOR,
         contype=1,
-        conaffinity=0,
+        conaffinity=1,  # some models' soles have a type alone, some an affinity alone
         friction=[0.8, 0.005, 0.0001],
         priority=1,  # the floor's friction counts, so that randomising one number is enough
         solref=[0.008, 1.0],
@@ -150,6 +216,11 @@ def _add_servo(model: mujoco.MjSpec, name: str, servo: Servo) -> None:
     joint.damping = [servo.damping, 0, 0]
     joint.frictionloss = servo.friction
     joint.armature = servo.armature
+    # Springs, ends and force limits of the file are those of another motor, or of its defaults.
+    joint.stiffness, joint.springref = [0, 0, 0], 0.0
+    joint.limited = joint.actfrclimited = False
+    joint.range = joint.actfrcrange = [0, 0]
+    joint.actgravcomp = False
     k = servo.voltage / servo.no_load_speed
     r = k * servo.voltage / servo.stall_torque
     actuator = model.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
@@ -169,19 +240,26 @@ def _add_sensors(model: mujoco.MjSpec, robot: Robot, number: int, robots: int) -
     def add(name: str, sensor: int, objtype: int, objname: str, **more: object) -> None:
         model.add_sensor(name=own + name, type=sensor, objtype=objtype, objname=objname, **more)
 
-    add("gyro", kind.mjSENS_GYRO, obj.mjOBJ_SITE, own + robot.imu_site)
-    add("accelerometer", kind.mjSENS_ACCELEROMETER, obj.mjOBJ_SITE, own + robot.imu_site)
+    add(f"{ADDED}gyro", kind.mjSENS_GYRO, obj.mjOBJ_SITE, own + robot.imu_site)
+    add(f"{ADDED}accelerometer", kind.mjSENS_ACCELEROMETER, obj.mjOBJ_SITE, own + robot.imu_site)
     whole = {"reftype": obj.mjOBJ_XBODY, "refname": own + robot.base}
-    add("floor", kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, "floor", intprm=[FOUND, 0, 1], **whole)
+    add(FLOOR, kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, FLOOR, intprm=[FOUND, 0, 1], **whole)
     for name, foot in robot.feet.items():
         body = model.geom(own + foot.geoms[0]).parent
-        site = f"{name}_foot"
-        body.add_site(name=own + site, pos=foot.sole, group=4)
+        site = f"{own}{ADDED}{name}_foot"
+        body.add_site(name=site, pos=foot.sole, group=4)
         sole = {"reftype": obj.mjOBJ_BODY, "refname": body.name}
-        add(f"{name}_contact", kind.mjSENS_CONTACT, obj.mjOBJ_GEOM, "floor", intprm=[FOUND | _FORCE, _NET, 1], **sole)
-        add(f"{name}_position", kind.mjSENS_FRAMEPOS, obj.mjOBJ_SITE, own + site)
-        add(f"{name}_velocity", kind.mjSENS_FRAMELINVEL, obj.mjOBJ_SITE, own + site)
-        add(f"{name}_up", kind.mjSENS_FRAMEZAXIS, obj.mjOBJ_SITE, own + site)
+        add(
+            f"{ADDED}{name}_contact",
+            kind.mjSENS_CONTACT,
+            obj.mjOBJ_GEOM,
+            FLOOR,
+            intprm=[FOUND | _FORCE, _NET, 1],
+            **sole,
+        )
+        add(f"{ADDED}{name}_position", kind.mjSENS_FRAMEPOS, obj.mjOBJ_SITE, site)
+        add(f"{ADDED}{name}_velocity", kind.mjSENS_FRAMELINVEL, obj.mjOBJ_SITE, site)
+        add(f"{ADDED}{name}_up", kind.mjSENS_FRAMEZAXIS, obj.mjOBJ_SITE, site)
     for other in (i for i in range(robots) if i != number):  # of the scene's sensors: what it touches beside the floor
         base = prefix(other) + robot.base
-        add(f"{PREFIX}robot{other}", kind.mjSENS_CONTACT, obj.mjOBJ_XBODY, base, intprm=[FOUND, 0, 1], **whole)
+        add(f"{SCENE}robot{other}", kind.mjSENS_CONTACT, obj.mjOBJ_XBODY, base, intprm=[FOUND, 0, 1], **whole)

@@ -7,7 +7,7 @@ holds for the others by its place in the block.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -16,6 +16,7 @@ from mujoco.batch import Batch
 
 from servoid.hw.contracts.body import Array
 
+ADDED = "servoid/"  # what all names begin with that are added to those of a robot's own file
 _BIT = 8  # the first of the collision bits that tell robots apart; a robot's own file uses those below
 
 
@@ -24,13 +25,8 @@ def prefix(number: int) -> str:
     return f"robot{number}/" if number else ""
 
 
-def add_others(model: mujoco.MjSpec, base: str, load: Callable[[], mujoco.MjSpec], robots: int) -> None:
-    """Put more robots, which `load` makes, into a model that has one, until there are `robots`.
-
-    Whatever of one can be touched, touches whatever of another can.
-    """
-    for number in range(1, robots):
-        model.worldbody.add_frame().attach_body(load().body(base), prefix(number), "")
+def tell_apart(model: mujoco.MjSpec, base: str, robots: int) -> None:
+    """Let whatever of one robot can be touched touch whatever of another can; their bases are named `base`."""
     everyone = sum(1 << (_BIT + number) for number in range(robots))
     for number in range(robots):
         own = 1 << (_BIT + number)

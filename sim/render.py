@@ -13,7 +13,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
-from servoid.sim.model import spec
+from servoid.sim.model import compiled, spec
 from servoid.sim.multi_robot import prefix
 from servoid.sim.scene import PILLAR_COLOUR, PILLAR_HEIGHT, SPHERE_COLOUR
 
@@ -51,7 +51,7 @@ def render(robot: Robot, frames: list[Frame], width: int = 640, height: int = 48
     Raises RenderError when there is no way to draw.
     """
     others = 0 if not frames or frames[0].robots is None else len(frames[0].robots)
-    model = spec(robot, 1 + others).compile()
+    model = compiled(spec(robot, 1 + others), robot)
     model.vis.quality.offsamples = 0  # in software, smoothing costs 28 against 400 ms a picture
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     data = mujoco.MjData(model)

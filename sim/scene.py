@@ -11,9 +11,9 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
 from servoid.hw.contracts.world import Percept, Scene, Truth
-from servoid.sim.multi_robot import prefix
+from servoid.sim.multi_robot import ADDED, prefix
 
-PREFIX = "scene/"  # of the names of a scene's bodies, which follow the robot's
+SCENE = f"{ADDED}scene/"  # of the names of a scene's bodies, which follow the robot's
 PILLAR_HEIGHT = 0.4  # m: taller than the robot's shoulders
 PILLAR_COLOUR, SPHERE_COLOUR = (0.55, 0.42, 0.32, 1.0), (0.80, 0.20, 0.20, 1.0)
 FOUND = 1  # data bit of MuJoCo's contact sensor
@@ -24,11 +24,11 @@ def add_scene(model: mujoco.MjSpec, scene: Scene) -> None:
     collides with the floor."""
     bodies = []
     if len(scene.pillars):
-        bodies.append(model.worldbody.add_body(name=f"{PREFIX}pillars"))
+        bodies.append(model.worldbody.add_body(name=f"{SCENE}pillars"))
         for x, y, radius in scene.pillars:
             _add_geom(bodies[0], mujoco.mjtGeom.mjGEOM_CYLINDER, [radius, PILLAR_HEIGHT / 2, 0], PILLAR_COLOUR, [x, y])
     for number, (x, y, radius, _) in enumerate(scene.spheres):
-        body = model.worldbody.add_body(name=f"{PREFIX}sphere{number}", mocap=True, pos=[x, y, radius])
+        body = model.worldbody.add_body(name=f"{SCENE}sphere{number}", mocap=True, pos=[x, y, radius])
         _add_geom(body, mujoco.mjtGeom.mjGEOM_SPHERE, [radius, 0, 0], SPHERE_COLOUR)
         bodies.append(body)
     for body in bodies:
@@ -46,7 +46,7 @@ def _add_geom(
 ) -> None:
     height = size[1] if kind == mujoco.mjtGeom.mjGEOM_CYLINDER else 0.0
     body.add_geom(
-        type=kind, size=size, pos=[*at, height], rgba=colour, contype=1, conaffinity=0, condim=3, solref=[0.008, 1.0]
+        type=kind, size=size, pos=[*at, height], rgba=colour, contype=1, conaffinity=1, condim=3, solref=[0.008, 1.0]
     )
 
 
@@ -57,13 +57,13 @@ def count_robots(scene: Scene | None) -> int:
 
 def robot_bodies(model: mujoco.MjModel) -> int:
     """How many of a model's bodies, the first ones, are the world's and the first robot's, and not a scene's."""
-    return next((i for i in range(model.nbody) if model.body(i).name.startswith((PREFIX, prefix(1)))), model.nbody)
+    return next((i for i in range(model.nbody) if model.body(i).name.startswith((SCENE, prefix(1)))), model.nbody)
 
 
 def scene_sensors(model: mujoco.MjModel) -> Array:
     """Addresses of the scene's contact sensors in the sensor data."""
     sensors = (model.sensor(i) for i in range(model.nsensor))
-    return np.array([int(s.adr[0]) for s in sensors if s.name.startswith(PREFIX)], dtype=int)
+    return np.array([int(s.adr[0]) for s in sensors if s.name.startswith(SCENE)], dtype=int)
 
 
 def plain(scene: Scene) -> dict[str, Any]:

@@ -6,7 +6,9 @@ import mujoco
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.geometry import turned, up_vector, yaw_of
 from servoid.hw.robot.description import Robot
+from servoid.sim.multi_robot import ADDED
 from servoid.sim.scene import scene_sensors
 
 FALL_HEIGHT = 0.6  # of the standing height
@@ -22,8 +24,9 @@ class Truth:
         """`recent` `(n, substeps, ...)` are the sensors at the substeps of the last tick; by default those of now."""
         self._robot, self._qpos, self._qvel, self._sensors = robot, qpos, qvel, sensors
         self._recent = sensors[:, None] if recent is None else recent
-        self._at = {model.sensor(i).name: slice(int(a := model.sensor(i).adr[0]), int(a + model.sensor(i).dim[0]))
-                    for i in range(model.nsensor)}  # fmt: skip
+        views = [model.sensor(i) for i in range(model.nsensor)]
+        starts = {sensor.name.removeprefix(ADDED): (int(sensor.adr[0]), int(sensor.dim[0])) for sensor in views}
+        self._at = {name: slice(start, start + size) for name, (start, size) in starts.items()}
         self._scene = scene_sensors(model)
         joints = [model.joint(name) for name in robot.names]
         self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
@@ -50,14 +53,12 @@ class Truth:
     @property
     def yaw(self) -> Array:
         """Heading `(n,)` rad in -pi..pi."""
-        w, x, y, z = self.orientation.T
-        return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return yaw_of(self.orientation)
 
     @property
     def gravity(self) -> Array:
         """Unit vector along gravity in the base frame `(n, 3)`."""
-        w, x, y, z = self.orientation.T
-        return -np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1)
+        return -up_vector(self.orientation)
 
     @property
     def tilt(self) -> Array:
@@ -67,9 +68,7 @@ class Truth:
     @property
     def velocity(self) -> Array:
         """Base velocity `(n, 3)` m/s in the heading frame."""
-        c, s = np.cos(self.yaw), np.sin(self.yaw)
-        vx, vy, vz = self._qvel[:, 0:3].T
-        return np.stack([c * vx + s * vy, -s * vx + c * vy, vz], -1)
+        return turned(self._qvel[:, 0:3], -self.yaw)
 
     @property
     def angular_velocity(self) -> Array:

@@ -14,9 +14,10 @@ from mujoco.batch import Batch
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array, Command, Mode, Observation
+from servoid.hw.geometry import headed
 from servoid.hw.robot.description import Imu, Robot
 from servoid.hw.robot.legs import Legs
-from servoid.sim.model import TIMESTEP, build
+from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.multi_robot import Crowd
 from servoid.sim.randomise import Body, draw, longest
 from servoid.sim.scene import robot_bodies
@@ -78,7 +79,7 @@ class Worlds:
         self._gain, self._force = b.expand("actuator_gainprm"), b.expand("actuator_forcerange")
         if self.model.nmocap:
             self._mocap = b.bind("mocap_pos")
-        self._floor = b.expand("geom_friction")[:, self.model.geom("floor").id]
+        self._floor = b.expand("geom_friction")[:, self.model.geom(FLOOR).id]
         if randomise > 0:
             self._mass, self._inertia = b.expand("body_mass"), b.expand("body_inertia")
         self.bodies: list[Body | None] = [None] * n
@@ -120,7 +121,7 @@ class Worlds:
         self._state_qpos[ids, 2], self._state_qpos[ids, 3:7] = self._legs.stand(pose - self._zero[ids])
         if places is not None:
             self._state_qpos[ids, :2] = places[:, :2]
-            self._state_qpos[ids, 3:7] = _headed(self._state_qpos[ids, 3:7], places[:, 2])
+            self._state_qpos[ids, 3:7] = headed(self._state_qpos[ids, 3:7], places[:, 2])
         self._state_qpos[ids[:, None], self._qpos] = pose - self._zero[ids]
         self._state_qvel[ids] = 0.0
         if self.randomise > 0:
@@ -250,9 +251,3 @@ def _tilt(vector: Array, angles: Array) -> Array:
     """Turn `(..., 3)` by small angles `(..., 2)` about x and y."""
     x, y = angles[..., 0], angles[..., 1]
     return vector + np.stack([y * vector[..., 2], -x * vector[..., 2], x * vector[..., 1] - y * vector[..., 0]], -1)
-
-
-def _headed(orientation: Array, heading: Array) -> Array:
-    """Quaternions `(n, 4)` w x y z turned about the vertical by `(n,)` rad."""
-    (w, x, y, z), c, s = orientation.T, np.cos(heading / 2), np.sin(heading / 2)
-    return np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], -1)

@@ -39,6 +39,7 @@ VERBS: dict[str, Verb] = {
             "scan": Verb("ask who is on the bus", "servoid.tools.bringup.scan"),
             "setup": Verb("give a servo its ID and baud", "servoid.tools.bringup.setup"),
             "check": Verb("compare every servo with the robot's file", "servoid.tools.bringup.check"),
+            "off": Verb("switch torque off", "servoid.tools.bringup.off"),
             "calibrate": Verb("measure zeros and directions, moved by hand", "servoid.tools.bringup.calibrate"),
             "jog": Verb("move one joint, slowly and a little", "servoid.tools.bringup.jog"),
             "watch": Verb("watch temperatures, voltages, loads and the bus", "servoid.tools.bringup.watch"),

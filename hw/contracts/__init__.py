@@ -1,1 +1,1 @@
-"""The contracts of the hardware abstraction layer: body, control, world and task."""
+"""The contracts of the hardware abstraction layer: body, backend, control, world and task."""

@@ -81,18 +81,5 @@ class Clock(Protocol):
         ...
 
 
-class Backend(Protocol):
-    """A body: simulated, virtual or real. `connect` never moves it."""
-
-    name: str
-    clock: Clock
-
-    def connect(self) -> tuple[Sensors, Motors]: ...
-
-    def close(self) -> None:
-        """Release the body. Motors are left with torque off."""
-        ...
-
-
 class BackendError(Exception):
     """A body cannot be reached or refused: exit code 3."""

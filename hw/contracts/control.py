@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -30,17 +31,34 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class ReferenceFrames:
-    """Frames of a motion to track, `k` of them along the axis before the last."""
+    """`k` frames of a motion to track, along the axis before the last; of a number a frame, along the last.
+
+    A velocity is in the heading frame of its own frame. The root's pose is in the heading frame of the reference's
+    own root now: x along its heading at `ahead` 0, z up, and the origin on the ground below it. So a clip is tracked
+    wherever the robot is, by its displacement from now on; nothing says where it was recorded.
+    """
 
     position: Array  # (..., k, n_joints) rad
-    velocity: Array  # (..., k, 2) m/s of the base, heading frame
-    yaw_rate: Array  # (..., k) rad/s
+    joint_velocity: Array  # (..., k, n_joints) rad/s
+    velocity: Array  # (..., k, 2) m/s of the base, heading frame of the same frame
+    yaw_rate: Array  # (..., k) rad/s about the vertical
     height: Array  # (..., k) m of the base above the ground
+    root_position: Array  # (..., k, 3) m of the base, present heading frame of the reference; z is `height`
+    root_orientation: Array  # (..., k, 4) quaternion w x y z, base in the same frame; of no yaw at `ahead` 0
     contact: Array  # (..., k, n_feet) 0..1, planned
 
 
 class Reference(Protocol):
-    """A motion that a tracker follows: a gait, a clip, or a planner's output."""
+    """A motion that a tracker follows: a gait, a clip, or a planner's output; of one robot or of many worlds `...`."""
+
+    @property
+    def ended(self) -> Array:
+        """Whether the motion is over `(...)`: its last frame then holds, at rest. A gait and a loop never end."""
+        ...
+
+    def reset(self, where: Array | slice = slice(None)) -> None:
+        """Begin anew in the worlds `where` (default: all)."""
+        ...
 
     def frames(self, ahead: Array) -> ReferenceFrames:
         """Frames `ahead` ticks from now, `(k,)` integers, 0 being the frame to be in at the next tick."""
@@ -72,16 +90,6 @@ class Instruction:
     ground: Array | None = None  # (2,) m/s over the ground in the heading frame, where the task asks for one
 
 
-class Policy(Protocol):
-    """A controller. `applied` is what the guard really sent last, so that a policy never believes its own wishes."""
-
-    def reset(self, seed: int) -> None: ...
-
-    def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
-        """Joint targets `(..., n_joints)` rad for the next tick."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
     """What a planner is asked at `tick`: the newest `history` of features and the actions that run meanwhile."""
@@ -107,3 +115,43 @@ class Plan:
     path: Array  # (horizon, 2) m: predicted displacement in the heading frame of `tick`, to be drawn and logged
     seconds: float  # how long planning took
     error: str = ""  # why there is no plan, where there is none: its arrays are NaN then
+
+
+@dataclass(frozen=True, slots=True)
+class Adopted:
+    """A plan at the tick of its adoption; ticks count calls of the policy in this run."""
+
+    requested: int
+    adopted: int
+    plan: Plan
+
+
+class Policy(Protocol):
+    """A controller. `stack.control.base.BasePolicy` answers all but `act` for one that neither plans nor holds
+    anything."""
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode, whose random numbers all come from `seed`."""
+        ...
+
+    def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
+        """Joint targets `(..., n_joints)` rad for the next tick. `applied` is what the guard really sent last, so that
+        a policy never believes its own wishes. Whatever it raises ends the run safely."""
+        ...
+
+    @property
+    def adopted(self) -> Adopted | None:
+        """The plan that was taken over in the last call of `act`; None where that took over none."""
+        ...
+
+    def take_events(self) -> tuple[str, ...]:
+        """What a person should know of, since the last call."""
+        ...
+
+    def repeat(self, plans: Mapping[int, int]) -> None:
+        """Take over the plans of a recorded run and no others: ticks of their requests, and of their adoption."""
+        ...
+
+    def close(self) -> None:
+        """Let go of processes and devices."""
+        ...

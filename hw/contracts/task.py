@@ -38,6 +38,49 @@ class Task(Protocol):
 
     name: str
     seconds: float
+    settings: Any  # a frozen dataclass, as the task's file and `--set` say
+
+    @property
+    def steered(self) -> bool:
+        """Whether a person steers, who needs real time."""
+        ...
+
+    @property
+    def guides(self) -> bool:
+        """Whether `cost` can guide a plan; where it is zero, planners need no gradient of it, and no samples."""
+        ...
+
+    @property
+    def pushes(self) -> bool:
+        """Whether `disturbance` may answer with a push, which only a simulated body can be given."""
+        ...
+
+    @property
+    def counts_undone(self) -> tuple[str, ...]:
+        """Metrics that hold of a run that never began, too."""
+        ...
+
+    @property
+    def goal(self) -> Array | None:
+        """Where the robot shall be `(2,)` m in the frame that it starts in, where that is one place."""
+        ...
+
+    @property
+    def teammates(self) -> tuple[Task, ...]:
+        """The tasks of the scene's other robots, in their order."""
+        ...
+
+    def steer_by(self, velocities: Array, ended: bool) -> None:
+        """Follow a recorded run's velocities `(ticks, 3)`; `ended`: whether with the last one the person ended it."""
+        ...
+
+    def lost(self) -> None:
+        """Its robot has ended, maybe before the others of the scene."""
+        ...
+
+    def close(self) -> None:
+        """Let go of devices."""
+        ...
 
     def reset(self, rng: np.random.Generator) -> None:
         """Draw the episode's goal, commands and disturbances."""

@@ -41,7 +41,17 @@ class Scene:
 
 
 class Surroundings(Protocol):
-    """The scene of a simulated world as a camera on the robot shows it, without what lies outside the scene."""
+    """A scene in play, as a camera on one of its robots shows it, without what lies outside the scene."""
+
+    @property
+    def scene(self) -> Scene:
+        """The scene as it began."""
+        ...
+
+    @property
+    def obstacles(self) -> Array:
+        """Pillars and spheres as they are now `(n, 3)` m: x, y, radius, world frame. For evaluation alone."""
+        ...
 
     def look(self, state: State) -> Percept:
         """What is around the base, in the odometry frame of `state`. At each call, what moves goes on by a tick."""
@@ -57,6 +67,11 @@ class Truth(Protocol):
     @property
     def position(self) -> Array:
         """Base position `(n, 3)` m."""
+        ...
+
+    @property
+    def orientation(self) -> Array:
+        """Base quaternion `(n, 4)` w x y z."""
         ...
 
     @property

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 from servoid.hw.clock import WallClock
+from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import BackendError, Clock
 from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY, Bus, Counters
 from servoid.hw.dynamixel.guardian_client import Lifeline
@@ -17,7 +18,7 @@ from servoid.hw.dynamixel.motors import DynamixelMotors
 from servoid.hw.dynamixel.port import Port, SerialPort
 from servoid.hw.dynamixel.register_check import Difference, as_table, compare, correct, find_board, find_servos
 from servoid.hw.dynamixel.sensors import DynamixelSensors, present
-from servoid.hw.dynamixel.servo_monitor import Watch
+from servoid.hw.dynamixel.servo_monitor import ServoMonitor
 from servoid.hw.dynamixel.units import Units
 from servoid.hw.imu.serial_imu import SerialImu
 from servoid.hw.robot.description import Robot
@@ -43,6 +44,7 @@ class DynamixelBackend:
     ) -> None:
         self.name = name
         self.clock: Clock = clock or WallClock()
+        self.simulation: Simulation | None = None  # it moves metal
         self.differences: tuple[Difference, ...] = ()
         self._robot, self._given, self._fix, self._exact, self._open = robot, port, fix, exact, opener
         self._port: Port | None = None
@@ -91,14 +93,14 @@ class DynamixelBackend:
             raise error
         bus.return_delay = max(servo.get("return_delay_time") for servo in found) * 2e-6
         units = Units(self._robot, [servo.table for servo in found])
-        watch = Watch(bus, found, units)
+        monitor = ServoMonitor(bus, found, units)
         group = present(found)
         ids = [servo.joint.id for servo in found]
         if isinstance(bus.port, SerialPort):
             self._lifeline = Lifeline(bus.port, ids, found[0].table, bus.return_delay)
-        self._motors = DynamixelMotors(bus, found, units, watch, group, self._lifeline)
+        self._motors = DynamixelMotors(bus, found, units, monitor, group, self._lifeline)
         self._bus = bus
-        return DynamixelSensors(bus, self._robot, units, watch, group, self._imu), self._motors
+        return DynamixelSensors(bus, self._robot, units, monitor, group, self._imu), self._motors
 
     def close(self) -> None:
         """Torque off, acknowledged, and the port given back. Raises BackendError when torque may still be on: the

@@ -1,4 +1,5 @@
-"""Who answers on a bus of which nothing is known, and new IDs and bauds for them. Nothing here moves a motor."""
+"""Who answers on a bus of which nothing is known, and new IDs and bauds for them. Nothing here moves a motor or
+gives one torque."""
 
 from __future__ import annotations
 
@@ -10,13 +11,16 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY, Bus, Ping
 from servoid.hw.dynamixel.codec import MAX_ID, OVERHEAD
-from servoid.hw.dynamixel.register_check import EEPROM_BYTES, RAM_BYTES
-from servoid.hw.dynamixel.tables import ControlTable, table
+from servoid.hw.dynamixel.register_check import RAM_BYTES, SERVO_BLOCKS, read_memory
+from servoid.hw.dynamixel.tables import ControlTable, Item, table
 
 BAUDS = table("xm430-w350").bauds  # bit/s; the same for every model
 FACTORY_BAUD = 57600
 PATIENCE = 0.03  # s of margin for a bus on which nothing is known: adapters come with a latency timer of 16 ms
 BOOT_SECONDS = 1.0  # after the servos' power was switched on
+BRAKE_SECONDS = 0.4  # with torque and without gain, before torque goes off: as a run ends
+OFF_TRIES = 4
+_GAINS = ("position_p_gain", "position_i_gain", "position_d_gain")
 PING_ANSWER = 14  # bytes
 _ECHO = 14  # bytes at most of a request that some adapters hand back
 _LONGEST_ANSWER = OVERHEAD + RAM_BYTES  # bytes of anything that is asked here
@@ -147,6 +151,37 @@ def assign(bus: Bus, device: Device, id: int, baud: int) -> Device:
     return now
 
 
+def let_go(bus: Bus, devices: Sequence[Device]) -> list[Device]:
+    """Torque off at servos, braked first so that a robot settles instead of dropping. Returns those that did not say
+    that it is off. Their gains are as before afterwards."""
+    gains = {}
+    for device in devices:
+        _tune(bus, device.baud)
+        gains[device] = {name: device.get(name) for name in _GAINS}
+        for name in _GAINS:
+            bus.write_item(device.id, _item(device, name), 0)
+    bus.clock.sleep_until(bus.clock.now_ns() + round(BRAKE_SECONDS * 1e9))
+    left = []
+    for device in devices:
+        _tune(bus, device.baud)
+        torque = _item(device, "torque_enable")
+        for _ in range(OFF_TRIES):
+            bus.write_item(device.id, torque, 0)
+            if bus.read_item(device.id, torque) == 0:
+                break
+        else:
+            left.append(device)
+            continue
+        for name, value in gains[device].items():
+            bus.write_item(device.id, _item(device, name), value or 0)
+    return left
+
+
+def _item(device: Device, name: str) -> Item:
+    assert device.table is not None, "only a known model says that it has torque"
+    return device.table.item(name)
+
+
 def _ask_all(bus: Bus, baud: int, found: Census) -> None:
     before = _broken(bus)
     pings = bus.broadcast_ping()
@@ -181,14 +216,8 @@ def _ask_all(bus: Bus, baud: int, found: Census) -> None:
 
 
 def _read(bus: Bus, ping: Ping, baud: int) -> Device:
-    memory = b""
     board = ping.model == table("opencr").number
-    for address, length in ((0, _BOARD_BYTES),) if board else ((0, EEPROM_BYTES), (EEPROM_BYTES, RAM_BYTES)):
-        status = bus.read(ping.id, address, length)
-        if status is None or status.error:
-            memory = b""
-            break
-        memory += status.data
+    memory = read_memory(bus, ping.id, ((0, _BOARD_BYTES),) if board else SERVO_BLOCKS)
     return Device(ping.id, baud, ping.model, ping.firmware, memory)
 
 

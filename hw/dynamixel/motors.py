@@ -8,13 +8,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from servoid.hw.contracts.body import Array, BackendError, Command, Mode
-from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel import arming, codec
 from servoid.hw.dynamixel.bus import Bus
 from servoid.hw.dynamixel.codec import SyncWriter
 from servoid.hw.dynamixel.group_read import GroupRead
 from servoid.hw.dynamixel.guardian_client import Lifeline
 from servoid.hw.dynamixel.register_check import Found
-from servoid.hw.dynamixel.servo_monitor import Watch
+from servoid.hw.dynamixel.servo_monitor import ServoMonitor
 from servoid.hw.dynamixel.units import Units
 from servoid.hw.faults import describe
 
@@ -24,7 +24,6 @@ OFF_SECONDS, ON_SECONDS = 0.25, 0.1  # and for how long: a host or an adapter ma
 OUTSIDE = 12  # ticks (1 degree) that a joint may be beyond its servo's limits when torque comes on
 AWAY = 68  # ticks (6 degrees) that a joint may have moved since it was read, for its first goal is gone to at once
 _GAINS = struct.Struct("<HHH")  # D, I, P in the order of their registers
-_CHECKED = struct.Struct("<HHH")
 
 
 class DynamixelMotors:
@@ -35,19 +34,18 @@ class DynamixelMotors:
         bus: Bus,
         found: Sequence[Found],
         units: Units,
-        watch: Watch,
+        monitor: ServoMonitor,
         present: GroupRead,
         lifeline: Lifeline | None = None,
     ) -> None:
         """`present` is the group of the control cycle, at whose positions torque comes on. `lifeline` is told of
         torque; without one nothing but the servos' watchdog stops them when this process is killed."""
         table = found[0].table
-        self._bus, self._found, self._units, self._watch, self._present = bus, found, units, watch, present
+        self._bus, self._found, self._units, self._monitor, self._present = bus, found, units, monitor, present
         self._lifeline = lifeline
         self._ids = [servo.joint.id for servo in found]
         self._goal = table.item("goal_position")
         self._torque, self._watchdog = table.item("torque_enable"), table.item("bus_watchdog")
-        self._profile = table.item("profile_acceleration").address
         self._d_gain = table.item("position_d_gain")
         self._goals = SyncWriter(self._ids, self._goal.address, self._goal.width, signed=True)
         self._default_d = [servo.table.item("position_d_gain").default or 0 for servo in found]
@@ -60,7 +58,7 @@ class DynamixelMotors:
     @property
     def armed(self) -> bool:
         """Whether torque was switched on by this program."""
-        return self._watch.armed
+        return self._monitor.armed
 
     def write(self, command: Command) -> None:
         """Send a command. Raises BackendError, naming the joints, where torque does not go on or off, and where a joint
@@ -89,7 +87,7 @@ class DynamixelMotors:
             left = self._unconfirmed(left, b"\0")
             if not left:
                 self.on, self._gain = False, None
-                self._watch.expect(False)
+                self._monitor.expect(False)
                 if self._lifeline is not None:
                     self._lifeline.let_go()
                 return
@@ -103,8 +101,8 @@ class DynamixelMotors:
         `wanted` `(n_joints,)` are the goal ticks that will be sent next.
         """
         everyone = list(range(len(self._ids)))
-        if broken := [i for i in everyone if self._watch.fault[i] & 0xFF]:
-            reasons = ", ".join(describe(int(self._watch.fault[broken[0]]) & 0xFF))
+        if broken := [i for i in everyone if self._monitor.fault[i] & 0xFF]:
+            reasons = ", ".join(describe(int(self._monitor.fault[broken[0]]) & 0xFF))
             raise BackendError(f"{self._names(broken)} reports {reasons}: let it cool, then switch it off and on")
         if self._lifeline is not None:
             self._lifeline.hold()  # first, as it may wait for seconds, in which a limp robot moves
@@ -114,31 +112,54 @@ class DynamixelMotors:
             raise BackendError(
                 f"{self._names(moved)} moved before torque was on: support the robot, hold it still and start again"
             )
-        self._watch.expect(False)
+        self._monitor.expect(False)
         self._gain = None
-        for _ in self._attempts(ON_SECONDS):
-            self._write(self._watchdog.address, everyone, [b"\0"] * len(everyone))  # lifts an expired one, too
-            self._write(self._profile, everyone, [bytes(8)] * len(everyone))
-            self._bus.send(self._goals.packet(goals.tolist()))
-            unready = self._unprepared(goals)
-            if not unready:  # with torque on already, gains would pull at once to a goal that is not from here
-                self._send_gains(gain)
-                unready = self._unprepared(goals, gain)
-            if not unready:
-                break
-        else:
-            raise BackendError(f"{self._names(unready)} did not take goal and gains: torque stays off")
+        self._prepare(goals, gain)
         left = everyone
         for _ in self._attempts(ON_SECONDS):
             self._write(self._torque.address, left, [b"\1"] * len(left))
             self._write(self._watchdog.address, left, [bytes([WATCHDOG])] * len(left))
             left = self._unconfirmed(left, b"\1", bytes([WATCHDOG]))
             if not left:
-                self._watch.expect(True)
+                self._monitor.expect(True)
                 return
         names = self._names(left)
         self.off()
         raise BackendError(f"{names} did not switch torque on: does it report an error? Switch its power off and on")
+
+    def _prepare(self, goals: Array, gain: Array) -> None:
+        """Write what RAM must hold before torque, and read it back. Raises BackendError naming what was not taken."""
+        motion = [arming.motion(goal) for goal in goals.tolist()]
+        strength = [arming.strength(servo, each) for servo, each in zip(self._found, gain.tolist(), strict=True)]
+        both = [{**first, **then} for first, then in zip(motion, strength, strict=True)]
+        places = [{"goal_position": goal} for goal in goals.tolist()]
+        for _ in self._attempts(ON_SECONDS):
+            self._set(motion)
+            wrong = self._differing(places, (self._goal.address, self._goal.width))
+            if not any(wrong):  # with torque on already, gains would pull at once to a goal that is not from here
+                self._set(strength)
+                wrong = self._differing(both, arming.span(self._found[0].table))
+            if not any(wrong):
+                self._gain = gain
+                return
+        unready = [i for i, registers in enumerate(wrong) if registers]
+        raise BackendError(
+            f"{self._names(unready)} did not take {', '.join(wrong[unready[0]])}: torque stays off; switch its power "
+            "off and on"
+        )
+
+    def _set(self, values: Sequence[arming.Values]) -> None:
+        for packet in arming.packets(self._found, values):
+            self._bus.send(packet)
+
+    def _differing(self, values: Sequence[arming.Values], place: tuple[int, int]) -> list[list[str]]:
+        """Of each joint, the registers that do not read back; `place` is the address and length of what is read."""
+        group = GroupRead([(id, *place) for id in self._ids])
+        self._bus.read_group(group)
+        return [
+            arming.differing(servo, wanted, data, place[0])
+            for servo, wanted, data in zip(self._found, values, group.data, strict=True)
+        ]
 
     def _attempts(self, seconds: float) -> Iterator[int]:
         """Counts attempts: TRIES at least, and for at least so long."""
@@ -177,21 +198,6 @@ class DynamixelMotors:
     def _write(self, address: int, joints: Sequence[int], values: Sequence[bytes]) -> None:
         data = {self._ids[i]: value for i, value in zip(joints, values, strict=True)}
         self._bus.send(codec.sync_write(address, len(values[0]), data))
-
-    def _unprepared(self, goals: Array, gain: Array | None = None) -> list[int]:
-        """Joints whose goal, or P gain where it was sent, does not read back."""
-        start = self._d_gain.address
-        group = GroupRead([(id, start, self._goal.end - start) for id in self._ids])
-        self._bus.read_group(group)
-        left = []
-        for i, data in enumerate(group.data):
-            if (
-                data is None
-                or (gain is not None and _CHECKED.unpack_from(data)[2] != gain[i])
-                or self._goal.decode(data[self._goal.address - start :]) != goals[i]
-            ):
-                left.append(i)
-        return left
 
     def _unconfirmed(self, joints: Sequence[int], torque: bytes, watchdog: bytes | None = None) -> list[int]:
         """Of `joints`, those whose torque enable (and watchdog) does not read back."""

@@ -8,13 +8,29 @@ from dataclasses import dataclass
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import BackendError
+from servoid.hw.dynamixel import codec
 from servoid.hw.dynamixel.bus import Bus
+from servoid.hw.dynamixel.codec import MAX_ID
 from servoid.hw.dynamixel.tables import ControlTable, table
 from servoid.hw.dynamixel.units import Units
 from servoid.hw.robot.description import Joint, Robot, Servo
 
 POSITION_MODE = 3
+# EEPROM that is not compared.
+UNCOMPARED = {
+    "id": "the servo would not have answered",
+    "baud_rate": "the servo would not have answered",
+    "external_port_mode_1": "a pin of the servo's expansion port",
+    "external_port_mode_2": "a pin of the servo's expansion port",
+    "external_port_mode_3": "a pin of the servo's expansion port",
+}
+# What turns a joint the wrong way, moves it without being asked, or moves it when another is meant.
+GRAVE = (
+    *("secondary_id", "protocol_type", "startup_configuration", "status_return_level"),
+    *("operating_mode", "drive_mode", "homing_offset"),
+)
 EEPROM_BYTES, RAM_BYTES = 64, 83  # in two reads: all that is compared, and what is measured
+SERVO_BLOCKS = ((0, EEPROM_BYTES), (EEPROM_BYTES, RAM_BYTES))
 POWER_SECONDS = 2.0  # that servos may take to answer after power-on
 RETRY_SECONDS = 0.05
 
@@ -111,26 +127,31 @@ def compare(robot: Robot, found: Sequence[Found]) -> list[Difference]:
     margin = int(robot.limits.margin * robot.servos[0].ticks_per_turn / math.tau)  # ticks that the guard keeps off
     differences: list[Difference] = []
     for servo, model, low, high in zip(found, robot.servos, lows.tolist(), highs.tolist(), strict=True):
-        wanted: dict[str, tuple[int, bool]] = {
-            "operating_mode": (POSITION_MODE, True),
-            "drive_mode": (0, True),
-            "homing_offset": (0, True),
-            "status_return_level": (2, True),
-            "min_position_limit": (low, servo.get("min_position_limit") > low + margin),
-            "max_position_limit": (high, servo.get("max_position_limit") < high - margin),
-            "return_delay_time": (0, False),
-            "temperature_limit": (round(model.max_temperature), False),
+        wanted = _factory(servo.table) | {
+            "operating_mode": POSITION_MODE,
+            "min_position_limit": low,
+            "max_position_limit": high,
+            "return_delay_time": 0,
+            "temperature_limit": round(model.max_temperature),
+            "status_return_level": 2,
         }
-        for register in ("shutdown", "pwm_limit", "current_limit", "min_voltage_limit", "max_voltage_limit"):
-            default = servo.table.items[register].default if register in servo.table else None
-            if default is not None:
-                wanted[register] = (default, False)
-        for register, (value, grave) in wanted.items():
-            if servo.get(register) != value:
-                differences.append(
-                    Difference(servo.joint.name, servo.joint.id, register, servo.get(register), value, grave)
-                )
+        narrow = {
+            "min_position_limit": servo.get("min_position_limit") > low + margin,
+            "max_position_limit": servo.get("max_position_limit") < high - margin,
+        }
+        for register, value in wanted.items():
+            found_there = servo.get(register)
+            if found_there == value or (register == "secondary_id" and found_there > MAX_ID):
+                continue
+            grave = narrow.get(register, register in GRAVE)
+            differences.append(Difference(servo.joint.name, servo.joint.id, register, found_there, value, grave))
     return sorted(differences, key=lambda difference: not difference.grave)
+
+
+def _factory(items: ControlTable) -> dict[str, int]:
+    """The factory's value of every register that is kept without power."""
+    kept = (item for item in items.items.values() if item.eeprom and item.writable and item.name not in UNCOMPARED)
+    return {item.name: item.default or 0 for item in kept}
 
 
 def as_table(differences: Sequence[Difference]) -> str:
@@ -148,22 +169,38 @@ def correct(bus: Bus, found: Sequence[Found], differences: Sequence[Difference])
     """Write what is wanted, and read it back. Raises BackendError naming the joint that did not take it, or that has
     torque on: its EEPROM is locked then, and only a person may let a robot go limp."""
     servos = {servo.joint.id: servo for servo in found}
-    for id in {d.id for d in differences}:
-        if servos[id].get("torque_enable"):
-            raise BackendError(f"{servos[id].joint.name} has torque on: hold the robot and switch it off first")
-    for d in differences:
+    if stiff := [servo.joint.name for servo in found if servo.get("torque_enable")]:
+        raise BackendError(
+            f"{', '.join(stiff)} has torque on, which locks its registers: hold the robot, then servoid bringup off"
+        )
+    # First of all every servo obeys nobody's ID but its own, and then says what it did.
+    first = ("secondary_id", "status_return_level")
+    for d in sorted(differences, key=lambda d: d.register not in first):
         item = servos[d.id].table.item(d.register)
         if not bus.write_item(d.id, item, d.wanted) or bus.read_item(d.id, item) != d.wanted:
             raise BackendError(f"{d.joint} (ID {d.id}) does not take {d.register} = {d.wanted}: restart it")
 
 
-def _read(bus: Bus, joint: Joint, firmware: int) -> Found:
+def read_memory(bus: Bus, id: int, blocks: Sequence[tuple[int, int]] = SERVO_BLOCKS) -> bytes:
+    """What a servo holds from address 0 on; nothing where it cannot be read. One that another program told to answer
+    nothing but a ping is told to answer: its status return level is in RAM, and moves nothing."""
     memory = b""
-    for address, length in ((0, EEPROM_BYTES), (EEPROM_BYTES, RAM_BYTES)):
-        status = bus.read(joint.id, address, length)
+    level = table("xm430-w350").item("status_return_level")  # in the same place in every model
+    for address, length in blocks:
+        status = bus.read(id, address, length)
+        if status is None and blocks is SERVO_BLOCKS and not address:
+            bus.send(codec.sync_write(level.address, level.width, {id: level.encode(2)}))
+            status = bus.read(id, address, length)
         if status is None or status.error:
-            raise BackendError(f"{joint.name} (ID {joint.id}) answers a ping, but cannot be read{_garbled(bus)}")
+            return b""
         memory += status.data
+    return memory
+
+
+def _read(bus: Bus, joint: Joint, firmware: int) -> Found:
+    memory = read_memory(bus, joint.id)
+    if not memory:
+        raise BackendError(f"{joint.name} (ID {joint.id}) answers a ping, but cannot be read{_garbled(bus)}")
     number = int.from_bytes(memory[:2], "little")
     return Found(joint, table(number, firmware), firmware, memory)
 

@@ -11,7 +11,7 @@ from servoid.hw.dynamixel.bus import Bus
 from servoid.hw.dynamixel.group_read import GroupRead
 from servoid.hw.dynamixel.imu import BUTTONS, BoardImu
 from servoid.hw.dynamixel.register_check import Found
-from servoid.hw.dynamixel.servo_monitor import Watch
+from servoid.hw.dynamixel.servo_monitor import ServoMonitor
 from servoid.hw.dynamixel.tables import table
 from servoid.hw.dynamixel.units import Units
 from servoid.hw.faults import LATE
@@ -36,9 +36,15 @@ class DynamixelSensors:
     """The reading half of the backend. `imu` is one on a port of its own; without it the board's is read."""
 
     def __init__(
-        self, bus: Bus, robot: Robot, units: Units, watch: Watch, present: GroupRead, imu: SerialImu | None = None
+        self,
+        bus: Bus,
+        robot: Robot,
+        units: Units,
+        monitor: ServoMonitor,
+        present: GroupRead,
+        imu: SerialImu | None = None,
     ) -> None:
-        self._bus, self._units, self._watch, self._present, self._imu = bus, units, watch, present, imu
+        self._bus, self._units, self._monitor, self._present, self._imu = bus, units, monitor, present, imu
         self._block = BoardImu(table("opencr"), Mounting(robot.imu.signs, robot.imu.mounting))
         self._board = GroupRead([(robot.bus.board_id, self._block.address, self._block.length)])
         self._stop = sum({BUTTONS[name] for name in robot.bus.stop_buttons})
@@ -55,8 +61,8 @@ class DynamixelSensors:
         reading = self._block.update(self._board.data[0] if fresh else None, self._board.time_ns[0])
         if self._imu is not None:
             reading = self._imu.read()
-        self._watch.press(self._block.buttons & self._stop != 0)
-        self._watch.look(group.alert, hurry=not all(group.fresh))
+        self._monitor.press(self._block.buttons & self._stop != 0)
+        self._monitor.look(group.alert, hurry=not all(group.fresh))
         self._late.append(bus.counters.lost > lost and bus.counters.stray > stray)
         self._short.append(not (fresh and all(group.fresh)))
         late = LATE if sum(self._late) >= LATE_TICKS or sum(self._short) >= SHORT_TICKS else 0
@@ -66,10 +72,10 @@ class DynamixelSensors:
             position=self._units.position(position),
             velocity=self._units.velocity(velocity),
             effort=self._units.effort(current),
-            temperature=self._watch.temperature.copy(),
-            voltage=self._watch.voltage.copy(),
+            temperature=self._monitor.temperature.copy(),
+            voltage=self._monitor.voltage.copy(),
             age=np.array([_age(now, time) for time in group.time_ns]),
-            fault=self._watch.fault | reading.fault | late,
+            fault=self._monitor.fault | reading.fault | late,
             orientation=reading.orientation,
             angular_velocity=reading.angular_velocity,
             specific_force=reading.specific_force,

@@ -22,7 +22,7 @@ TRIPPED = 255  # what the watchdog register reads once it expired
 _HOST_BITS = TORQUE_LOST | REBOOTED | WATCHDOG
 
 
-class Watch:
+class ServoMonitor:
     """Faults `(n_joints,)` as bits of servoid.hw.faults, and temperatures and voltages as they come in."""
 
     def __init__(self, bus: Bus, found: Sequence[Found], units: Units) -> None:

@@ -21,8 +21,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.checkpoint import difference
-from servoid.policy.diffusion.config import DenoiserConfig
 from servoid.policy.diffusion.features import Emphasis, Normaliser, raw_mirror, recorded_names, to_tokens
+from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.latent.actions import LatentActions
 from servoid.policy.text.captions import MOTIONS, mirrored, motion_of
 from servoid.policy.text.encoder import load_encoder

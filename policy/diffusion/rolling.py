@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from servoid.hw.contracts.body import Array
-from servoid.policy.diffusion.config import DenoiserConfig
 from servoid.policy.diffusion.features import Normaliser, joints_seen, to_tokens
+from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.schedule import DenoisingMatrix
 
 _FRAME = 2**31  # sets the noise of frames apart from what is drawn for a plan

@@ -10,62 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
 
-from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
+from servoid.policy.diffusion.guidance import NETWORK, Guidance, Predictor
 from servoid.policy.diffusion.schedule import DenoisingMatrix
-
-# (states, actions, state levels, action levels) -> clean states, clean actions
-Predictor = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-
-ANALYTIC = "analytic"
-NETWORK = "network"
-
-
-class Diverged(ValueError):
-    """Sampling left all bounds, or guidance has no gradient: there is no plan. The message says what to change."""
-
-
-@dataclass(frozen=True)
-class Guidance:
-    """Loss guidance: predicted clean states move by `-weight * gradient`, never further than `clip`.
-
-    `cost` maps normalised states `(batch, state tokens, features)` to `(batch,)`. `gradient` is "analytic": taken on
-    the predicted states themselves, which is cheap; or "network": taken on the noisy states, back through the network
-    (UniPhys, eq. 3). `clip` is the norm of a step over one window. Both are in the network's inputs: deviations, or
-    their projection where it has emphasis. With `samples` > 1 so many neighbours in the batch are samples of one
-    window, and all move by the mean of their gradients (Monte-Carlo guidance, UniPhys, eq. 4).
-    """
-
-    cost: Callable[[Tensor], Tensor]
-    weight: float
-    clip: float
-    gradient: str = ANALYTIC
-    samples: int = 1
-
-    def __post_init__(self) -> None:
-        if self.gradient not in (ANALYTIC, NETWORK):
-            raise ConfigError(f"guidance: gradient must be '{ANALYTIC}' or '{NETWORK}', not '{self.gradient}'")
-
-    def step(self, gradient: Tensor, moving: Tensor) -> Tensor:
-        """How far states go, `(batch, state tokens, features)`: those `moving` `(state tokens,)`. Raises Diverged."""
-        if self.samples > 1:
-            mean = gradient.reshape(-1, self.samples, *gradient.shape[1:]).mean(1)
-            gradient = mean.repeat_interleave(self.samples, 0)
-        step = self.weight * gradient * moving[:, None]  # what does not move uses nothing of the step up
-        norm = step.flatten(1).norm(dim=1).clamp_min(1e-12)
-        if not torch.isfinite(norm).all():
-            if not torch.isfinite(gradient).all():
-                raise Diverged("the guidance cost has no finite gradient on this trajectory; check the task's cost")
-            raise Diverged(
-                f"guidance with a weight of {self.weight:g} moves this trajectory out of all bounds; lower it"
-            )
-        limited: Tensor = step * (self.clip / norm).clamp_max(1.0)[:, None, None]
-        return limited
 
 
 @dataclass(frozen=True)
@@ -82,34 +33,13 @@ class Known:
     impute: Callable[[Tensor], Tensor] | None = None  # clean states to clean states
 
 
-def classifier_free(denoise: Callable[..., tuple[Tensor, Tensor]], text: Tensor | None, weight: float) -> Predictor:
-    """A predictor told `text` `(batch, size)`: `x0 = x0() + weight * (x0(text) - x0())` (Ho and Salimans, 2207.12598).
-
-    `weight` 0 leaves the instruction unread and 1 needs no second window, so both cost one call.
-    """
-    if text is None or weight == 0.0:
-        return denoise
-    if weight == 1.0:
-        return partial(denoise, text=text)
-    told = torch.arange(2 * len(text)) < len(text)
-    twice = torch.cat([text, text])
-
-    def predict(states: Tensor, actions: Tensor, *levels: Tensor) -> tuple[Tensor, Tensor]:
-        pairs = denoise(torch.cat([states, states]), torch.cat([actions, actions]), *levels, text=twice, told=told)
-        with_text, without = zip(*(x.chunk(2) for x in pairs), strict=True)
-        state, action = (b + weight * (a - b) for a, b in zip(with_text, without, strict=True))
-        return state, action
-
-    return predict
-
-
 def draw_noise(generators: Sequence[torch.Generator], tokens: int, features: int) -> Tensor:
     """Noise `(batch, tokens, features)`, one generator a sample, so that a sample does not depend on its batch."""
     return torch.stack([torch.randn(tokens, features, generator=g) for g in generators])
 
 
 @dataclass(frozen=True)
-class Step:
+class DenoisingStep:
     """One call's step of all tokens; factors are `(tokens, 1)`, the square roots of what they are of."""
 
     moving: Tensor  # (tokens,) bool: the others are left alone
@@ -192,7 +122,7 @@ class Sampler:
                 (gradient,) = torch.autograd.grad(guidance.cost(source).sum(), source)
         return clean_states - guidance.step(gradient, moving), clean_actions
 
-    def _steps(self, rows: Tensor) -> list[Step]:
+    def _steps(self, rows: Tensor) -> list[DenoisingStep]:
         """The steps between the rows `(calls + 1, tokens)` of a denoising matrix."""
         a, b = self._signal[rows[:-1]][..., None], self._signal[rows[1:]][..., None]
         fresh = self._eta**2 * (1 - b) / (1 - a).clamp_min(1e-6) * (1 - a / b)  # variance of the noise drawn anew
@@ -203,9 +133,9 @@ class Sampler:
             (1 - b - fresh).clamp_min(0.0).sqrt(),
             fresh.clamp_min(0.0).sqrt(),
         )
-        return [Step(*parts) for parts in zip(rows[1:] < rows[:-1], *factors, strict=True)]
+        return [DenoisingStep(*parts) for parts in zip(rows[1:] < rows[:-1], *factors, strict=True)]
 
-    def _step(self, noisy: Tensor, clean: Tensor, step: Step, generators: Sequence[torch.Generator]) -> Tensor:
+    def _step(self, noisy: Tensor, clean: Tensor, step: DenoisingStep, generators: Sequence[torch.Generator]) -> Tensor:
         """Tokens after a call that predicted them `clean`."""
         noise = (noisy - step.signal_before * clean) / step.noise_before
         stepped = step.signal_after * clean + step.noise_after * noise

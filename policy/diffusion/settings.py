@@ -11,8 +11,8 @@ import numpy as np
 
 from servoid.hw.config import ConfigError, load_yaml, nearest, resolve
 from servoid.hw.contracts.body import Array
-from servoid.policy.diffusion.config import DenoiserConfig
 from servoid.policy.diffusion.engines import ENGINES, REFERENCE, check_engine
+from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.schedule import (
     PYRAMID,
     TRAPEZOID,
@@ -30,7 +30,7 @@ SHAPES = (PYRAMID, TRAPEZOID)
 
 @dataclass(frozen=True)
 class GuidanceSettings:
-    """Loss guidance: see `servoid.policy.diffusion.sampler.Guidance`. A weight of 0 turns it off."""
+    """Loss guidance: see `servoid.policy.diffusion.guidance.Guidance`. A weight of 0 turns it off."""
 
     weight: float = 4000.0
     clip: float = 12.0  # longest step over a window; both are in the network's inputs, projected where it has emphasis

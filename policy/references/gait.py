@@ -13,6 +13,7 @@ import numpy as np
 from servoid.hw.config import CONFIGS, load_yaml
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Reference, ReferenceFrames
+from servoid.hw.geometry import headed, joined, turned
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import LegInverse, Legs
 
@@ -56,8 +57,13 @@ class Gait(Reference):
     Standing is the same motion with no lift and no sway: `activity` (0 to 1) fades the steps in and out.
     """
 
-    def __init__(self, robot: Robot, settings: GaitSettings, shape: tuple[int, ...] = ()) -> None:
-        self.robot, self.settings = robot, settings
+    def __init__(self, robot: Robot, shape: tuple[int, ...] = (), settings: GaitSettings | None = None) -> None:
+        """`shape` are the leading dimensions; `settings` are by default those of configs/policies/gait.yaml.
+
+        Raises ConfigError for legs of another build than `LegInverse` can bend.
+        """
+        self.robot, self.settings = robot, settings or load_gait()
+        settings = self.settings
         legs = Legs(robot)
         self._inverse, self._index = LegInverse(legs, robot.name), legs.index
         self._side = np.sign(self._inverse.hip[:, 1])  # 1 left, -1 right
@@ -97,20 +103,45 @@ class Gait(Reference):
         self.phase = np.where(self.activity > 0, (self.phase + self._phase_step) % 1.0, begun)
         self.activity = np.clip(self.activity + rate, 0.0, 1.0)
 
+    @property
+    def ended(self) -> Array:
+        """Never `(...)`."""
+        return np.zeros(self.phase.shape, bool)
+
     def frames(self, ahead: Array) -> ReferenceFrames:
-        """Frames `ahead` ticks from now, at the present velocity."""
+        """Frames `ahead` ticks from now, at the present velocity.
+
+        The root goes the way of the asked twist, leaning, without the sway between steps. Joint velocities are the
+        change to the tick after.
+        """
         shape = (*self.phase.shape, len(ahead))
-        phase = (self.phase[..., None] + np.asarray(ahead) * self._phase_step * (self.activity > 0)[..., None]) % 1.0
+        moving = (self.activity > 0)[..., None]
+        phase = (self.phase[..., None] + np.asarray(ahead) * self._phase_step * moving) % 1.0
         velocity = np.broadcast_to(self.velocity[..., None, :], (*shape, 3))
         activity = np.broadcast_to(self.activity[..., None], shape)
         position, contact = self.pose(phase, velocity, activity)
+        after, _ = self.pose((phase + self._phase_step * moving) % 1.0, velocity, activity)
+        height = np.full(shape, self.robot.standing_height)
+        seconds = np.asarray(ahead) * self.robot.dt
+        # Along an arc: the chord is the arc's length times sin(a) / a, and leaves its start at half of the turn.
+        yaw = velocity[..., 2] * seconds
+        chord = velocity[..., :2] * (seconds * np.sinc(yaw / (2 * np.pi)))[..., None]
+        half = 0.5 * self._lean(velocity[..., 0])
+        zero = np.zeros(shape)
         return ReferenceFrames(
             position=position,
+            joint_velocity=(after - position) / self.robot.dt,
             velocity=velocity[..., :2],
             yaw_rate=velocity[..., 2],
-            height=np.full(shape, self.robot.standing_height),
+            height=height,
+            root_position=np.concatenate([turned(chord, yaw / 2), height[..., None]], -1),
+            root_orientation=headed(joined(np.cos(half), zero, np.sin(half), zero), yaw),
             contact=contact,
         )
+
+    def _lean(self, forward: Array) -> Array:
+        """Forward pitch of the base [rad] at `forward` m/s."""
+        return self.settings.lean - self.settings.backward_lean * np.minimum(forward, 0.0)
 
     def pose(self, phase: Array, velocity: Array, activity: Array) -> tuple[Array, Array]:
         """Joint positions `(..., n_joints)` and planned contacts `(..., n_feet)` at a phase `(...)` of the cycle.
@@ -138,7 +169,7 @@ class Gait(Reference):
         y = y0 + (vy + wz * x0) * period * travel
         y = y + (s.sway * activity * np.sin(2 * np.pi * phase))[..., None]  # away from the foot that steps
         z = self._inverse.hip[:, 2] - s.height + s.lift * lift
-        lean = s.lean - s.backward_lean * backward
+        lean = self._lean(velocity[..., None, 0])
         cos, sin = np.cos(lean), np.sin(lean)
         ankle = np.stack([cos * x - sin * z, y, sin * x + cos * z], -1)  # seen from the leaning base
         c, n, zero = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)
@@ -163,7 +194,8 @@ class Gait(Reference):
 class GyroFeedback:
     """Adds to the ankles what the gyro says: the baseline's only balance."""
 
-    def __init__(self, robot: Robot, settings: GaitSettings) -> None:
+    def __init__(self, robot: Robot, settings: GaitSettings | None = None) -> None:
+        settings = settings or load_gait()
         inverse = LegInverse(Legs(robot), robot.name)
         index = Legs(robot).index
         self._pitch, self._pitch_sign = index[:, 4], inverse.sign[:, 4]

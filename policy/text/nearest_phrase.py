@@ -17,8 +17,15 @@ from servoid.policy.text.lexicon import flags
 # Cosine similarity to some training phrasing below which a text is not about walking, or not English. With the
 # "words" encoder, commands lie above it ("start walking": 0.56), other wishes and languages below ("sit down": 0.31).
 FAMILIAR = 0.5
-_CONFLICTS = (("left", "right"), ("forward", "back"))
+_CONFLICTS = (("left", "right"), ("forward", "back"), ("slow", "fast"))
 _SIDED = frozenset({"turn", "side-step", "diagonal", "arc"})  # flags of motions that need a side
+_SPEEDS = {"slow": "forward slowly", "fast": "forward fast"}  # what walking forward is called by these flags
+# Neither the order of words nor a number is in a code: without these checks they would be dropped without a word.
+_SEQUENCE = re.compile(r"\b(then|after(wards?)?|before|first|until|next)\b|[;.!?]\s*\w")
+_QUANTITY = re.compile(
+    r"\d|\b(once|twice|times|half|quarter|full|(one|two|three|four|five|six|seven|eight|nine|ten)"
+    r"( more)? (steps?|turns?|met(er|re)s?|degrees?|seconds?|circles?|rounds?|paces?|feet|foot))\b"
+)
 _NEGATION = re.compile(r"\b(no|not|never|cannot|(do|does|did|ca|wo|should|must|is|are)n['\u2019]?t)\b")
 
 
@@ -49,7 +56,8 @@ class Phrasebook:
         """Index in `MOTIONS` of what a text asks for.
 
         Raises ConfigError for a text that is empty, not in English, not about a known motion, negated, or that asks
-        for two opposite motions, and for a turn or step to no side.
+        for two opposite motions; for a turn or step to no side; and for what no motion here can be told: one thing
+        after another, how far or how long, how fast where a motion has one speed.
         """
         code = self._encoder.encode([text])
         distance = _distances(code, self.codes)[0]
@@ -57,6 +65,10 @@ class Phrasebook:
         hint = f"the nearest known motion is '{NAMES[nearest]}': '{MOTIONS[nearest].phrasings[0]}'"
         if _NEGATION.search(text.lower()):
             raise ConfigError(f"the instruction '{text}' says what not to do; say what to do, such as 'stand still'")
+        if _SEQUENCE.search(text.lower()):
+            raise ConfigError(f"the instruction '{text}' says one thing after another; give one instruction at a time")
+        if _QUANTITY.search(text.lower()):
+            raise ConfigError(f"the instruction '{text}' says how much; that is not understood: say only what to do")
         marked = flags(text)
         for one, other in _CONFLICTS:
             if {one, other} <= marked:
@@ -68,7 +80,15 @@ class Phrasebook:
             raise ConfigError(f"the instruction '{text}' does not say to which side; add 'left' or 'right'")
         # The side is as it was said. Standing has none: "stand on your left foot" stays standing.
         fitting = (self._sides == side) | ((self.motions == NAMES.index("stand")) & ("stop" in marked))
-        return int(self.motions[np.where(fitting, distance, np.inf).argmin()])
+        motion = NAMES[self.motions[np.where(fitting, distance, np.inf).argmin()]]
+        for flag in marked & _SPEEDS.keys():
+            if not motion.startswith("forward"):
+                raise ConfigError(
+                    f"the instruction '{text}' says how fast, but '{motion}' has one speed: leave that out; "
+                    "walking forward can be slow or fast"
+                )
+            motion = _SPEEDS[flag]
+        return NAMES.index(motion)
 
 
 def _side(text: str) -> str:

@@ -12,14 +12,14 @@ from functools import partial
 
 import numpy as np
 
+from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array, BackendError, Clock
-from servoid.hw.contracts.control import State
-from servoid.hw.contracts.world import Percept, Scene, Truth
+from servoid.hw.contracts.world import Scene, Truth
 from servoid.hw.dynamixel.backend import DynamixelBackend
 from servoid.hw.dynamixel.motors import DynamixelMotors
 from servoid.hw.dynamixel.sensors import DynamixelSensors
 from servoid.hw.robot.description import Robot
-from servoid.sim.rig.control import Control, LockedClock, RigProcess, RigTruth
+from servoid.sim.rig.process.control import Control, LockedClock, RigProcess, RigTruth
 from servoid.sim.scene import Stage
 
 
@@ -38,6 +38,7 @@ class VirtualBackend:
         self.truth: Truth = VirtualTruth(self)
         self._robot, self._seed, self._randomise = robot, seed, randomise
         self.stage = None if scene is None else Stage(scene, self.truth, robot.dt, self._roll)
+        self.simulation = Simulation(self.truth, self.push, self.stage)
         self._rig: RigProcess | None = None
         self._rig_truth: RigTruth | None = None
         self._body: DynamixelBackend | None = None
@@ -75,11 +76,6 @@ class VirtualBackend:
     def push(self, velocity: Array) -> None:
         """Change the base's velocity by `(2,)` m/s, world frame, before time goes on."""
         self._clock.requests.append(partial(Control.push, velocity=np.array(velocity, dtype=float)))
-
-    def look(self, state: State) -> Percept:
-        """What the robot sees of the scene (see `servoid.hw.contracts.world.Surroundings`)."""
-        assert self.stage is not None, "there is no scene"
-        return self.stage.look(state)
 
     def _roll(self, places: Array) -> None:
         self._clock.requests.append(partial(Control.roll, places=places))
@@ -166,6 +162,11 @@ class VirtualTruth:
     def position(self) -> Array:
         """Base position `(1, 3)` m."""
         return self._now().position
+
+    @property
+    def orientation(self) -> Array:
+        """Base quaternion `(1, 4)` w x y z."""
+        return self._now().orientation
 
     @property
     def yaw(self) -> Array:

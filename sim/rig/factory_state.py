@@ -22,7 +22,7 @@ _STREAM = 11  # distinguishes its random numbers from others of the same seed
 
 
 @dataclass(frozen=True)
-class Delivery:
+class FactoryState:
     """`fresh` servos are as the factory sends them (ID 1, 57600 bit/s); those not in `only`, if given, are unplugged.
 
     With `assembly` "random" zeros and directions are not those of the robot's file: calibration has to find them.
@@ -100,7 +100,7 @@ def ticks_per_turn(items: ControlTable) -> int:
     return round(2 * math.pi / items.item("present_position").scale)
 
 
-def add_delivery_arguments(parser: argparse.ArgumentParser) -> None:
+def add_factory_state_arguments(parser: argparse.ArgumentParser) -> None:
     for option, text in (
         ("--fresh", "this joint's servo is as from the factory: ID 1, 57600 bit/s"),
         ("--only", "no other joint's servo is plugged in"),

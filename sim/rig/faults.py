@@ -136,7 +136,7 @@ class Chunk:
 
 
 @dataclass
-class Dice:
+class FaultInjector:
     """Which faults strike when. `struck` counts by kind and servo ID (0 where no servo is concerned)."""
 
     robot: Robot

@@ -6,8 +6,8 @@ between are left out. It is several times quicker, for runs by the hundred.
 
 from __future__ import annotations
 
+from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array, BackendError, Clock
-from servoid.hw.contracts.world import Truth
 from servoid.hw.dynamixel.backend import DynamixelBackend
 from servoid.hw.dynamixel.motors import DynamixelMotors
 from servoid.hw.dynamixel.sensors import DynamixelSensors
@@ -19,7 +19,7 @@ from servoid.sim.rig.rig import Rig
 _TOGETHER_NS = 80_000_000  # after which ticks of 20 ms and batches of 16 ms begin together again
 
 
-class LocalLine:
+class InProcessLine:
     """The rig's line as a Port, and its time as a Clock, which sleeping lets pass.
 
     A port that vanished or an adapter that takes nothing more fails as a real one does on Linux.
@@ -67,7 +67,7 @@ class LocalLine:
             raise BackendError(f"{self.name}: the port is gone")
 
 
-class LocalBackend:
+class InProcessBackend:
     """The hardware backend on `rig`, reset to the robot, the noise and the dice of a seed, without faults.
 
     The truth is the rig's own.
@@ -81,13 +81,10 @@ class LocalBackend:
         rig.advance(-(-rig.now_ns // _TOGETHER_NS) * _TOGETHER_NS)
         rig.scenario = Scenario(seed=seed)
         rig.reset(seed)
-        self._line = LocalLine(rig)
+        self._line = InProcessLine(rig)
         self.clock: Clock = self._line
+        self.simulation = Simulation(rig.plant.truth, self.push)
         self._body = DynamixelBackend(on_the_board(rig.robot), port=self._line, clock=self._line, name=self.name)
-
-    @property
-    def truth(self) -> Truth:
-        return self.rig.plant.truth
 
     def connect(self) -> tuple[DynamixelSensors, DynamixelMotors]:
         """Find the servos, and wait for a step of physics that ticks may begin on. Raises BackendError."""

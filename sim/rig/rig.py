@@ -17,15 +17,15 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.imu.mounting import Mounting
 from servoid.hw.robot.description import Robot
-from servoid.sim.rig.board import Board
-from servoid.sim.rig.bus import Bus
-from servoid.sim.rig.duplicate_id import Spare
-from servoid.sim.rig.factory_state import Delivery
-from servoid.sim.rig.faults import ALERTS, Dice, Fault, Scenario
-from servoid.sim.rig.motors import STEP_NS, Motors
-from servoid.sim.rig.plant import Plant
-from servoid.sim.rig.servo import VirtualServo
-from servoid.sim.rig.wire import Wire
+from servoid.sim.rig.factory_state import FactoryState
+from servoid.sim.rig.faults import ALERTS, Fault, FaultInjector, Scenario
+from servoid.sim.rig.servo.board import VirtualBoard
+from servoid.sim.rig.servo.duplicate_id import DuplicateId
+from servoid.sim.rig.servo.motor_bank import STEP_NS, MotorBank
+from servoid.sim.rig.servo.plant import Plant
+from servoid.sim.rig.servo.virtual_servo import VirtualServo
+from servoid.sim.rig.wire.dispatcher import Dispatcher
+from servoid.sim.rig.wire.half_duplex import Wire
 
 BROWN_OUT, BOARD_BROWN_OUT = 6.0, 4.5  # V below which a servo and the board lose power
 _LONGEST_BROWN_OUT = 0.05  # s, when the scenario does not say
@@ -47,7 +47,7 @@ class Accepted:
 class Rig:
     """The rig of `robot`. Time begins at 0; the robot is held in its home pose until all servos have torque.
 
-    Raises ConfigError for a servo that is no known Dynamixel, and for a fault or delivery of an unknown one.
+    Raises ConfigError for a servo that is no known Dynamixel, and for a fault or factory state of an unknown one.
     """
 
     def __init__(
@@ -57,13 +57,13 @@ class Rig:
         seed: int = 0,
         randomise: bool = False,
         scenario: Scenario | None = None,
-        delivery: Delivery | None = None,
+        factory_state: FactoryState | None = None,
     ) -> None:
-        self.delivery, self.scenario = delivery or Delivery(), scenario or Scenario()
-        self.delivery.check(robot)
-        robot = self.robot = self.delivery.assembled(robot, seed)
+        self.factory_state, self.scenario = factory_state or FactoryState(), scenario or Scenario()
+        self.factory_state.check(robot)
+        robot = self.robot = self.factory_state.assembled(robot, seed)
         self.plant = Plant(robot)
-        self.motors = Motors(robot, self.plant)
+        self.motors = MotorBank(robot, self.plant)
         self.now_ns = 0
         self.wire = Wire()
         self.reset(seed, randomise=randomise)
@@ -75,8 +75,8 @@ class Rig:
         self.auto_release = True  # onto its feet as soon as all servos have torque
         baud, self.wire = self.wire.host_baud, Wire()
         self.wire.host_baud = baud
-        self.dice = Dice(self.robot, self.scenario, self.now_ns)
-        self.bus = Bus(self.wire, self.dice)
+        self.injector = FaultInjector(self.robot, self.scenario, self.now_ns)
+        self.dispatcher = Dispatcher(self.wire, self.injector)
         self.port_open, self.stalled, self.skew_ns = True, False, 0
         self._echo = self._babbles = self._cut = False
         self._next_step_ns = (self.now_ns // STEP_NS + 1) * STEP_NS
@@ -85,17 +85,19 @@ class Rig:
         self.forgotten = 0  # accepted writes that nobody asked for in time
         self.servos = [
             VirtualServo(self.motors, i, servo.model_number, eeprom, self._record)
-            for i, (servo, eeprom) in enumerate(zip(self.robot.servos, self.delivery.eeprom(self.robot), strict=True))
+            for i, (servo, eeprom) in enumerate(
+                zip(self.robot.servos, self.factory_state.eeprom(self.robot), strict=True)
+            )
         ]
-        unplugged = self.delivery.unplugged(self.robot.names)
+        unplugged = self.factory_state.unplugged(self.robot.names)
         for servo, name in zip(self.servos, self.robot.names, strict=True):
             servo.dead = name in unplugged
         codes = self.servos[0].table.bauds
         board = {"id": self.robot.bus.board_id, "baud_rate": codes.index(self.robot.bus.baud)}
         mounting = Mounting(self.robot.imu.signs, self.robot.imu.mounting)
-        self.board = Board(self.motors, board, self._switch, mounting)
+        self.board = VirtualBoard(self.motors, board, self._switch, mounting)
         self._switch(False)
-        self.bus.devices = [*self.servos, self.board]
+        self.dispatcher.devices = [*self.servos, self.board]
 
     def _record(self, joint: int, register: str, value: int, angle: float, now_ns: int) -> None:
         if math.isfinite(angle):
@@ -113,7 +115,7 @@ class Rig:
     @property
     def seconds(self) -> float:
         """Time since the rig began or was reset."""
-        return self.dice.seconds(self.now_ns)
+        return self.injector.seconds(self.now_ns)
 
     # Time
 
@@ -145,7 +147,7 @@ class Rig:
                 sent = self.wire.take_instruction()
                 if self._echo:
                     self._held_back.append((self.now_ns, bytes(sent.data)))
-                self.bus.receive(bytes(sent.data), sent.baud, self.now_ns)
+                self.dispatcher.receive(bytes(sent.data), sent.baud, self.now_ns)
             else:
                 for data in self._deliver():
                     heard += data
@@ -159,11 +161,11 @@ class Rig:
         for servo in self.servos:
             servo.guard(self.now_ns)
         self._supply()
-        for begins_now, fault, id in self.dice.due(self.now_ns):
+        for begins_now, fault, id in self.injector.due(self.now_ns):
             self._fault(begins_now, fault, id)
         if self._babbles:
             count = round(_BABBLE * STEP_NS * 1e-9 * self.wire.host_baud / 10)
-            self.wire.device_sends(self.dice.noise(count), self.now_ns, self.wire.host_baud, self.now_ns)
+            self.wire.device_sends(self.injector.noise(count), self.now_ns, self.wire.host_baud, self.now_ns)
         if self.plant.held and self.auto_release and self.motors.firmware.powered.all():
             self.plant.release()
 
@@ -183,7 +185,7 @@ class Rig:
         data, fresh = b"", self.wire.take_delivery(self.now_ns)
         while self._held_back and self._held_back[0][0] <= self.now_ns:
             data += self._held_back.pop(0)[1]
-        if len(fresh) > 1 and self.dice.strikes(("split",), 0, self.now_ns) is not None:
+        if len(fresh) > 1 and self.injector.strikes(("split",), 0, self.now_ns) is not None:
             middle = len(fresh) // 2
             self._held_back.append((self.now_ns + 1_000_000, fresh[middle:]))
             fresh = fresh[:middle]
@@ -197,7 +199,7 @@ class Rig:
 
     def inject(self, fault: Fault) -> None:
         """Add a fault to the scenario; its times count from the rig's beginning or reset. Raises ConfigError."""
-        self.dice.add(fault)
+        self.injector.add(fault)
 
     def _fault(self, begins: bool, fault: Fault, id: int) -> None:
         """Begin or end a fault that is a state."""
@@ -232,7 +234,7 @@ class Rig:
             self.motors.sag = self.motors.open_circuit - fault.amount if begins else 0.0
             if begins and fault.until is None:
                 end = self.seconds + _LONGEST_BROWN_OUT
-                self.dice.pending = [(end, False, fault, id), *self.dice.pending]
+                self.injector.pending = [(end, False, fault, id), *self.injector.pending]
 
     def _servo_fault(self, begins: bool, fault: Fault, servo: VirtualServo) -> None:
         kind, i, firmware = fault.kind, servo.index, self.motors.firmware
@@ -251,10 +253,12 @@ class Rig:
             other = next(c for c, baud in enumerate(servo.table.bauds) if baud != self.robot.bus.baud and baud >= 57600)
             servo.put("baud_rate", other if begins else servo.table.bauds.index(self.robot.bus.baud))
         elif kind == "id_conflict":
-            self.bus.devices = [device for device in self.bus.devices if not isinstance(device, Spare)]
+            self.dispatcher.devices = [
+                device for device in self.dispatcher.devices if not isinstance(device, DuplicateId)
+            ]
             if begins:
                 eeprom = {name: servo.get(name) for name in ("id", "baud_rate", "return_delay_time")}
-                self.bus.devices.append(Spare(servo.table.number, eeprom))
+                self.dispatcher.devices.append(DuplicateId(servo.table.number, eeprom))
         elif begins and kind == "heat":
             firmware.winding[i] = firmware.case[i] = fault.amount
         elif begins and kind == "reboot":

@@ -25,13 +25,14 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
-from servoid.hw.contracts.control import Instruction, Plan, PlanRequest, State
+from servoid.hw.contracts.control import Adopted, Instruction, Plan, PlanRequest, State
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import read_header, resolve
-from servoid.policy.diffusion.actions import JOINT_TARGETS, ActionSpace, load_action_space
-from servoid.policy.diffusion.config import check_fit
 from servoid.policy.diffusion.features import raw_row
+from servoid.policy.diffusion.model.action_space import JOINT_TARGETS, ActionSpace, load_action_space
+from servoid.policy.diffusion.model.config import check_fit
 from servoid.policy.diffusion.settings import DiffusionSettings, load_settings
+from servoid.stack.control.base import BasePolicy
 from servoid.stack.control.planner import Answer, InlinePlanner, Planner, ProcessPlanner
 from servoid.stack.control.trim import Trim
 from servoid.stack.safety.min_jerk import MinJerk
@@ -43,10 +44,10 @@ STAND_SECONDS = 0.4  # with 0.8 s some fell
 _MANY = 25  # late plans in a row after which it is said that the machine is too slow
 
 
-class DiffusionPolicy:
+class DiffusionPolicy(BasePolicy):
     """Asks a planner every `replan` ticks and runs its plans. One robot; ticks count calls of `act` since `reset`.
 
-    `latest_plan` is the plan that runs; `adopted` lists (requested tick, adopted tick) of all plans of the episode.
+    `latest_plan` is the plan that runs.
     """
 
     def __init__(
@@ -73,8 +74,17 @@ class DiffusionPolicy:
         self._stand = stand
         self._states: deque[Array] = deque(maxlen=history)
         self._applied: deque[Array] = deque(maxlen=history - 1)
-        self.only: Mapping[int, int] | None = None  # where a recorded run is repeated: its requests, and when adopted
+        self._only: Mapping[int, int] | None = None  # where a recorded run is repeated: its requests, and when adopted
         self.reset(0)
+
+    @property
+    def adopted(self) -> Adopted | None:
+        """The plan that was taken over in the last call of `act`."""
+        return self._adopted
+
+    def repeat(self, plans: Mapping[int, int]) -> None:
+        """Take over the plans of a recorded run and no others: ticks of their requests, and of their adoption."""
+        self._only = plans
 
     def reset(self, seed: int) -> None:
         """Begin an episode; its plans draw their noise from `seed`."""
@@ -92,7 +102,7 @@ class DiffusionPolicy:
         self._ended = self._refused = False
         self._events: list[str] = []
         self.latest_plan: Plan | None = None
-        self.adopted: list[tuple[int, int]] = []
+        self._adopted: Adopted | None = None
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         """Joint targets `(n_joints,)` rad for this tick; the goal is held until the first plan.
@@ -106,7 +116,7 @@ class DiffusionPolicy:
         before = self._states[-1] if self._states else row
         self._states.append(row)
         self._applied.append(self._space.encode(before, applied))  # what ran at the tick before
-        tick = self._tick
+        tick, self._adopted = self._tick, None
         if self._trim is not None:
             instruction = replace(instruction, velocity=self._trim(state, instruction.velocity))
         self._adopt(tick)
@@ -146,7 +156,7 @@ class DiffusionPolicy:
 
     def _idle(self, tick: int) -> bool:
         """Whether the planner may be asked. A recorded run says so of a plan that it did adopt."""
-        return self._requested is None or (self.only is not None and tick in self.only)
+        return self._requested is None or (self._only is not None and tick in self._only)
 
     def _adopt(self, tick: int) -> None:
         """Take over the plan that is due at `tick`, or was due before."""
@@ -154,7 +164,7 @@ class DiffusionPolicy:
             return
         requested, due = self._requested, self._requested + self._delay
         self._plan = plan = self._plan or self._planner.collect(requested, self._wait)
-        if plan is None or (self.only is not None and self.only.get(requested) != tick and not plan.error):
+        if plan is None or (self._only is not None and self._only.get(requested) != tick and not plan.error):
             if tick == due and not self._late:  # of many in a row, the first
                 self._events.append(
                     f"the plan requested at tick {requested} was not ready at {tick}: {self._running()}"
@@ -175,7 +185,7 @@ class DiffusionPolicy:
                 f"replan: {self._replan}: set them higher, or steps lower"
             )
         self.latest_plan, self._ended, self._refused = plan, False, False
-        self.adopted.append((requested, tick))
+        self._adopted = Adopted(requested, tick, plan)
 
     def _meanwhile(self, tick: int, row: Array) -> list[Array]:
         """The actions of the next `delay` ticks, as long as no other plan comes."""
@@ -246,7 +256,7 @@ def _build(robot: Robot, settings: DiffusionSettings, cost: Cost | None) -> Answ
 
 def _plan(runtime: Runtime, request: PlanRequest, seed: int) -> Plan:
     """The plan of a request, or why there is none."""
-    from servoid.policy.diffusion.sampler import Diverged
+    from servoid.policy.diffusion.guidance import Diverged
 
     try:
         return runtime.plan(request, seed)

@@ -8,16 +8,16 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Task
 from servoid.hw.robot.description import Robot
-from servoid.policy.references.gait import Gait, GyroFeedback, load_gait
+from servoid.policy.references.gait import Gait, GyroFeedback
+from servoid.stack.control.base import BasePolicy
 
 _NOW = np.array([0])
 
 
-class GaitPolicy:
+class GaitPolicy(BasePolicy):
     def __init__(self, robot: Robot, task: Task, realtime: bool) -> None:
         del task, realtime  # a gait needs neither
-        settings = load_gait()
-        self._gait, self._feedback = Gait(robot, settings), GyroFeedback(robot, settings)
+        self._gait, self._feedback = Gait(robot), GyroFeedback(robot)
 
     def reset(self, seed: int) -> None:
         self._gait.reset()

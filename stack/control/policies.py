@@ -21,7 +21,7 @@ Maker = Callable[[str, Robot, Task, bool], Policy]
 def _diffusion(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     from servoid.stack.control.diffusion import diffusion_policy
 
-    cost = task.cost if getattr(task, "guides", True) else None
+    cost = task.cost if task.guides else None
     return diffusion_policy(robot, _planner(source), cost, process=realtime)
 
 

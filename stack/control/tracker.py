@@ -8,16 +8,17 @@ from servoid.hw.contracts.task import Task
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import resolve
 from servoid.policy.mlp import Mlp
-from servoid.policy.references.gait import Gait, load_gait
+from servoid.policy.references.gait import Gait
 from servoid.policy.tracker.observation import AHEAD, RESIDUAL, TrackerObservation
+from servoid.stack.control.base import BasePolicy
 
 
-class ExpertPolicy:
+class ExpertPolicy(BasePolicy):
     """Raises CheckpointError when the tracker of `checkpoint` does not fit the robot."""
 
     def __init__(self, robot: Robot, task: Task, realtime: bool, checkpoint: str = "expert") -> None:
         del task, realtime  # the tracker sees its reference alone, and answers within the tick
-        self._gait, self._observation = Gait(robot, load_gait()), TrackerObservation(robot)
+        self._gait, self._observation = Gait(robot), TrackerObservation(robot)
         self._tracker, _ = Mlp.load(resolve(checkpoint), "tracker", robot, self._observation.size)
 
     def reset(self, seed: int) -> None:

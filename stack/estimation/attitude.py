@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.geometry import cross, joined, split
+from servoid.hw.geometry import cross, headed, multiply, up_vector, yaw_of
 
 _GRAVITY = 9.81
 _CORRECTION = 0.5  # 1/s: how fast the accelerometer turns the estimate
@@ -19,25 +19,6 @@ _STILL_JOINTS = 0.15  # rad/s
 _STILL_TIME = 0.3  # s
 _FIRST = 0.5  # s of standing after which a bias is known
 _BIAS_MEMORY = 3.0  # s of standing that the bias is averaged over
-
-
-def rotate(quaternion: Array, vector: Array) -> Array:
-    """Turn `(..., 3)` from the base frame into the odometry frame."""
-    w, u = quaternion[..., :1], quaternion[..., 1:]
-    t = 2.0 * cross(u, vector)
-    return vector + w * t + cross(u, t)
-
-
-def up_vector(quaternion: Array) -> Array:
-    """Upward unit vector seen from the base `(..., 3)`."""
-    w, x, y, z = split(quaternion)
-    return joined(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
-
-
-def yaw_of(quaternion: Array) -> Array:
-    """Heading `(...,)` rad in -pi..pi."""
-    w, x, y, z = split(quaternion)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 class Attitude:
@@ -60,8 +41,7 @@ class Attitude:
         q = np.stack([1 + up[..., 2], up[..., 1], -up[..., 0], np.zeros_like(up[..., 0])], -1)
         q = np.where(up[..., 2:] < -1 + 1e-9, [0.0, 1.0, 0.0, 0.0], q)  # on its head any half turn is the shortest
         q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-        turn = yaw_of(q)
-        q = _multiply(np.stack([np.cos(turn / 2), 0 * turn, 0 * turn, -np.sin(turn / 2)], -1), q)
+        q = headed(q, -yaw_of(q))
         self.quaternion = np.where(where[..., None], q, self.quaternion)
         self.bias = np.where(where[..., None], 0.0 if bias is None else bias, self.bias)
         self.yaw = np.where(where, 0.0, self.yaw)
@@ -91,7 +71,7 @@ class Attitude:
         turn = rate + _CORRECTION * trust * cross(measured, up_vector(self.quaternion))
         angle = 0.5 * dt * turn
         step = np.concatenate([np.ones((*self._shape, 1)), angle], -1)
-        q = _multiply(self.quaternion, step)
+        q = multiply(self.quaternion, step)
         self.quaternion = q / np.linalg.norm(q, axis=-1, keepdims=True)
         change = yaw_of(self.quaternion) - self.yaw
         self.yaw = self.yaw + (change + np.pi) % (2 * np.pi) - np.pi
@@ -107,15 +87,3 @@ class Attitude:
         self._seen = np.where(learn, np.minimum(self._seen + dt, _BIAS_MEMORY), self._seen)
         share = np.where(learn, dt / np.maximum(self._seen, dt), 0.0)[..., None]
         self.bias = self.bias + share * np.where(np.isfinite(gyro), gyro - leaning - self.bias, 0.0)
-
-
-def _multiply(a: Array, b: Array) -> Array:
-    """Hamilton product of `(..., 4)` quaternions."""
-    aw, ax, ay, az = split(a)
-    bw, bx, by, bz = split(b)
-    return joined(
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )

@@ -11,11 +11,11 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array, Observation
 from servoid.hw.contracts.control import State
-from servoid.hw.geometry import cross, joined, split
+from servoid.hw.geometry import cross, headed, joined, turned, up_vector
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
 from servoid.policy.mlp import Mlp
-from servoid.stack.estimation.attitude import Attitude, up_vector
+from servoid.stack.estimation.attitude import Attitude
 from servoid.stack.estimation.odometry import OdometryFeatures
 
 _CORNER_SOFTNESS = 0.003  # m of height over which corners share the contact
@@ -99,14 +99,11 @@ class Estimator:
             velocity = velocity + self._odometry(self.features.window())
 
         yaw = self._attitude.yaw - self._heading0
-        c, s = np.cos(yaw), np.sin(yaw)
-        step = joined(c * velocity[..., 0] - s * velocity[..., 1], s * velocity[..., 0] + c * velocity[..., 1])
-        self._displacement[..., :2] += step * dt
+        self._displacement[..., :2] += turned(velocity[..., :2], yaw) * dt
         self._displacement[..., 2] = -ground[..., 0]
-        half = self._heading0 / 2
         return State(
             time_ns=observation.time_ns,
-            orientation=_unyaw(self._attitude.quaternion, half),
+            orientation=headed(self._attitude.quaternion, -self._heading0),
             gravity=-up,
             yaw=yaw,
             angular_velocity=rate,
@@ -148,10 +145,3 @@ def _heading_frame(up: Array) -> Array:
     forward = forward - up[..., :1] * up
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True) + 1e-9
     return np.stack([forward, cross(up, forward), up], -2)
-
-
-def _unyaw(quaternion: Array, half: Array) -> Array:
-    """Turn a quaternion about z by minus twice `half`."""
-    c, s = np.cos(half), -np.sin(half)
-    w, x, y, z = split(quaternion)
-    return joined(c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w)

@@ -14,7 +14,7 @@ IMU_FIELDS = ("angular_velocity", "specific_force")
 SLOW_FIELDS = ("temperature", "voltage")  # read in rotation: their last value stands
 
 
-class Coast:
+class SampleHold:
     """Fills what an observation lacks (NaN) from the newest valid sample.
 
     A joint's sample is its position and velocity; the IMU's is angular velocity and specific force (not every IMU

@@ -6,24 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from servoid.hw.contracts.body import Array, Command, Observation
-from servoid.hw.contracts.control import Instruction, Plan, State
+from servoid.hw.contracts.control import Adopted, Instruction, State
 from servoid.hw.contracts.world import Percept
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Phase
 
 
 @dataclass(frozen=True, slots=True)
-class Adopted:
-    """A plan at the tick of its adoption; ticks count calls of the policy in this run."""
-
-    requested: int
-    adopted: int
-    plan: Plan
-
-
-@dataclass(frozen=True, slots=True)
 class Proposal:
-    """What a pilot wants at a tick. Without a target the goal holds."""
+    """What a supervisor wants at a tick. Without a target the goal holds."""
 
     target: Array | None = None  # (n_joints,) rad
     instruction: Instruction | None = None

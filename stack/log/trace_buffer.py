@@ -13,7 +13,7 @@ _LONGEST = 36_000  # ticks that room is made for at once; a longer run takes as 
 _COLUMNS = {"displacement": 3, "yaw": 1, "velocity": 3, "yaw_rate": 1, "command": 3}  # and the joints
 
 
-class Tape:
+class TraceBuffer:
     """Rows of a task of one robot; `len` of it are the ticks so far."""
 
     def __init__(self, joints: int, ticks: int) -> None:

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import Any
 
 from servoid.hw.config import ConfigError, nearest
-from servoid.hw.contracts.body import Backend
+from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.description import Robot
 

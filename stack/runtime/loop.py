@@ -7,7 +7,7 @@ from typing import Protocol
 
 from servoid.hw.contracts.body import Array, Observation, Sensors
 from servoid.hw.contracts.control import State
-from servoid.stack.estimation.sample_hold import Coast, complete
+from servoid.stack.estimation.sample_hold import SampleHold, complete
 from servoid.stack.log.tick import Listener, Proposal, TickRecord, Timing
 from servoid.stack.runtime.clock import Schedule
 from servoid.stack.runtime.interrupt import TWICE, Interrupt, Stops
@@ -25,7 +25,7 @@ class Estimator(Protocol):
     def update(self, observation: Observation, applied: Array, ticks: int) -> State: ...
 
 
-class Pilot(Protocol):
+class Supervisor(Protocol):
     """Decides what a run does at each tick, through the guard."""
 
     def act(self, tick: int, observation: Observation, state: State | None) -> Proposal: ...
@@ -38,16 +38,16 @@ class Loop:
         self,
         sensors: Sensors,
         estimator: Estimator,
-        pilot: Pilot,
+        supervisor: Supervisor,
         guard: Guard,
         schedule: Schedule,
         interrupt: Interrupt,
         stops: Stops,
         listeners: tuple[Listener, ...] = (),
     ) -> None:
-        self._sensors, self._estimator, self._pilot, self._guard = sensors, estimator, pilot, guard
+        self._sensors, self._estimator, self._supervisor, self._guard = sensors, estimator, supervisor, guard
         self._schedule, self._interrupt, self._stops, self._listeners = schedule, interrupt, stops, listeners
-        self._coast = Coast()
+        self._hold = SampleHold()
         self._estimated: int | None = None  # tick of the newest state
         self._record_ns = 0
 
@@ -68,7 +68,7 @@ class Loop:
         raw = self._sensors.read()
         read = time.perf_counter_ns()
         self._guard.begin(wake.tick, raw.time_ns)
-        observation = self._coast.update(raw)
+        observation = self._hold.update(raw)
         state = self._estimate(wake.tick, observation) if complete(observation) else None
         estimated = time.perf_counter_ns()
         self._heed(wake.tick)  # first: a signal that asks to stop may have ended a planner, too
@@ -101,7 +101,7 @@ class Loop:
     def _act(self, tick: int, observation: Observation, state: State | None) -> Proposal:
         self._interrupt.breakable = True  # nothing is written here, so a hung policy may be cut off
         try:
-            return self._pilot.act(tick, observation, state)
+            return self._supervisor.act(tick, observation, state)
         finally:
             self._interrupt.breakable = False
 

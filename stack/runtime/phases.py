@@ -14,8 +14,8 @@ from servoid.hw.contracts.task import Task, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot
 from servoid.stack.estimation.sample_hold import missing
-from servoid.stack.log.tick import Adopted, Proposal
-from servoid.stack.log.trace_buffer import Tape
+from servoid.stack.log.tick import Proposal
+from servoid.stack.log.trace_buffer import TraceBuffer
 from servoid.stack.runtime.loop import Estimator
 from servoid.stack.safety.guard import Guard, Phase
 
@@ -25,8 +25,8 @@ DONE = "the task is done"
 SETTLE_SECONDS = 1.5  # standing still at home, in which the estimator learns the gyro's bias
 
 
-class Director:
-    """Pilot of a run. `push` changes the body's velocity, m/s `(2,)`; None where a body cannot be pushed.
+class Phases:
+    """Supervises a run. `push` changes the body's velocity, m/s `(2,)`; None where a body cannot be pushed.
 
     `look` sees what is around the robot (`world.Surroundings`); without it the task says what should be there.
     """
@@ -45,13 +45,12 @@ class Director:
         self._push = push
         self._look = task.percept if look is None else look
         self._settled = 0
-        self._plans = 0  # adopted so far
-        self._tape = Tape(len(robot.joints), round(task.seconds / robot.dt))
+        self._buffer = TraceBuffer(len(robot.joints), round(task.seconds / robot.dt))
         self.ended: str | None = None  # "done" or "time", if the task ended by itself
 
     @property
     def task_ticks(self) -> int:
-        return len(self._tape)
+        return len(self._buffer)
 
     def act(self, tick: int, observation: Observation, state: State | None) -> Proposal:
         phase = self._guard.phase
@@ -73,7 +72,7 @@ class Director:
     def trace(self) -> Trace:
         """What the robot believes to have gone through in the task."""
         fallen = self._guard.phase is Phase.FAULT and self._guard.cause == "fall" and self.ended is None
-        return self._tape.trace(self._robot.dt, fallen)
+        return self._buffer.trace(self._robot.dt, fallen)
 
     def _wake(self, tick: int, observation: Observation, state: State | None) -> None:
         if state is not None:
@@ -86,7 +85,7 @@ class Director:
         tick = self.task_ticks
         percept = self._look(state)
         instruction = self._task.instruct(tick, state, percept)
-        self._tape.add(state, instruction, percept)
+        self._buffer.add(state, instruction, percept)
         shown = Proposal(instruction=instruction, percept=percept)
         if self._task.done(state):
             return self._end("done", DONE, shown, state)
@@ -101,7 +100,7 @@ class Director:
             self._guard.give_up(_failed(error))
             return shown
         self._tell()
-        return Proposal(target, instruction, percept, self._adopted())
+        return Proposal(target, instruction, percept, self._policy.adopted)
 
     def _come_to_rest(self, state: State) -> Proposal:
         """Ask the policy to stand."""
@@ -111,20 +110,12 @@ class Director:
             self._guard.give_up(_failed(error))
             return Proposal()
         self._tell()
-        return Proposal(target, plan=self._adopted())
+        return Proposal(target, plan=self._policy.adopted)
 
     def _tell(self) -> None:
         """What the policy wants a person to know, as events."""
-        for text in self._policy.take_events() if hasattr(self._policy, "take_events") else ():
+        for text in self._policy.take_events():
             self._guard.note("plan", text)
-
-    def _adopted(self) -> Adopted | None:
-        """The plan that a planning policy took over at this tick."""
-        adopted: list[tuple[int, int]] = getattr(self._policy, "adopted", [])
-        if len(adopted) <= self._plans:
-            return None
-        self._plans = len(adopted)
-        return Adopted(*adopted[-1], self._policy.latest_plan)  # type: ignore[attr-defined]
 
     def _end(self, how: str, text: str, shown: Proposal, state: State) -> Proposal:
         """End the task. The policy is asked at this tick too: a walking robot has no time for a tick without."""

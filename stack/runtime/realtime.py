@@ -13,7 +13,7 @@ PRIORITY = 50  # of SCHED_FIFO: above ordinary processes, below the kernel's own
 
 
 @contextmanager
-def steady(first_in_line: bool, note: Callable[[str], None]) -> Iterator[None]:
+def undisturbed(first_in_line: bool, note: Callable[[str], None]) -> Iterator[None]:
     """Keep garbage collection, and with `first_in_line` other processes, from holding up the thread that enters.
 
     Objects that live already are frozen, so that a full collection (65 to 103 ms with torch imported) does not visit

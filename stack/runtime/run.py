@@ -7,15 +7,16 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from servoid.hw.config import ConfigError
-from servoid.hw.contracts.body import Array, Backend
+from servoid.hw.contracts.backend import Backend
+from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Policy
 from servoid.hw.contracts.task import Task, Trace
-from servoid.hw.contracts.world import Scene, Surroundings
+from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.calibration import calibrated
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.stack.control.policies import make_policy, policy_fingerprint
@@ -26,9 +27,9 @@ from servoid.stack.runtime.backends import backend_kind, make_backend
 from servoid.stack.runtime.clock import RealTime, Schedule, WallClock
 from servoid.stack.runtime.interrupt import Interrupt, Stops
 from servoid.stack.runtime.loop import Loop
-from servoid.stack.runtime.multi_robot import Others, OtherTask
-from servoid.stack.runtime.phases import Director
-from servoid.stack.runtime.realtime import steady
+from servoid.stack.runtime.multi_robot import Others
+from servoid.stack.runtime.phases import Phases
+from servoid.stack.runtime.realtime import undisturbed
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Guard, Phase
 from servoid.stack.tasks import load_task
@@ -38,7 +39,7 @@ TASK_STREAM = 1  # distinguishes the task's random stream from others of the sam
 
 
 @dataclass(frozen=True)
-class Settings:
+class RunSettings:
     """What to run. `set` overrides the task's settings by name; `gain` in it scales the servos' position gain."""
 
     task: str
@@ -92,7 +93,7 @@ class Result:
 
 
 def run(
-    settings: Settings,
+    settings: RunSettings,
     *,
     backend: Backend | None = None,
     on_tick: Listener | None = None,
@@ -102,15 +103,15 @@ def run(
 ) -> Result:
     """Do one run and return how it went, the robot with torque off.
 
-    `backend` and `policy` replace those that the settings name; a backend that has a `truth` is a simulation, which
-    starts itself and need not keep to real time. `on_tick` is called after each tick and must be quick.
-    `confirm` asks the person at a real robot, and returns when it may move. `script` repeats a recorded run. Raises
-    ConfigError before anything is connected, BackendError when the body cannot be reached.
+    `backend` and `policy` replace those that the settings name; a backend that offers a `simulation` starts itself and
+    need not keep to real time. `on_tick` is called after each tick and must be quick. `confirm` asks the person
+    at a real robot, and returns when it may move. `script` repeats a recorded run. Raises ConfigError before anything
+    is connected, BackendError when the body cannot be reached.
     """
     script = script or Script()
     robot = load_robot(settings.robot)
     task, gain = _task(settings, robot)
-    simulated = backend_kind(settings.backend).simulated if backend is None else hasattr(backend, "truth")
+    simulated = backend_kind(settings.backend).simulated if backend is None else backend.simulation is not None
     realtime = not simulated if settings.realtime is None else settings.realtime
     if not (simulated or settings.start or confirm):
         raise ConfigError(
@@ -121,7 +122,7 @@ def run(
         from servoid.stack.log.recorder import Recorder, check_new
 
         check_new(settings.record)
-    if script.velocities is not None and hasattr(task, "steer_by"):
+    if script.velocities is not None:
         task.steer_by(script.velocities, script.ended)
     scene = start_task(task, settings.seed)
     assembled, assembly = (robot, None) if simulated or backend is not None else calibrated(robot)
@@ -133,26 +134,25 @@ def run(
         port=settings.port,
         scene=scene,
     )
-    if scene is not None and simulated and getattr(body, "stage", None) is None:
+    surroundings = None if body.simulation is None else body.simulation.surroundings
+    if scene is not None and simulated and surroundings is None:
         raise ConfigError(
             f"task '{task.name}' has a scene: make the backend with it (servoid.stack.runtime.run.prepare does)"
         )
-    tasks: tuple[OtherTask, ...] = getattr(task, "others", ())
-    if tasks and policy is not None:
-        raise ConfigError(f"task '{task.name}' has {len(tasks) + 1} robots, each with its own policy: name one instead")
+    if task.teammates and policy is not None:
+        robots = len(task.teammates) + 1
+        raise ConfigError(f"task '{task.name}' has {robots} robots, each with its own policy: name one instead")
     with ExitStack() as stack:
-        if hasattr(task, "close"):
-            stack.callback(task.close)
+        stack.callback(task.close)
         interrupt = stack.enter_context(Interrupt(eager=True))
         pilot = make_policy(settings.policy, robot, task, realtime) if policy is None else policy
-        if script.plans is not None and hasattr(pilot, "only"):
-            pilot.only = script.plans
-        if hasattr(pilot, "close"):
-            stack.callback(pilot.close)
+        stack.callback(pilot.close)
+        if script.plans is not None:
+            pilot.repeat(script.plans)
         stack.callback(body.close)
         stack.callback(setattr, interrupt, "eager", False)  # a second Ctrl-C must not break off the closing
-        push = getattr(body, "push", None)
-        if push is None and _pushes(task):
+        push = None if body.simulation is None else body.simulation.push
+        if push is None and task.pushes:
             raise ConfigError(f"backend '{body.name}' cannot push the robot: drop the task's push setting")
         pilot.reset(settings.seed)
         sensors, motors = body.connect()
@@ -166,17 +166,18 @@ def run(
         if assembly is not None:
             guard.note("system", assembly)
         estimator = Estimator(robot, odometry)
-        look = None if scene is None or not simulated else cast(Surroundings, body).look
-        director = Director(robot, guard, estimator, task, pilot, push, look)
+        look = None if surroundings is None else surroundings.look
+        phases = Phases(robot, guard, estimator, task, pilot, push, look)
         tally = _Tally()
         listeners: list[Listener] = [tally]
         others = None
-        if tasks:
+        time = body.clock
+        if task.teammates and body.simulation is not None:
             # Their planners never run beside the loop: the log, which is the first robot's, has to repeat them.
-            others = Others(
+            time = others = Others(
                 robot,
                 body,
-                tasks,
+                task.teammates,
                 lambda its: make_policy(settings.policy, robot, its, realtime=False),
                 guard,
                 interrupt,
@@ -204,11 +205,11 @@ def run(
         if on_tick is not None:
             listeners.append(on_tick)
         if realtime:
-            stack.enter_context(steady(not simulated, lambda text: guard.note("system", text)))
-        clock = RealTime(body.clock) if realtime and not isinstance(body.clock, WallClock) else body.clock
+            stack.enter_context(undisturbed(not simulated, lambda text: guard.note("system", text)))
+        clock = RealTime(time) if realtime and not isinstance(time, WallClock) else time
         requests = Stops(interrupt, lambda: recorder.error if recorder is not None else None, script.stops)
         loop = Loop(
-            sensors, estimator, director, guard, Schedule(clock, robot.rate), interrupt, requests, tuple(listeners)
+            sensors, estimator, phases, guard, Schedule(clock, robot.rate), interrupt, requests, tuple(listeners)
         )
         try:
             loop.run()
@@ -221,7 +222,7 @@ def run(
             raise
         last = guard.events()
         tally.events += last
-        result = replace(tally.result(director, guard, task, settings), interrupted=interrupt.count > 0)
+        result = replace(tally.result(phases, guard, task, settings), interrupted=interrupt.count > 0)
         if recorder is not None:
             recorder.events(last)
             recorder.close(result.summary())
@@ -229,7 +230,7 @@ def run(
         return result
 
 
-def prepare(settings: Settings) -> tuple[Task, Backend]:
+def prepare(settings: RunSettings) -> tuple[Task, Backend]:
     """The task of a run, its episode drawn, and the simulated body with its scene, for `run` and for judging it.
 
     Raises ConfigError like `run`.
@@ -254,7 +255,7 @@ def start_task(task: Task, seed: int) -> Scene | None:
     return task.scene()
 
 
-def _task(settings: Settings, robot: Robot) -> tuple[Task, float]:
+def _task(settings: RunSettings, robot: Robot) -> tuple[Task, float]:
     values = dict(settings.set)
     text = values.pop("gain", "1")
     try:
@@ -276,10 +277,6 @@ def _with_failure(result: Result, error: str | None) -> Result:
     return replace(result, events=(*result.events, Event(last.tick, last.time, "record", None, error)))
 
 
-def _pushes(task: Task) -> bool:
-    return bool(np.any(getattr(getattr(task, "settings", None), "push", 0.0)))
-
-
 class _Tally:
     """Counts while a run goes on."""
 
@@ -294,28 +291,28 @@ class _Tally:
             self._late.append(record.timing.late)
             self._missed += record.timing.missed
 
-    def result(self, director: Director, guard: Guard, task: Task, settings: Settings) -> Result:
-        trace = director.trace()
-        success = bool(director.ended is not None and task.success(trace))
+    def result(self, phases: Phases, guard: Guard, task: Task, settings: RunSettings) -> Result:
+        trace = phases.trace()
+        success = bool(phases.ended is not None and task.success(trace))
         late = np.array(self._late or [0], dtype=float) * 1e-6
         return Result(
-            outcome=_outcome(director, guard, success, trace),
+            outcome=_outcome(phases, guard, success, trace),
             success=success,
-            seconds=director.task_ticks * trace.dt,
-            ticks=director.task_ticks,
+            seconds=phases.task_ticks * trace.dt,
+            ticks=phases.task_ticks,
             missed=self._missed,
             late_p50_ms=float(np.percentile(late, 50)),
             late_p99_ms=float(np.percentile(late, 99)),
-            metrics=task.metrics(trace) if director.task_ticks else {},
+            metrics=task.metrics(trace) if phases.task_ticks else {},
             events=tuple(self.events),
             trace=trace,
             log=settings.record,
         )
 
 
-def _outcome(director: Director, guard: Guard, success: bool, trace: Trace) -> str:
-    if director.ended is not None:
-        return "succeeded" if success else "timed_out" if director.ended == "time" else "failed"
+def _outcome(phases: Phases, guard: Guard, success: bool, trace: Trace) -> str:
+    if phases.ended is not None:
+        return "succeeded" if success else "timed_out" if phases.ended == "time" else "failed"
     if trace.fallen:
         return "fell"
     return "interrupted" if guard.cause == "interrupt" else "stopped"

@@ -38,7 +38,7 @@ from servoid.stack.estimation.sample_hold import missing
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.health import BLOCKED, Health
 from servoid.stack.safety.limits import limit
-from servoid.stack.safety.lowering import crouch
+from servoid.stack.safety.lowering import lowered_pose
 from servoid.stack.safety.min_jerk import MIN_JERK_PEAK, MinJerk
 
 ASKED = {"interrupt", "button"}  # kinds of what a person does to stop the robot
@@ -80,7 +80,7 @@ class Guard:
         self.applied: Array = robot.home.copy()  # (n_joints,) rad: the last accepted goal
         self.off = False  # torque off has been sent
         self.cause: str | None = None  # kind of the event that ended the run, the first if there were several
-        self.lowest = crouch(robot)
+        self.lowest = lowered_pose(robot)
         self._motors = motors
         self._gain = np.full(len(robot.names), gain)
         self._health = Health(robot, self._gain)

@@ -1,4 +1,4 @@
-"""The crouch that the guard lowers a standing robot to, found from the geometry of its legs."""
+"""The pose that the guard lowers a standing robot to, found from the geometry of its legs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STEP = 0.005  # m, so that each solution starts near the next
 TOLERANCE = 1e-5  # m and rad
 
 
-def crouch(robot: Robot) -> Array:
+def lowered_pose(robot: Robot) -> Array:
     """Joint positions `(n_joints,)` rad of a low, statically stable stance.
 
     Every sole stays as flat as it is at the home pose while the base comes down, and a little forward, in steps to

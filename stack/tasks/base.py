@@ -9,7 +9,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.task import Task, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.robot.description import Robot
 from servoid.stack.tasks.guidance import Trajectory, Weights, total_cost
@@ -36,6 +36,8 @@ class BaseTask:
     settings_type: ClassVar[type[Settings]] = Settings
     steered: ClassVar[bool] = False  # by a person, who needs real time
     counts_undone: ClassVar[tuple[str, ...]] = ()  # metrics that hold of a run that never began, too
+    goal: Array | None = None  # (2,) m in the frame that the robot starts in, where it shall be in one place
+    teammates: tuple[Task, ...] = ()  # the tasks of the scene's other robots
 
     def __init__(self, settings: Any, dt: float) -> None:
         self.settings = settings
@@ -47,8 +49,17 @@ class BaseTask:
         """Settings as typed, with those that follow from them."""
         return settings
 
+    def steer_by(self, velocities: Array, ended: bool) -> None:
+        """Follow a recorded run's velocities `(ticks, 3)`; `ended`: whether with the last one the person ended it."""
+
     def reset(self, rng: np.random.Generator) -> None:
         """Draw the episode. All randomness of a task comes from `rng`."""
+
+    def lost(self) -> None:
+        """The task's robot has ended, maybe before the others of the scene."""
+
+    def close(self) -> None:
+        """Let go of devices."""
 
     def check(self, robot: Robot) -> None:
         """Raise ConfigError where the settings ask for what `robot` cannot do."""
@@ -76,6 +87,11 @@ class BaseTask:
     def guides(self) -> bool:
         """Whether its cost can guide a plan; where it is zero, planners need no gradient of it, and no samples."""
         return True
+
+    @property
+    def pushes(self) -> bool:
+        """Whether `disturbance` may answer with a push, which only a simulated body can be given."""
+        return False
 
     def done(self, state: State) -> bool:
         """Whether the episode may end before its time."""

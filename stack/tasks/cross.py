@@ -12,8 +12,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept, Scene
+from servoid.hw.geometry import to_heading, turned
 from servoid.stack.navigation.collision_avoidance import Motion, Passing, way
-from servoid.stack.navigation.frames import to_heading, turned
 from servoid.stack.navigation.go_to_point import Approach, approach
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseTask, Settings, require_positive
@@ -58,7 +58,7 @@ class Cross(BaseTask):
     name = "cross"
     description = "cross a circle together with other robots, to the opposite side, without touching one"
     settings_type = CrossSettings
-    others: tuple[Cross, ...] = ()  # of the first robot's task: those of the other robots
+    teammates: tuple[Cross, ...] = ()  # of the first robot's task: those of the other robots
 
     def __init__(self, settings: CrossSettings, dt: float) -> None:
         super().__init__(settings, dt)
@@ -80,7 +80,7 @@ class Cross(BaseTask):
         rim = s.circle * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
         middle = np.array([s.circle, 0.0])
         self._others = np.column_stack([middle + rim, angles - math.pi, middle - rim])
-        self.others = tuple(Cross(s, self.dt) for _ in range(s.robots - 1))
+        self.teammates = tuple(Cross(s, self.dt) for _ in range(s.robots - 1))
 
     def scene(self) -> Scene:
         return Scene(np.zeros((0, 3)), np.zeros((0, 4)), self.goal, self._others)
@@ -95,7 +95,7 @@ class Cross(BaseTask):
         goal = to_heading(self.goal if percept.goal is None else percept.goal, state)
         robots = np.zeros((0, 3)) if percept.robots is None else percept.robots
         near = to_heading(robots[:, :2], state)
-        velocity = turned(self._motion.update(robots[:, :2]), -float(state.yaw))
+        velocity = turned(self._motion.update(robots[:, :2]), -state.yaw)
         self.arrived = bool(np.linalg.norm(goal) <= (1.0 if self.arrived else 0.7) * s.radius)
         if self.arrived:
             return Instruction(velocity=np.zeros(3), goal=goal)
@@ -109,7 +109,7 @@ class Cross(BaseTask):
 
     def done(self, state: State) -> bool:
         """For the first robot, when it and all others have arrived, or cannot any more. The others stand meanwhile."""
-        return bool(self.others) and self.arrived and all(other.arrived or other.ended for other in self.others)
+        return bool(self.teammates) and self.arrived and all(other.arrived or other.ended for other in self.teammates)
 
     def lost(self) -> None:
         self.ended = True

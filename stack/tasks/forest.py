@@ -12,7 +12,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept, Scene
-from servoid.stack.navigation.frames import ahead, moving, to_heading
+from servoid.hw.geometry import to_heading
 from servoid.stack.navigation.go_to_point import Approach, approach
 from servoid.stack.navigation.potential_field import Field, FieldSettings
 from servoid.stack.tasks import metrics as measures
@@ -119,7 +119,7 @@ class Forest(BaseTask):
         return Instruction(
             velocity=approach(far, self.settings.approach),
             goal=goal,
-            obstacles=moving(ahead(pillars, state), np.zeros(2)),
+            obstacles=np.pad(to_heading(pillars, state), ((0, 0), (0, 2))),  # they stand
         )
 
     def done(self, state: State) -> bool:

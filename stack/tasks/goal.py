@@ -14,8 +14,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept, Scene
+from servoid.hw.geometry import to_heading
 from servoid.policy.text.captions import twist_of
-from servoid.stack.navigation.frames import to_heading
 from servoid.stack.navigation.go_to_point import Approach, approach
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseTask, Range, Settings, require_positive, require_ranges

@@ -14,10 +14,10 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Keyframes, State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
+from servoid.hw.geometry import to_heading, turned
 from servoid.hw.robot.description import Robot
 from servoid.policy.diffusion.features import Layout, raw_layout
 from servoid.stack.log.flightlog import FlightLog, read_log
-from servoid.stack.navigation.frames import to_heading, turned
 from servoid.stack.tasks.base import BaseTask, Settings, require_positive
 
 _SOON = 0.2  # s: nearer keyframes are not hurried to

@@ -12,7 +12,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept, Scene
-from servoid.stack.navigation.frames import ahead, moving
+from servoid.hw.geometry import to_heading
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseTask, Settings, require_positive
 
@@ -67,7 +67,7 @@ class Obstacle(BaseTask):
         s = self.settings
         if percept.obstacles is None or not len(percept.obstacles):
             return Instruction(velocity=np.zeros(3))
-        obstacles = ahead(percept.obstacles, state)
+        obstacles = to_heading(percept.obstacles, state)
         nearest = obstacles[np.argmin(np.linalg.norm(obstacles[:, :2], axis=1)), :2]
         self._distance = float(np.linalg.norm(nearest))
         bearing = math.atan2(-nearest[1], -nearest[0])
@@ -79,7 +79,7 @@ class Obstacle(BaseTask):
             ]
         )
         rolling = -s.sphere_speed * obstacles[:, :2] / np.linalg.norm(obstacles[:, :2], axis=1, keepdims=True)
-        return Instruction(velocity=velocity, obstacles=moving(obstacles, rolling))
+        return Instruction(velocity=velocity, obstacles=np.concatenate([obstacles, rolling], -1))
 
     def done(self, state: State) -> bool:
         """Escaped, as the robot sees it, with something to spare."""

@@ -12,7 +12,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept, Scene
-from servoid.stack.navigation.frames import to_heading
+from servoid.hw.geometry import to_heading
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseTask, Settings, require_positive
 

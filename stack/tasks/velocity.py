@@ -13,7 +13,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
-from servoid.stack.navigation.frames import turned
+from servoid.hw.geometry import turned
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseTask, Range, Settings, require_positive, require_ranges
 
@@ -57,7 +57,7 @@ class Velocity(BaseTask):
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
         number = self._segment(tick)
-        ahead = turned(self._velocity[number], -float(state.yaw))
+        ahead = turned(self._velocity[number], -state.yaw)
         off = (self._direction[number] - float(state.yaw) + math.pi) % (2.0 * math.pi) - math.pi
         turn = min(max(self.settings.turn_gain * off, -self.settings.yaw_rate), self.settings.yaw_rate)
         if not self._velocity[number].any() and abs(off) < 0.05:
@@ -92,8 +92,6 @@ class Velocity(BaseTask):
                     errors.append(np.linalg.norm(self._velocity[self._segment(start)]))
                     continue
                 rows = slice(first, first + cycle)
-                cos, sin = np.cos(trace.yaw[rows]), np.sin(trace.yaw[rows])
-                forward, left = trace.velocity[rows, 0], trace.velocity[rows, 1]
-                ground = np.stack([cos * forward - sin * left, sin * forward + cos * left], axis=-1).mean(0)
+                ground = turned(trace.velocity[rows, :2], trace.yaw[rows]).mean(0)
                 errors.append(np.linalg.norm(ground - self._velocity[self._segment(start)]))
         return float(np.mean(errors)) if errors else float("nan")

@@ -65,6 +65,10 @@ class Walk(BaseTask):
         segment = tick // max(round(self.settings.every / self.dt), 1)
         return Instruction(velocity=self._commands[min(segment, len(self._commands) - 1)].copy())
 
+    @property
+    def pushes(self) -> bool:
+        return self.settings.push[1] > 0.0
+
     def disturbance(self, tick: int) -> Array | None:
         """A push at each whole interval, the first one interval after the start."""
         number, rest = divmod(tick, max(round(self.settings.push_every / self.dt), 1))

@@ -105,7 +105,7 @@ def test_whole_robot(model: mujoco.MjModel) -> None:
 
 def test_every_body_collides(model: mujoco.MjModel) -> None:
     colliding = {int(b) for b, c in zip(model.geom_bodyid, model.geom_conaffinity, strict=True) if c}
-    assert colliding == set(range(1, model.nbody))
+    assert colliding == set(range(model.nbody))
 
 
 def test_leg_kinematics_equal_mujoco(model: mujoco.MjModel) -> None:

@@ -33,7 +33,7 @@ def scene(*starts: tuple[float, float, float]) -> Scene:
 
 def hold(body: SimBackend, robot: Robot, ticks: int) -> list[Array]:
     """All hold the home pose; what the first one's sensors said meanwhile."""
-    bodies = [body.connect(), *(other.connect() for other in body.others)]
+    bodies = [body.connect(), *(other.connect() for other in body.simulation.teammates)]
     for _, motors in bodies:
         motors.write(Command(robot.home, np.ones(len(robot.joints)), Mode.ACTIVE))
     seen, start = [], body.clock.now_ns() // TICK
@@ -56,8 +56,10 @@ def test_each_robot_has_a_block_of_its_own(robot: Robot, robots: int) -> None:
         servos = [int(model.actuator(own + name).id) for name in robot.names]
         assert servos == [number * one.nu + int(one.actuator(name).id) for name in robot.names]
         size = model.nsensordata // robots
-        assert int(model.sensor(own + "gyro").adr[0]) == number * size
-        assert int(model.sensor(own + "right_up").adr[0]) == number * size + int(one.sensor("right_up").adr[0])
+        assert int(model.sensor(own + "servoid/gyro").adr[0]) == number * size
+        assert int(model.sensor(own + "servoid/right_up").adr[0]) == number * size + int(
+            one.sensor("servoid/right_up").adr[0]
+        )
 
 
 def test_rows_are_views_of_the_one_world(robot: Robot) -> None:
@@ -109,7 +111,7 @@ def test_the_others_draw_from_streams_of_their_own(robot: Robot) -> None:
 def test_one_that_is_switched_off_falls_alone(robot: Robot) -> None:
     body = SimBackend(robot, seed=0, scene=scene((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     hold(body, robot, 10)
-    body.others[0].close()
+    body.simulation.teammates[0].close()
     for tick in range(11, 100):
         body.clock.sleep_until(tick * TICK)
     assert body.truth.fallen.tolist() == [False, True, False]
@@ -123,22 +125,22 @@ def test_who_stands_too_near_touches(robot: Robot, apart: float, touching: bool)
 
 def test_each_sees_the_others_and_its_own_goal_from_where_it_is(robot: Robot) -> None:
     body = SimBackend(robot, scene=scene((1.0, 0.5, np.pi / 2), (2.0, 0.0, np.pi)))
-    first = body.look(state(0.0, 0.0, 0.0))
+    first = body.stage.look(state(0.0, 0.0, 0.0))
     assert first.robots is not None
     np.testing.assert_allclose(first.robots, [[1.0, 0.5, np.pi / 2], [2.0, 0.0, np.pi]], atol=1e-9)
     np.testing.assert_allclose(first.goal, [2.0, 0.0], atol=1e-9)
-    second = body.others[0].look(state(0.0, 0.0, 0.0))  # which faces along y of the world
+    second = body.simulation.teammates[0].simulation.surroundings.look(
+        state(0.0, 0.0, 0.0)
+    )  # which faces along y of the world
     assert second.robots is not None
     np.testing.assert_allclose(second.robots, [[-0.5, 1.0, -np.pi / 2], [-0.5, -1.0, np.pi / 2]], atol=1e-9)
     np.testing.assert_allclose(second.goal, [0.0, -1.0], atol=1e-9)
 
 
 def test_time_goes_on_by_the_first_ones_clock_alone(robot: Robot) -> None:
-    body, ticks = SimBackend(robot, scene=scene((1.0, 0.0, 0.0))), []
-    body.before_step = lambda: ticks.append(body.clock.now_ns())
-    other = body.others[0].clock
+    body = SimBackend(robot, scene=scene((1.0, 0.0, 0.0)))
+    other = body.simulation.teammates[0].clock
     with pytest.raises(RuntimeError, match="by the first one's clock"):
         other.sleep_until(TICK)
     body.clock.sleep_until(3 * TICK)
-    assert ticks == [0, TICK, 2 * TICK]
     assert other.now_ns() == 3 * TICK

@@ -18,7 +18,7 @@ from servoid.hw.robot.description import Robot, load_robot
 from servoid.sim.backend import SimBackend
 from servoid.sim.model import build
 from servoid.sim.render import Frame, render
-from servoid.sim.rig.plant import Plant
+from servoid.sim.rig.servo.plant import Plant
 from servoid.sim.scene import from_plain, plain, robot_bodies
 
 NOTHING = np.zeros((0, 3)), np.zeros((0, 4))
@@ -78,7 +78,7 @@ def test_a_sphere_rolls_to_the_robot_and_touches_it(robot: Robot) -> None:
     motors.write(Command(robot.home, np.ones(len(robot.joints)), Mode.ACTIVE))
     places, touched = [], []
     for tick in range(1, 21):
-        places.append(body.look(state(0, 0, 0)).obstacles[0, 0])
+        places.append(body.stage.look(state(0, 0, 0)).obstacles[0, 0])
         body.clock.sleep_until(tick * TICK)
         touched.append(bool(body.truth.touching[0]))
     np.testing.assert_allclose(-np.diff(places)[:10], 1.0 * robot.dt, atol=1e-3)  # 1 m/s
@@ -115,7 +115,7 @@ def test_a_touch_that_is_over_before_the_tick_is_counts(robot: Robot) -> None:
 def test_what_is_seen_is_right_relative_to_the_robot_wherever_it_believes_to_be(robot: Robot) -> None:
     scene = Scene(np.array([[1.0, 0.5, 0.05]]), np.zeros((0, 4)), np.array([2.0, 0.0]))
     body = SimBackend(robot, scene=scene)  # truly at the origin, facing x
-    lost = body.look(state(3.0, 4.0, np.pi / 2))
+    lost = body.stage.look(state(3.0, 4.0, np.pi / 2))
     np.testing.assert_allclose(lost.obstacles, [[3.0 - 0.5, 4.0 + 1.0, 0.05]], atol=1e-9)
     np.testing.assert_allclose(lost.goal, [3.0, 6.0], atol=1e-9)
     assert (lost.source, lost.age) == ("scene", 0.0)

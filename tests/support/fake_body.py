@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array, BackendError, Command, Mode, Motors, Observation, Sensors
 from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import Robot
@@ -28,6 +29,7 @@ class FakeBody:
     """A backend. `spoil`, if set, changes each observation; `sent` is every command that was written."""
 
     name = "fake"
+    simulation: Simulation | None = None
 
     def __init__(self, robot: Robot, start: Array | None = None) -> None:
         self.robot = robot

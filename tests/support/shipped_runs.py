@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servoid.hw.contracts.control import Plan, PlanRequest
+from servoid.hw.contracts.control import Adopted, Plan, PlanRequest
 from servoid.hw.contracts.task import Trace
 from servoid.hw.robot.description import load_robot
 from servoid.policy.diffusion.runtime import Runtime
 from servoid.stack.control.planner import Answer, InlinePlanner
-from servoid.stack.log.tick import Adopted, TickRecord
-from servoid.stack.runtime.run import Result, Settings, prepare, run
-from servoid.tools.common.ground_truth import Witness
+from servoid.stack.log.tick import TickRecord
+from servoid.stack.runtime.run import Result, RunSettings, prepare, run
+from servoid.tools.common.ground_truth import GroundTruth
 
 ROBOT = load_robot()
 
@@ -73,13 +73,13 @@ def drive(
     task: str, chosen: Mapping[str, str] | None = None, seconds: float = 2.0, policy: str = "diffusion", seed: int = 1
 ) -> Driven:
     """A run by the way that `servoid run` takes: `chosen` are the task's settings."""
-    settings = Settings(task, policy=policy, seconds=seconds, seed=seed, set=chosen or {})
+    settings = RunSettings(task, policy=policy, seconds=seconds, seed=seed, set=chosen or {})
     _, backend = prepare(settings)
     body: Any = backend
-    witness, records, planners = Witness(body.truth, ROBOT.dt, body.stage), list[TickRecord](), list[Asked]()
+    ground_truth, records, planners = GroundTruth(body.simulation, ROBOT.dt), list[TickRecord](), list[Asked]()
 
     def watch(record: TickRecord) -> None:
-        witness(record)
+        ground_truth(record)
         records.append(record)
 
     def listening(answer: Answer) -> Asked:
@@ -91,7 +91,7 @@ def drive(
         result = run(settings, backend=body, on_tick=watch)
     for planner in planners:  # what comes after the task is no concern of it: to stand
         planner.requests = [request for request in planner.requests if request.tick < result.ticks - 1]
-    return Driven(result, witness.trace(), records, planners)
+    return Driven(result, ground_truth.trace(), records, planners)
 
 
 def walked(driven: Driven, ticks: int = 101) -> Driven:

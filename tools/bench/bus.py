@@ -57,11 +57,11 @@ COLUMNS = ("client", "mode", "baud", "median_ms", "p99_ms", "cpu_us", "failed", 
 
 def measure(report: Report, bauds: tuple[int, ...], cycles: int) -> list[dict[str, Any]]:
     """A row for each client, mode and baud, the wire's own among them."""
-    from servoid.stack.runtime.realtime import steady
+    from servoid.stack.runtime.realtime import undisturbed
     from servoid.tools.bench.clients import CLIENTS
 
     rows = []
-    with responder() as port, steady(False, report.line):
+    with responder() as port, undisturbed(False, report.line):
         for baud in bauds:
             runs = {(name, mode): Run() for mode in ("sync", "fast") for name in CLIENTS}
             done = 0

@@ -6,7 +6,7 @@ import argparse
 
 from servoid.hw.robot.description import load_robot
 from servoid.stack.log.tick import TickRecord
-from servoid.stack.runtime.run import Settings, run
+from servoid.stack.runtime.run import RunSettings, run
 from servoid.tools.commands.run import positive
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import add_json_argument, reporting
@@ -26,7 +26,7 @@ def main(args: argparse.Namespace) -> int:
             timing = record.timing
             busy.append((timing.read + timing.estimate + timing.act + timing.guard + timing.write) * 1e-6)
 
-        settings = Settings(
+        settings = RunSettings(
             "walk", robot=args.robot, policy="gait", seconds=args.seconds, set={"vx": "0.1"}, realtime=True
         )
         result = run(settings, on_tick=count)

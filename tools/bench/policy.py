@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from servoid.hw.contracts.control import PlanRequest
     from servoid.hw.robot.description import Robot
-    from servoid.policy.diffusion.checkpoint import Model
     from servoid.policy.diffusion.engines import Engine
+    from servoid.policy.diffusion.model.checkpoint import Model
     from servoid.policy.diffusion.runtime import Runtime
     from servoid.policy.diffusion.settings import DiffusionSettings
 
@@ -184,9 +184,9 @@ def _time(
 def _networks(args: argparse.Namespace, robot: Robot) -> list[Network]:
     """The checkpoint, or one with random weights without it, and the network of `--shape`."""
     from servoid.policy.checkpoint import CheckpointError, resolve
-    from servoid.policy.diffusion.checkpoint import load
-    from servoid.policy.diffusion.config import DenoiserConfig
     from servoid.policy.diffusion.features import Normaliser, token_layout
+    from servoid.policy.diffusion.model.checkpoint import load
+    from servoid.policy.diffusion.model.config import DenoiserConfig
     from servoid.policy.diffusion.settings import load_settings
 
     name, model = RANDOM, None
@@ -231,8 +231,8 @@ def _made_up(config: Any, states: Any, actions: Any) -> Model:
     """A network of this shape with random weights, the same every time."""
     import torch
 
-    from servoid.policy.diffusion.checkpoint import Model
-    from servoid.policy.diffusion.denoiser import Denoiser
+    from servoid.policy.diffusion.model.checkpoint import Model
+    from servoid.policy.diffusion.model.denoiser import Denoiser
 
     torch.manual_seed(0)
     return Model(Denoiser(config).eval().requires_grad_(False), states, actions, {})

@@ -20,8 +20,8 @@ import time
 from servoid.hw.dynamixel import codec
 from servoid.hw.dynamixel.bus import BITS
 from servoid.hw.dynamixel.codec import Instruction
-from servoid.sim.rig.pty import Terminal
-from servoid.stack.runtime.realtime import steady
+from servoid.sim.rig.process.pty import Pty
+from servoid.stack.runtime.realtime import undisturbed
 
 CURRENT, VELOCITY = 7, -11  # raw values that every servo reports
 ALERT_SECONDS = 0.02  # after a packet, in which the next is watched for and not slept for
@@ -33,7 +33,7 @@ class Responder:
     """Keeps the wire's time: bytes take what they take at the port's speed, one packet after the other."""
 
     def __init__(self) -> None:
-        self.terminal = Terminal()
+        self.pty = Pty()
         self._goals: dict[int, int] = {}
         self._free_ns = 0  # when the line is free again
         self._buffer = bytearray()
@@ -41,13 +41,13 @@ class Responder:
     def serve(self) -> None:
         """Until standard input closes."""
         poll = select.poll()
-        poll.register(self.terminal.master, select.POLLIN)
+        poll.register(self.pty.master, select.POLLIN)
         stdin = sys.stdin.fileno()
         both = select.poll()
-        both.register(self.terminal.master, select.POLLIN)
+        both.register(self.pty.master, select.POLLIN)
         both.register(stdin, select.POLLIN | select.POLLHUP)
         gc.disable()
-        with steady(True, lambda text: None):  # servos are punctual, however busy the host is
+        with undisturbed(True, lambda text: None):  # servos are punctual, however busy the host is
             self._serve(both, poll, stdin)
 
     def _serve(self, both: select.poll, poll: select.poll, stdin: int) -> None:
@@ -62,7 +62,7 @@ class Responder:
     def _hear(self) -> int:
         """Take what the host wrote; returns when it was seen."""
         now = time.monotonic_ns()
-        self._buffer += self.terminal.read()
+        self._buffer += self.pty.read()
         while len(self._buffer) >= 7:
             size = 7 + int.from_bytes(self._buffer[5:7], "little")
             if len(self._buffer) < size:
@@ -73,7 +73,7 @@ class Responder:
         return now
 
     def _execute(self, packet: bytes, now: int) -> None:
-        byte_ns = BITS * 1e9 / self.terminal.baud
+        byte_ns = BITS * 1e9 / self.pty.baud
         _, id, _, instruction = _HEAD.unpack_from(packet)
         params = packet[8:-2]
         self._free_ns = max(self._free_ns, now) + round(len(packet) * byte_ns)
@@ -100,17 +100,17 @@ class Responder:
             time.sleep(left * 1e-9)
         while time.monotonic_ns() < self._free_ns:
             pass
-        os.write(self.terminal.master, answer)
-        select.select([self.terminal.slave], [], [], 0)  # the kernel moves the bytes over at the latest when asked
+        os.write(self.pty.master, answer)
+        select.select([self.pty.slave], [], [], 0)  # the kernel moves the bytes over at the latest when asked
 
 
 def main() -> int:
     responder = Responder()
-    print(responder.terminal.port, flush=True)
+    print(responder.pty.port, flush=True)
     try:
         responder.serve()
     finally:
-        responder.terminal.close()
+        responder.pty.close()
     return 0
 
 

@@ -69,12 +69,12 @@ def main(args: argparse.Namespace) -> int:
         if path is not None:
             check_writable(path)
         reference = _reference(args.pose, robot)
-        delivery = None
+        factory_state = None
         if virtual:
-            from servoid.sim.rig.factory_state import Delivery
+            from servoid.sim.rig.factory_state import FactoryState
 
-            delivery = Delivery(assembly="random")
-        with open_line(args, robot, delivery=delivery, seed=args.seed) as line:
+            factory_state = FactoryState(assembly="random")
+        with open_line(args, robot, factory_state=factory_state, seed=args.seed) as line:
             zeros, directions = _measure(line, robot, reference, chosen, earlier, args, report)
         result = _calibration(robot, zeros, directions, chosen, earlier, args.pose)
         _show(robot, result, report)
@@ -133,8 +133,7 @@ def refuse(found: list[Found]) -> None:
     """Raise BackendError for servos that cannot be measured: with torque, or with registers that bend angles."""
     if stiff := [servo.joint.name for servo in found if servo.get("torque_enable")]:
         raise BackendError(
-            f"{', '.join(stiff)} has torque on: end the program that drives the robot, or hold it and switch its power "
-            "off and on"
+            f"{', '.join(stiff)} has torque on: end the program that drives it, hold it, then servoid bringup off"
         )
     for register in ("homing_offset", "drive_mode"):
         if bent := [servo.joint.name for servo in found if servo.get(register)]:

@@ -33,6 +33,9 @@ def main(args: argparse.Namespace) -> int:
             report.line(f"{len(found)} servos and the board answer; {len(before)} registers differ")
             if before:
                 report.line(as_table(before))
+            stiff = [f"{servo.joint.name} (ID {servo.joint.id})" for servo in found if servo.get("torque_enable")]
+            if stiff:
+                report.line(f"torque is on at {', '.join(stiff)}: servoid bringup off turns it off")
             if before and args.fix:
                 correct(line.bus, found, before)
                 left = compare(robot, find_servos(line.bus, robot))
@@ -46,6 +49,7 @@ def main(args: argparse.Namespace) -> int:
         report.result(
             {
                 "servos": len(found),
+                "torque": stiff,
                 "differences": [asdict(difference) for difference in before],
                 "fixed": len(before) - len(left) if args.fix else 0,
                 "left": [asdict(difference) for difference in left],

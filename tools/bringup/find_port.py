@@ -102,7 +102,7 @@ def _change(before: dict[str, PortInfo], seconds: float, *, coming: bool = False
 def _virtual(args: argparse.Namespace, report: Report) -> int:
     """Start a rig, and show where it would be found."""
     from servoid.hw.robot.description import load_robot
-    from servoid.sim.rig.control import RigProcess
+    from servoid.sim.rig.process.control import RigProcess
 
     robot = load_robot(args.robot)
     with RigProcess(robot) as rig:

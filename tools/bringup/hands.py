@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from servoid.hw.robot.description import Robot
-from servoid.sim.rig.control import Control
+from servoid.sim.rig.process.control import Control
 from servoid.tools.common.output import Report
 from servoid.tools.common.prompt import confirm
 

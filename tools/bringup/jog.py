@@ -13,7 +13,8 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, TextIO
 
 from servoid.hw.config import ConfigError, nearest
-from servoid.hw.contracts.body import Array, Backend, BackendError, Sensors
+from servoid.hw.contracts.backend import Backend
+from servoid.hw.contracts.body import Array, BackendError, Sensors
 from servoid.hw.robot.description import Robot
 from servoid.tools.bringup.line import add_line_arguments, assembled, is_virtual
 from servoid.tools.common import exit_codes
@@ -70,7 +71,7 @@ def _jog(
     from servoid.stack.runtime.interrupt import Interrupt, Stops
     from servoid.stack.runtime.loop import Loop
     from servoid.stack.safety.guard import Guard
-    from servoid.tools.bringup.jogging import SPEED, JogPilot, Keys, There, reach, restrict
+    from servoid.tools.bringup.jogging import SPEED, JogSupervisor, Keys, There, reach, restrict
 
     i = robot.names.index(args.joint)
     clock = body.clock
@@ -93,9 +94,9 @@ def _jog(
         source = There(args.by, robot.dt) if args.by is not None else stack.enter_context(Keys())
         guard = Guard(restricted, motors)
         shown = _Shown(guard, i, args.joint, here, sys.stderr)
-        pilot = JogPilot(restricted, guard, i, source)
+        supervisor = JogSupervisor(restricted, guard, i, source)
         schedule = Schedule(clock, robot.rate)
-        loop = Loop(sensors, Estimator(robot), pilot, guard, schedule, interrupt, Stops(interrupt), (shown,))
+        loop = Loop(sensors, Estimator(robot), supervisor, guard, schedule, interrupt, Stops(interrupt), (shown,))
         try:
             loop.run()
         finally:
@@ -119,12 +120,12 @@ def _jog(
 
 def _pose(sensors: Sensors, clock: Any, robot: Robot) -> Array:
     """Where every joint is [rad], the newest of several reads. Raises BackendError naming a joint that is silent."""
-    from servoid.stack.estimation.sample_hold import Coast, missing
+    from servoid.stack.estimation.sample_hold import SampleHold, missing
 
-    coast = Coast()
+    hold = SampleHold()
     for _ in range(_READS):
         clock.sleep_until(clock.now_ns() + round(robot.dt * 1e9))
-        observation = coast.update(sensors.read())
+        observation = hold.update(sensors.read())
     if lacking := missing(observation, robot.names):
         raise BackendError(f"no sample from {', '.join(lacking)}: check cables and power, then servoid bringup scan")
     return observation.position.copy()

@@ -1,7 +1,7 @@
-"""One joint moved a little by a person at a terminal: a pilot for the loop, and limits that the guard enforces.
+"""One joint moved a little by a person at a terminal: a supervisor for the loop, and limits that the guard enforces.
 
 Nothing here writes to a motor. The guard gets a robot whose joints can only be where they are, all but one, and that
-one slow and near: whatever the pilot proposes, no more than that is sent.
+one slow and near: whatever the supervisor proposes, no more than that is sent.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def reach(restricted: Robot, i: int) -> tuple[float, float]:
     return low + restricted.limits.margin, high - restricted.limits.margin
 
 
-class JogPilot:
-    """Pilot of a jog of joint `i`: holds the robot where it is, then does what `source` wishes."""
+class JogSupervisor:
+    """Supervises a jog of joint `i`: holds the robot where it is, then does what `source` wishes."""
 
     def __init__(self, robot: Robot, guard: Guard, i: int, source: Source) -> None:
         self._robot, self._guard, self._i, self._source = robot, guard, i, source

@@ -16,8 +16,8 @@ from servoid.tools.common.output import Report, add_json_argument
 
 if TYPE_CHECKING:
     from servoid.hw.dynamixel.bus import Bus
-    from servoid.sim.rig.control import Control
-    from servoid.sim.rig.factory_state import Delivery
+    from servoid.sim.rig.factory_state import FactoryState
+    from servoid.sim.rig.process.control import Control
 
 VIRTUAL = "virtual"
 
@@ -64,11 +64,16 @@ def assembled(args: argparse.Namespace, report: Report) -> Robot:
 
 @contextmanager
 def open_line(
-    args: argparse.Namespace, robot: Robot, *, patient: bool = True, delivery: Delivery | None = None, seed: int = 0
+    args: argparse.Namespace,
+    robot: Robot,
+    *,
+    patient: bool = True,
+    factory_state: FactoryState | None = None,
+    seed: int = 0,
 ) -> Iterator[Line]:
     """Open the port that the person named, and be `patient` with it where nothing is known of its adapter yet.
 
-    `delivery` is of a virtual rig. Raises BackendError with the remedy.
+    `factory_state` is of a virtual rig. Raises BackendError with the remedy.
     """
     from servoid.hw.clock import WallClock
     from servoid.hw.dynamixel.bus import MARGIN, Bus
@@ -79,12 +84,12 @@ def open_line(
         clock: Clock = WallClock()
         path, control = str(args.port), None
         if is_virtual(args):
-            from servoid.sim.rig.control import LockedClock, RigProcess
+            from servoid.sim.rig.process.control import LockedClock, RigProcess
 
-            rig = stack.enter_context(RigProcess(robot, delivery=delivery, seed=seed))
+            rig = stack.enter_context(RigProcess(robot, factory_state=factory_state, seed=seed))
             path, control, clock = rig.port, rig.control, LockedClock(rig.control)
         elif Path(path + ".control").is_socket():  # where `servoid virtual --link` puts it
-            from servoid.sim.rig.control import Control
+            from servoid.sim.rig.process.control import Control
 
             control = Control(path + ".control")
             stack.callback(control.close)

@@ -54,6 +54,9 @@ def main(args: argparse.Namespace) -> int:
                 "the supply on?"
             )
         _show(found, robot, problems, report)
+        stiff = [named(device, robot) for device in found.servos if device.get("torque_enable")]
+        if stiff:
+            report.line(f"torque is on at {', '.join(stiff)}: servoid bringup off turns it off")
         missing = absent(found, robot)
         if missing:
             report.line(f"not on the bus at {robot.bus.baud} bit/s: {', '.join(missing)}")
@@ -63,6 +66,7 @@ def main(args: argparse.Namespace) -> int:
                 "bauds": list(bauds),
                 "devices": [described(device, robot) for device in found.devices],
                 "missing": missing,
+                "torque": stiff,
                 "problems": problems,
             }
         )
@@ -82,6 +86,12 @@ def joint_of(device: Device, robot: Robot) -> str | None:
     if device.is_board or device.baud != robot.bus.baud:
         return None
     return next((joint.name for joint in robot.joints if joint.id == device.id), None)
+
+
+def named(device: Device, robot: Robot) -> str:
+    """A servo as a person knows it: by its joint, else by what it is."""
+    joint = joint_of(device, robot)
+    return f"{joint} (ID {device.id})" if joint else str(device)
 
 
 def absent(found: Census, robot: Robot) -> list[str]:

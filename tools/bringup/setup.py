@@ -37,19 +37,21 @@ def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         robot = load_robot(args.robot)
         id, baud, model = _wanted(args, robot)
-        delivery = None
+        factory_state = None
         if is_virtual(args):
-            from servoid.sim.rig.factory_state import Delivery
+            from servoid.sim.rig.factory_state import FactoryState
 
             alone = (args.joint or robot.joints[0].name,)
-            delivery = Delivery(fresh=alone, only=alone)
-        with open_line(args, robot, delivery=delivery) as line:
+            factory_state = FactoryState(fresh=alone, only=alone)
+        with open_line(args, robot, factory_state=factory_state) as line:
             device = find_one(line.bus, robot, baud, report)
             if model is not None and device.model != model:
                 wanted = robot.servos[robot.names.index(args.joint)].name
                 raise BackendError(f"{device} is not the {wanted} that {robot.name} has at {args.joint}: take another")
             if device.get("torque_enable"):
-                raise BackendError(f"{device} has torque on, which locks its EEPROM: switch its power off and on")
+                raise BackendError(
+                    f"{device} has torque on, which locks its EEPROM: servoid bringup off --baud {device.baud}"
+                )
             changes = _changes(device, id, baud)
             if changes:
                 report.line(f"will be written: {', '.join(changes)}")

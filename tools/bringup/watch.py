@@ -62,9 +62,9 @@ class Watched:
         from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY
         from servoid.hw.dynamixel.register_check import find_board, find_servos
         from servoid.hw.dynamixel.sensors import DynamixelSensors, present
-        from servoid.hw.dynamixel.servo_monitor import Watch
+        from servoid.hw.dynamixel.servo_monitor import ServoMonitor
         from servoid.hw.dynamixel.units import Units
-        from servoid.stack.estimation.sample_hold import Coast
+        from servoid.stack.estimation.sample_hold import SampleHold
         from servoid.stack.runtime.clock import RealTime, WallClock
 
         bus = line.bus
@@ -73,8 +73,8 @@ class Watched:
         found = find_servos(bus, robot)
         bus.return_delay = max(servo.get("return_delay_time") for servo in found) * 2e-6
         units = Units(robot, [servo.table for servo in found])
-        self._sensors = DynamixelSensors(bus, robot, units, Watch(bus, found, units), present(found), imu)
-        self._bus, self._robot, self._coast = bus, robot, Coast()
+        self._sensors = DynamixelSensors(bus, robot, units, ServoMonitor(bus, found, units), present(found), imu)
+        self._bus, self._robot, self._hold = bus, robot, SampleHold()
         self._clock = line.clock if isinstance(line.clock, WallClock) else RealTime(line.clock)
         self._before = dataclasses.replace(bus.counters)
         self._reads = 0
@@ -94,7 +94,7 @@ class Watched:
         while seconds is None or tick + 1 <= seconds * RATE:
             tick = schedule.wait().tick
             began = self._clock.now_ns()
-            self._newest = observation = self._coast.update(self._sensors.read())
+            self._newest = observation = self._hold.update(self._sensors.read())
             self._times.append((self._clock.now_ns() - began) * 1e-6)
             self._reads += 1
             self._hottest = np.fmax(self._hottest, observation.temperature).tolist()

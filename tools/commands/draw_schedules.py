@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.schedule import DenoisingMatrix
 from servoid.policy.diffusion.settings import Autoregressive, DiffusionSettings, Gradual
 

@@ -18,7 +18,7 @@ from servoid.stack.log.format import MACHINE_DEPENDENT, event_message, messages,
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.backends import BACKENDS
 from servoid.stack.runtime.phases import DONE
-from servoid.stack.runtime.run import Script, Settings, run
+from servoid.stack.runtime.run import RunSettings, Script, run
 from servoid.stack.safety.event import Event
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import add_json_argument, reporting
@@ -128,7 +128,7 @@ def _part(name: str, values: dict[str, Any]) -> dict[str, Any]:
     return {f"{name}.{key}": value for key, value in values.items()}
 
 
-def _task(settings: Settings) -> dict[str, Any]:
+def _task(settings: RunSettings) -> dict[str, Any]:
     """The task as a log's header has it, by the files of today."""
     from servoid.stack.log.provenance import described, files
     from servoid.stack.tasks import load_settings
@@ -140,10 +140,10 @@ def _task(settings: Settings) -> dict[str, Any]:
     return {"task": {"name": settings.task} | described(task), "task_files": files(task)}
 
 
-def _settings(log: FlightLog) -> Settings:
-    known = {f.name for f in fields(Settings)}
+def _settings(log: FlightLog) -> RunSettings:
+    known = {f.name for f in fields(RunSettings)}
     values = {name: value for name, value in log.header["settings"].items() if name in known}
-    return Settings(**(values | {"record": None, "realtime": False}))
+    return RunSettings(**(values | {"record": None, "realtime": False}))
 
 
 def _by_tick(log: FlightLog) -> dict[int, Tick]:

@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
-from servoid.hw.contracts.body import Backend
+from servoid.hw.contracts.backend import Backend, Simulation
 from servoid.hw.contracts.task import Task, Trace
-from servoid.hw.contracts.world import Truth
 from servoid.tools.common.confidence import wilson
 from servoid.tools.common.exit_codes import exit_code, explain
 from servoid.tools.common.output import add_json_argument, reporting
@@ -27,8 +26,8 @@ from servoid.tools.common.parser import add_set_argument, check_seed, settings
 from servoid.tools.common.worker_pool import each
 
 if TYPE_CHECKING:
-    from servoid.stack.runtime.run import Settings
-    from servoid.tools.common.ground_truth import Witness
+    from servoid.stack.runtime.run import RunSettings
+    from servoid.tools.common.ground_truth import GroundTruth
 
 ENDED = ("succeeded", "failed", "timed_out")  # outcomes of runs whose task ended by itself
 
@@ -101,11 +100,11 @@ def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[
     """
     from tqdm import tqdm
 
-    from servoid.stack.runtime.run import Settings
+    from servoid.stack.runtime.run import RunSettings
 
     seeds = [episode_seed(args.seed, i) for i in range(args.episodes)]
     jobs = [
-        Settings(
+        RunSettings(
             task=args.task,
             backend=args.backend,
             robot=args.robot,
@@ -124,11 +123,11 @@ def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[
     yield from tqdm(done, total=len(jobs), unit="episode", mininterval=2.0)
 
 
-def _numbered(job: tuple[int, Settings]) -> tuple[int, dict[str, Any]]:
+def _numbered(job: tuple[int, RunSettings]) -> tuple[int, dict[str, Any]]:
     return job[0], episode(job[1])
 
 
-def episode_check(job: Settings) -> None:
+def episode_check(job: RunSettings) -> None:
     """Raise here, in the parent, what every episode would raise: an unknown task, policy, robot or key."""
     from dataclasses import replace
 
@@ -144,15 +143,15 @@ class Judged:
     row: dict[str, Any]  # what a rollout keeps of it
     task: Task
     trace: Trace
-    witness: Witness
+    ground_truth: GroundTruth
 
 
-def episode(job: Settings) -> dict[str, Any]:
+def episode(job: RunSettings) -> dict[str, Any]:
     """One run, judged by the truth; see `judge`."""
     return judge(job).row
 
 
-def judge(job: Settings) -> Judged:
+def judge(job: RunSettings) -> Judged:
     """One run, with everything that the truth shows of it.
 
     One that the guard broke off is no success, however far it came, and one that never began has no metrics but those
@@ -161,16 +160,16 @@ def judge(job: Settings) -> Judged:
     """
     from servoid.hw.robot.description import load_robot
     from servoid.stack.runtime.run import prepare, run
-    from servoid.tools.common.ground_truth import Witness
+    from servoid.tools.common.ground_truth import GroundTruth
 
     task, backend = prepare(job)
-    witness = Witness(simulated_truth(backend), load_robot(job.robot).dt, getattr(backend, "stage", None))
-    result = run(job, backend=backend, on_tick=witness)
+    ground_truth = GroundTruth(simulation(backend), load_robot(job.robot).dt)
+    result = run(job, backend=backend, on_tick=ground_truth)
     _give_memory_back()
     if result.interrupted:
         raise KeyboardInterrupt
-    trace = witness.trace()
-    began, undone = len(trace.yaw) > 0, getattr(task, "counts_undone", ())
+    trace = ground_truth.trace()
+    began, undone = len(trace.yaw) > 0, task.counts_undone
     metrics = task.metrics(trace) if began or undone else {}
     fell = trace.fallen or result.outcome == "fell"
     row = {
@@ -178,13 +177,13 @@ def judge(job: Settings) -> Judged:
         "outcome": result.outcome,
         "success": result.outcome in ENDED and bool(task.success(trace)),
         "fell": fell,
-        "broken_off": not fell and result.outcome not in ENDED,
-        "fell_ending": witness.fell_ending,
+        "aborted": not fell and result.outcome not in ENDED,
+        "fell_ending": ground_truth.fell_ending,
         "seconds": result.seconds,
         "metrics": {name: value for name, value in metrics.items() if began or name in undone},
-        "odometry_error_m": witness.odometry_error(result.trace),
+        "odometry_error_m": ground_truth.odometry_error(result.trace),
     }
-    return Judged(row, task, trace, witness)
+    return Judged(row, task, trace, ground_truth)
 
 
 def _give_memory_back() -> None:
@@ -193,12 +192,11 @@ def _give_memory_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def simulated_truth(backend: Backend) -> Truth:
-    """The truth of a simulated body. Raises ConfigError for another: an episode is judged by the truth."""
-    truth: Truth | None = getattr(backend, "truth", None)
-    if truth is None:
+def simulation(backend: Backend) -> Simulation:
+    """What a simulated body knows. Raises ConfigError for another: an episode is judged by the truth."""
+    if backend.simulation is None:
         raise ConfigError(f"backend '{backend.name}' has no truth to judge by: use a simulated one, or `servoid run`")
-    return truth
+    return backend.simulation
 
 
 def summarise(args: argparse.Namespace, rows: list[dict[str, Any]], wall_seconds: float) -> dict[str, Any]:
@@ -222,7 +220,7 @@ def summarise(args: argparse.Namespace, rows: list[dict[str, Any]], wall_seconds
         "success_rate": successes / n,
         "success_ci95": wilson(successes, n),
         "fall_rate": sum(row["fell"] for row in rows) / n,
-        "broken_off_rate": sum(row["broken_off"] for row in rows) / n,
+        "aborted_rate": sum(row["aborted"] for row in rows) / n,
         "fell_ending_rate": sum(row["fell_ending"] for row in rows) / n,
         "mean_seconds": float(np.mean([row["seconds"] for row in rows])),
         "metrics": metrics,

@@ -70,14 +70,14 @@ def main(args: argparse.Namespace) -> int:
 
         with Interrupt(eager=True) as interrupt:  # these take a while, and a Ctrl-C meanwhile must not get lost
             from servoid.stack.runtime.backends import backend_kind
-            from servoid.stack.runtime.run import Settings, run
+            from servoid.stack.runtime.run import RunSettings, run
             from servoid.stack.tasks import task_class
             from servoid.tools.common.live import LiveLine
 
             interrupt.settle()
 
         watched = (sys.stdout.isatty() and not args.json) or task_class(args.task).steered
-        plan = Settings(
+        plan = RunSettings(
             task=args.task,
             backend=args.backend,
             robot=args.robot,

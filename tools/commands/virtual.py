@@ -8,7 +8,7 @@ from pathlib import Path
 from types import FrameType
 
 from servoid.hw.config import ConfigError
-from servoid.sim.rig.factory_state import add_delivery_arguments
+from servoid.sim.rig.factory_state import add_factory_state_arguments
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import add_json_argument, reporting
 from servoid.tools.common.parser import check_seed
@@ -27,12 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--control", type=Path, metavar="PATH", help="control socket (default: beside --link)")
     parser.add_argument("--seed", type=int, default=0, help="of the sensors' errors")
     parser.add_argument("--randomise", action="store_true", help="another robot within the ranges of training")
-    add_delivery_arguments(parser)
+    add_factory_state_arguments(parser)
     add_json_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
-    from servoid.sim.rig.server import build
+    from servoid.sim.rig.process.server import build
 
     with reporting(args.json) as report:
         check_seed(args.seed)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.geometry import turned
 from servoid.stack.log.flightlog import FlightLog
 from servoid.stack.log.format import unpack
 
@@ -51,9 +52,8 @@ def plans(log: FlightLog) -> list[DrawnPlan]:
         if message["requested"] >= len(ticks):
             continue  # to come to rest
         row = at[int(ticks[message["requested"]])]
-        c, s = np.cos(yaw[row]), np.sin(yaw[row])
-        turn = np.array([[c, -s], [s, c]])
-        found.append(DrawnPlan(int(message["tick"]), displacement[row, :2] + unpack(message["path"]) @ turn.T))
+        path = displacement[row, :2] + turned(unpack(message["path"]), yaw[row])
+        found.append(DrawnPlan(int(message["tick"]), path))
     return found
 
 

@@ -5,30 +5,26 @@ With other robots it is the frame of the scene, in which their goals are.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Trace
-from servoid.hw.contracts.world import Truth
+from servoid.hw.geometry import turned
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.guard import Phase
 from servoid.tools.common.motion_quality import Poses
 
-if TYPE_CHECKING:
-    from servoid.sim.scene import Stage
 
-
-class Witness:
-    """An `on_tick` listener: one row for each tick of the task. `stage` is the scene in play, where there is one.
+class GroundTruth:
+    """An `on_tick` listener: one row for each tick of the task.
 
     In a world of several robots it follows the first; that any of them fell or touched another counts. `fell_ending`:
     whether it fell after the task, while it came to rest or was lowered.
     """
 
-    def __init__(self, truth: Truth, dt: float, stage: Stage | None = None) -> None:
-        self._truth, self._dt, self._stage = truth, dt, stage
+    def __init__(self, simulation: Simulation, dt: float) -> None:
+        self._truth, self._surroundings, self._dt = simulation.truth, simulation.surroundings, dt
         self._rows: list[tuple[Array, float, Array, float, Array]] = []
         self._joints: list[Array] = []
         self._up: list[Array] = []
@@ -48,9 +44,9 @@ class Witness:
         self.upright += not self._fallen
         self._joints.append(truth.joints[0].copy())
         self._up.append(-truth.gravity[0])
-        if self._stage is not None:
+        if self._surroundings is not None:
             self._touched |= bool(truth.touching.any())
-            self._obstacles.append(self._stage.obstacles)
+            self._obstacles.append(self._surroundings.obstacles)
             self._robots.append(np.column_stack([truth.position[1:, :2], truth.yaw[1:]]))
         rate = -float(truth.gravity[0] @ truth.angular_velocity[0])
         self._rows.append(
@@ -64,12 +60,12 @@ class Witness:
             return Trace(self._dt, none, np.zeros(0), none, np.zeros(0), none, self._fallen)
         position, yaw, velocity, rate, command = (np.array(column) for column in zip(*self._rows, strict=True))
         yaw, (origin, heading) = np.unwrap(yaw), self._frame()
-        goal = None if self._stage is None else self._stage.scene.goal
+        goal = None if self._surroundings is None else self._surroundings.scene.goal
         if goal is not None:  # where it lies, which is where the robot sees it
-            goal = np.tile(_turned(np.array([*goal, 0.0]) - origin, heading)[:2], (len(yaw), 1))
+            goal = np.tile(turned(np.array([*goal, 0.0]) - origin, -heading)[:2], (len(yaw), 1))
         return Trace(
             dt=self._dt,
-            displacement=_turned(position - origin, heading),
+            displacement=turned(position - origin, -heading),
             yaw=yaw - heading,
             velocity=velocity,
             yaw_rate=rate,
@@ -77,8 +73,8 @@ class Witness:
             fallen=self._fallen,
             joints=np.array(self._joints),
             goal=goal,
-            obstacles=_turned(np.array(self._obstacles) - origin, heading) if self._obstacles else None,
-            robots=_turned(np.array(self._robots) - [*origin[:2], heading], heading) if self._others() else None,
+            obstacles=turned(np.array(self._obstacles) - origin, -heading) if self._obstacles else None,
+            robots=turned(np.array(self._robots) - [*origin[:2], heading], -heading) if self._others() else None,
             touched=self._touched if self._obstacles else None,
         )
 
@@ -110,12 +106,5 @@ class Witness:
         if not self._rows:
             return float("nan")
         origin, heading = self._start()
-        end = _turned(self._rows[-1][0] - origin, heading)[:2]
+        end = turned(self._rows[-1][0] - origin, -heading)[:2]
         return float(np.linalg.norm(end - estimate.displacement[-1, :2]))
-
-
-def _turned(points: Array, yaw: float) -> Array:
-    """Points `(..., 3)` seen in a frame that is turned by `yaw` about the vertical; their third value stays."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    x, y = points[..., 0], points[..., 1]
-    return np.stack([c * x + s * y, c * y - s * x, points[..., 2]], -1)

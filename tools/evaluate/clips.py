@@ -38,7 +38,7 @@ def record_clips(folder: Path, robot: str, number: int) -> list[Path]:
 
     Raises ConfigError where the expert falls too often.
     """
-    from servoid.stack.runtime.run import Settings, run
+    from servoid.stack.runtime.run import RunSettings, run
 
     place, clips = folder / key(recipe(robot)), []
     for seed in range(SEED, SEED + _TRIES * number):
@@ -50,7 +50,7 @@ def record_clips(folder: Path, robot: str, number: int) -> list[Path]:
             part = place / f"part-{seed}.mcap"
             place.mkdir(parents=True, exist_ok=True)
             part.unlink(missing_ok=True)
-            result = run(Settings("walk", policy="expert", robot=robot, seconds=SECONDS, seed=seed, record=part))
+            result = run(RunSettings("walk", policy="expert", robot=robot, seconds=SECONDS, seed=seed, record=part))
             if result.outcome not in ("succeeded", "timed_out"):
                 part.unlink()
                 fallen.touch()

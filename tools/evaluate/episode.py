@@ -14,7 +14,7 @@ from servoid.hw.contracts.task import Trace
 from servoid.tools.common.exit_codes import explain
 
 if TYPE_CHECKING:
-    from servoid.stack.runtime.run import Settings
+    from servoid.stack.runtime.run import RunSettings
 
 PATH_STEP = 0.2  # s between the points of a path that is kept
 _STREAM = 20_250_417  # any number but 0: the episodes are not those of `servoid rollout`, on which settings are tried
@@ -26,7 +26,7 @@ class Job:
 
     run: int
     episode: int
-    settings: Settings
+    settings: RunSettings
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def do(job: Job) -> Done:
         return Done(job, {}, explain(error))
 
 
-def record(settings: Settings) -> dict[str, Any]:
+def record(settings: RunSettings) -> dict[str, Any]:
     """Do an episode and keep what any row could ask of it. Raises ConfigError."""
     from servoid.hw.robot.description import load_robot
     from servoid.tools.commands.rollout import judge
@@ -62,11 +62,11 @@ def record(settings: Settings) -> dict[str, Any]:
     judged = judge(settings)
     trace, task = judged.trace, judged.task
     limit = round(task.seconds / trace.dt)
-    goal = getattr(task, "goal", None) if trace.goal is None else trace.goal[-1]
+    goal = task.goal if trace.goal is None else trace.goal[-1]
     return {
         **judged.row,
-        "ticks": min(judged.witness.upright, limit),
-        "motion": quality(judged.witness.poses(), load_robot(settings.robot)),
+        "ticks": min(judged.ground_truth.upright, limit),
+        "motion": quality(judged.ground_truth.poses(), load_robot(settings.robot)),
         "path": _points(trace.displacement[:, :2], trace.dt),
         "goal": None if goal is None else np.round(goal, 3),
         "pillars": _still(trace),

@@ -20,7 +20,7 @@ from servoid.tools.evaluate.spec import Row, Run
 from servoid.tools.evaluate.summary import Measured
 
 if TYPE_CHECKING:
-    from servoid.stack.runtime.run import Settings
+    from servoid.stack.runtime.run import RunSettings
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class _Work:
     """A run of one or more rows, with what was done of it."""
 
     run: Run
-    settings: Settings
+    settings: RunSettings
     pilot: tuple[Mapping[str, Any], str | None]  # fingerprint of the policy, and the hash of its file of settings
     episodes: int
     cache: EpisodeCache
@@ -114,7 +114,7 @@ def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[st
 
 def _prepare(run: Run, pilots: Pilots, options: Options) -> _Work:
     """Raises ConfigError where the run cannot be done."""
-    from servoid.stack.runtime.run import Settings
+    from servoid.stack.runtime.run import RunSettings
     from servoid.stack.tasks import load_settings
     from servoid.tools.evaluate import clips
 
@@ -128,7 +128,7 @@ def _prepare(run: Run, pilots: Pilots, options: Options) -> _Work:
     shortest = min(limit for limit in limits if limit is not None)
     seconds = None if shortest == own else shortest
     kept = spec(run, pilots, options.robot, options.seed, seconds, recipe)
-    settings = Settings(
+    settings = RunSettings(
         task=run.task,
         backend=run.backend,
         robot=options.robot,

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from servoid.hw.contracts.body import BackendError
-from servoid.sim.rig.control import Control, RigProcess
+from servoid.sim.rig.process.control import Control, RigProcess
 
 STAND_SECONDS = 2.5  # from torque to the first step: homing a robot that is at home, and standing still
 PRIORITY = 70  # of the rig by SCHED_FIFO, above the controller's: real servos do not wait for the host's processor

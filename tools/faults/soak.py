@@ -51,11 +51,11 @@ def soak(report: Report, args: argparse.Namespace) -> dict[str, Any]:
     from servoid.hw.contracts.body import BackendError
     from servoid.hw.dynamixel.backend import DynamixelBackend
     from servoid.hw.robot.description import load_robot
-    from servoid.stack.runtime.run import Settings, run
+    from servoid.stack.runtime.run import RunSettings, run
     from servoid.tools.faults.controller import free_rig
 
     robot = load_robot(args.robot)
-    settings = Settings(
+    settings = RunSettings(
         "walk",
         backend="dynamixel",
         robot=args.robot,

@@ -20,8 +20,8 @@ from servoid.hw.imu.bno08x import Bno08x
 from servoid.hw.imu.reading import Decoder
 from servoid.hw.imu.witmotion import WitMotion
 from servoid.hw.robot.description import Robot
-from servoid.sim.rig.motors import STEP_NS
 from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.servo.motor_bank import STEP_NS
 from servoid.tools.faults.streams import BOARD_ID, IDS, WIDTH
 
 _ANSWER_BYTES = 100_000  # more than the servos of a robot send in half a second at 1 Mbit/s
@@ -106,7 +106,7 @@ class Servos:
     def take(self, pieces: Sequence[bytes]) -> None:
         rig = self._rig
         for piece in pieces:
-            rig.bus.receive(piece, rig.wire.host_baud, rig.now_ns)
+            rig.dispatcher.receive(piece, rig.wire.host_baud, rig.now_ns)
         answered = sum(len(sent.data) for _, _, sent in rig.wire._replies)
         if answered > _ANSWER_BYTES * len(pieces):
             raise Unbounded(f"{answered} bytes of answers to {sum(map(len, pieces))}")

@@ -16,10 +16,10 @@ import numpy as np
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.sim.rig.faults import EXPECTED, KINDS, NEEDS_SERVO, STATUS_KINDS, Outcome
-from servoid.sim.rig.in_process import LocalBackend
+from servoid.sim.rig.in_process import InProcessBackend
 from servoid.sim.rig.rig import Rig
 from servoid.stack.log.tick import TickRecord
-from servoid.stack.runtime.run import Settings, run
+from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import LOWER_SECONDS, REST_SECONDS, Phase
 
@@ -65,7 +65,7 @@ class Verdict:
     said: str = ""  # what named it
 
 
-class Witnessed(LocalBackend):
+class Witnessed(InProcessBackend):
     """A virtual robot that is looked at once more, by the rig's own account, before it is let go.
 
     `powered` are the joints that are still driven then, and `later` those that are once the watchdog has had its time.
@@ -82,7 +82,7 @@ class Witnessed(LocalBackend):
     @property
     def struck(self) -> int:
         """How often faults did strike."""
-        return sum(self.rig.dice.struck.values())
+        return sum(self.rig.injector.struck.values())
 
     def close(self) -> None:
         if not self._ended:
@@ -129,7 +129,7 @@ def run_trial(trial: Trial) -> Verdict:
     verdict = Verdict(trial.kind, trial.seed, EXPECTED[trial.kind].value, joint)
     body = Witnessed(rig, seed=trial.seed)
     seconds = (tick + 5) * robot.dt + _ABSORBED_SECONDS
-    settings = Settings(
+    settings = RunSettings(
         "walk",
         backend="virtual",
         robot=trial.robot,
@@ -171,7 +171,7 @@ class _Watch:
             self.events += [(event, self.ticks, self._body.clock.now_ns()) for event in record.events]
         if record.phase is not Phase.RUNNING:
             return
-        self.fell |= bool(self._body.truth.fallen[0])
+        self.fell |= bool(self._body.simulation.truth.fallen[0])
         self.walked += 1
         if self.walked == self._at:
             self.began_ns = self._body.clock.now_ns()

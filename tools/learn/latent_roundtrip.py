@@ -7,8 +7,8 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.diffusion.features import raw_row
 from servoid.policy.latent.actions import LatentActions
 from servoid.policy.mlp import Mlp
+from servoid.stack.control.fleet import Fleet
 from servoid.stack.safety.limits import limit
-from servoid.tools.learn.envs.fleet import Fleet
 from servoid.tools.learn.envs.walker import Walker, load_tracker
 from servoid.tools.learn.survival import survival_of
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
 from servoid.hw.config import nearest
-from servoid.policy.diffusion.config import DenoiserShape, Objective
+from servoid.policy.diffusion.model.config import DenoiserShape, Objective
 from servoid.policy.latent.actions import LatentConfig
 from servoid.policy.tracker.rewards import TERMS
 

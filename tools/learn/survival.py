@@ -15,10 +15,10 @@ from servoid.tools.learn.progress import counted
 
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
-    from servoid.policy.diffusion.config import DenoiserConfig
+    from servoid.policy.diffusion.model.config import DenoiserConfig
     from servoid.policy.diffusion.settings import DiffusionSettings
+    from servoid.stack.control.fleet import Fleet
     from servoid.tools.learn.collect.episode_cutter import Driver
-    from servoid.tools.learn.envs.fleet import Fleet
 
 _CHANGE = 125  # ticks between commands
 _PUSH_EVERY = 50  # ticks
@@ -32,7 +32,7 @@ def closed_loop_survival(
 ) -> dict[str, float]:
     """Run a diffusion checkpoint in `worlds` worlds, all planned as one batch: see `survival_of`."""
     from servoid.policy.checkpoint import read_header
-    from servoid.policy.diffusion.config import check_fit
+    from servoid.policy.diffusion.model.config import check_fit
     from servoid.policy.diffusion.runtime import load_runtime
     from servoid.stack.tasks import load_task
     from servoid.tools.learn.envs.planned import PlannedWalker
@@ -67,8 +67,8 @@ def survival_of(
     Returns `survival`, the share of worlds that never fell, and `velocity_error`, the mean planar error [m/s] of
     those, smoothed over a cycle, from 2 s after each command.
     """
+    from servoid.stack.control.fleet import Fleet
     from servoid.stack.estimation.odometry import load_odometry
-    from servoid.tools.learn.envs.fleet import Fleet
 
     fleet = Fleet(robot, worlds, load_odometry(robot), randomise=_RANDOMISED, seed=seed, tag=_MEASURED)
     walker, everything = drive(fleet), np.ones(worlds, bool)

@@ -15,8 +15,8 @@ from servoid.policy.mlp import Mlp
 from servoid.tools.learn.progress import counted
 
 if TYPE_CHECKING:
+    from servoid.stack.control.fleet import Fleet
     from servoid.tools.learn.collect.episode_cutter import Driver
-    from servoid.tools.learn.envs.fleet import Fleet
 
     MakeDriver = Callable[[Fleet], Driver]
 
@@ -49,7 +49,7 @@ def record(
     robot: Robot, drive: MakeDriver, worlds: int, seconds: float, seed: int, odometry: Mlp | None = None
 ) -> dict[str, Array]:
     """Walk randomised worlds; returns rows `(n, ticks, features)`, starts `(n, ticks)` and errors `(n, ticks, 3)`."""
-    from servoid.tools.learn.envs.fleet import Fleet
+    from servoid.stack.control.fleet import Fleet
 
     fleet = Fleet(robot, worlds, odometry, randomise=0.7, seed=seed + 1000)
     walker = drive(fleet)
@@ -110,7 +110,7 @@ def drift(
     gait's sway would add to it, up to its double.
     """
     from servoid.policy.references.gait import load_gait
-    from servoid.tools.learn.envs.fleet import Fleet
+    from servoid.stack.control.fleet import Fleet
 
     fleet = Fleet(robot, walks, odometry, randomise=randomise, seed=seed)
     walker = drive(fleet)

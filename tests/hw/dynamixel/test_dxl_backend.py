@@ -192,8 +192,10 @@ def test_torque_comes_on_where_the_servo_is(robot: Robot) -> None:
     names = [name for name, _ in knee.writes]
     on = knee.writes.index(("torque_enable", 1))
     assert names[:on] == [
-        *("bus_watchdog", "profile_acceleration", "profile_velocity", "goal_position"),
-        *("position_d_gain", "position_i_gain", "position_p_gain"),
+        *("status_return_level", "bus_watchdog"),
+        *("goal_velocity", "profile_acceleration", "profile_velocity", "goal_position"),
+        *("velocity_i_gain", "velocity_p_gain", "position_d_gain", "position_i_gain", "position_p_gain"),
+        *("feedforward_2nd_gain", "feedforward_1st_gain", "goal_pwm", "goal_current"),
     ]
     assert ("goal_position", 2600) in knee.writes[:on]
     assert ("position_p_gain", 400) in knee.writes[:on]
@@ -211,7 +213,7 @@ def test_a_servo_that_has_torque_gets_no_gain_before_its_goal(robot: Robot) -> N
 
     def watch(packet: codec.Packet) -> None:
         robot.live()
-        goals = packet.instruction == Instruction.SYNC_WRITE and packet.params[:2] == b"\x74\x00"
+        goals = packet.instruction == Instruction.SYNC_WRITE and packet.params[:2] == b"\x68\x00"
         knee.answers = not (goals and deaf[0] > 0)
         deaf[0] -= goals
         if knee.get("torque_enable") and knee.get("position_p_gain"):

@@ -20,7 +20,7 @@ ROBOT = load_robot("op3")
 @pytest.fixture
 def port() -> Iterator[str]:
     server = subprocess.Popen(
-        [sys.executable, "-m", "servoid.sim.rig.server", "--robot", "op3", "--linger", "30"],
+        [sys.executable, "-m", "servoid.sim.rig.process.server", "--robot", "op3", "--linger", "30"],
         stdout=subprocess.PIPE,
         text=True,
     )

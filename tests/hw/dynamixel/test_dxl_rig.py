@@ -13,7 +13,7 @@ from servoid.hw.dynamixel.motors import DynamixelMotors
 from servoid.hw.faults import LATE, TORQUE_LOST, WATCHDOG
 from servoid.hw.robot.description import load_robot
 from servoid.sim.rig.faults import Fault
-from servoid.sim.rig.in_process import LocalLine
+from servoid.sim.rig.in_process import InProcessLine
 from servoid.sim.rig.rig import Rig
 
 ROBOT = load_robot("op3")
@@ -27,7 +27,7 @@ class Standing:
 
     def __init__(self) -> None:
         self.rig = Rig(ROBOT)
-        self.line = LocalLine(self.rig)
+        self.line = InProcessLine(self.rig)
         self.backend = DynamixelBackend(ROBOT, port=self.line, clock=self.line)
         self.sensors: DynamixelSensors
         self.motors: DynamixelMotors

@@ -22,7 +22,7 @@ from servoid.hw.robot.calibration import (
     save_calibration,
 )
 from servoid.hw.robot.description import load_robot
-from servoid.stack.runtime.run import Settings, run
+from servoid.stack.runtime.run import RunSettings, run
 
 ROBOT = load_robot()
 
@@ -122,5 +122,5 @@ def test_a_run_on_hardware_loads_it_and_one_in_simulation_does_not() -> None:
     path.parent.mkdir(parents=True)
     path.write_text("robot: op3\n")
     with pytest.raises(ConfigError, match=r"op3\.yaml"):
-        run(Settings("stand", backend="dynamixel", policy="gait", port="/dev/null", start=True))
-    assert run(Settings("stand", policy="gait", seconds=0.2)).ticks
+        run(RunSettings("stand", backend="dynamixel", policy="gait", port="/dev/null", start=True))
+    assert run(RunSettings("stand", policy="gait", seconds=0.2)).ticks

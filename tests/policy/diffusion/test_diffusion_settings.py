@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from servoid.hw.config import CONFIGS, ConfigError, load_yaml
-from servoid.policy.diffusion.config import DenoiserConfig
+from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings, Rolling, load_settings
 
 NETWORK = DenoiserConfig(108, 20)

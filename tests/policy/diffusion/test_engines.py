@@ -14,14 +14,14 @@ import torch
 from test_runtime import ROBOT, model, request, speed_cost
 
 from servoid.hw.config import ConfigError, load_yaml
-from servoid.policy.diffusion import engines, export
-from servoid.policy.diffusion.checkpoint import Model
-from servoid.policy.diffusion.config import DenoiserConfig
-from servoid.policy.diffusion.denoiser import Denoiser
-from servoid.policy.diffusion.engines import ENGINES, REFERENCE, check_engine, deviation, load_engine
-from servoid.policy.diffusion.masks import MASKS
+from servoid.policy.diffusion import engines
+from servoid.policy.diffusion.engines import ENGINES, REFERENCE, check_engine, deviation, export, load_engine
+from servoid.policy.diffusion.guidance import classifier_free
+from servoid.policy.diffusion.model.checkpoint import Model
+from servoid.policy.diffusion.model.config import DenoiserConfig
+from servoid.policy.diffusion.model.denoiser import Denoiser
+from servoid.policy.diffusion.model.masks import MASKS
 from servoid.policy.diffusion.runtime import Runtime
-from servoid.policy.diffusion.sampler import classifier_free
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 from servoid.policy.text.encoder import load_encoder
 
@@ -88,7 +88,7 @@ def test_instructions_are_read_as_torch_reads_them(engine: str) -> None:
     mixed = torch.tensor([True, False])
     outputs = []
     with torch.no_grad():
-        for instruction in ({}, {"text": text}, {"text": text, "told": mixed}):
+        for instruction in ({}, {"text": text}, {"text": text, "text_mask": mixed}):
             ours = run(*inputs, **instruction)
             assert difference(ours, denoiser(*inputs, **instruction)) <= ENGINES[engine].tolerance
             outputs.append(ours[0])

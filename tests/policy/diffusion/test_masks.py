@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from servoid.hw.config import ConfigError
-from servoid.policy.diffusion.config import DenoiserConfig
-from servoid.policy.diffusion.denoiser import Denoiser
-from servoid.policy.diffusion.masks import attention_mask
+from servoid.policy.diffusion.model.config import DenoiserConfig
+from servoid.policy.diffusion.model.denoiser import Denoiser
+from servoid.policy.diffusion.model.masks import attention_mask
 
 
 def leaks(layers: int, mask: str = "state_full_action_causal") -> tuple[Denoiser, torch.Tensor, torch.Tensor]:

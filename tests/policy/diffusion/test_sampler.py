@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 
 from servoid.hw.config import ConfigError
-from servoid.policy.diffusion.config import DenoiserConfig, Objective
-from servoid.policy.diffusion.denoiser import Denoiser
-from servoid.policy.diffusion.sampler import Diverged, Guidance, Known, Sampler, classifier_free
+from servoid.policy.diffusion.guidance import Diverged, Guidance, classifier_free
+from servoid.policy.diffusion.model.config import DenoiserConfig, Objective
+from servoid.policy.diffusion.model.denoiser import Denoiser
+from servoid.policy.diffusion.objective import losses
+from servoid.policy.diffusion.sampler import Known, Sampler
 from servoid.policy.diffusion.schedule import autoregressive, cosine_signal, full_sequence, rolling
-from servoid.policy.diffusion.training import losses
 
 LEVELS = 100
 SIGNAL = torch.as_tensor(cosine_signal(LEVELS), dtype=torch.float32)
@@ -278,7 +279,7 @@ def test_windows_of_a_batch_without_an_instruction_do_not_see_one() -> None:
     denoiser = Denoiser(config).eval()
     window = torch.randn(2, 5, 3), torch.randn(2, 4, 2), torch.full((5,), 7), torch.full((4,), 7)
     with torch.no_grad():
-        mixed = denoiser(*window, text=torch.randn(2, 5), told=torch.tensor([True, False]))
+        mixed = denoiser(*window, text=torch.randn(2, 5), text_mask=torch.tensor([True, False]))
         bare = denoiser(*window)
     torch.testing.assert_close(mixed[0][1], bare[0][1])
     assert (mixed[0][0] - bare[0][0]).abs().max() > 1e-4

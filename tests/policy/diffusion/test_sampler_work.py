@@ -8,8 +8,9 @@ from test_runtime import model
 from torch import Tensor
 
 from servoid.policy.diffusion import rolling
+from servoid.policy.diffusion.guidance import Guidance
 from servoid.policy.diffusion.rolling import frame_noise
-from servoid.policy.diffusion.sampler import Guidance, Known, Sampler, draw_noise
+from servoid.policy.diffusion.sampler import Known, Sampler, draw_noise
 from servoid.policy.diffusion.schedule import DenoisingMatrix, cosine_signal, full_sequence
 
 LEVELS = 20

@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from servoid.policy.diffusion.config import DenoiserConfig, Objective
-from servoid.policy.diffusion.denoiser import Denoiser
+from servoid.policy.diffusion.model.config import DenoiserConfig, Objective
+from servoid.policy.diffusion.model.denoiser import Denoiser
+from servoid.policy.diffusion.objective import UNTOLD, losses
 from servoid.policy.diffusion.schedule import cosine_signal
-from servoid.policy.diffusion.training import UNTOLD, losses
 
 WINDOWS, WORDS = 2000, 5
 CONFIG = DenoiserConfig(3, 2, width=16, heads=2, history=2, horizon=4, text="words", text_size=WORDS)

@@ -9,23 +9,24 @@ import numpy as np
 import pytest
 
 from servoid.hw.config import ConfigError
+from servoid.hw.geometry import turned, up_vector, yaw_of
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.legs import LegInverse, Legs
 from servoid.policy.references.gait import Gait, GaitSettings, GyroFeedback, load_gait
-from servoid.tools.learn.envs.fleet import Fleet
+from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.envs.walker import Walker
 
 ROBOT, SETTINGS = load_robot(), load_gait()
 LEGS = Legs(ROBOT)
 NOW = np.array([0])
 PHASES = np.linspace(0, 1, 48, endpoint=False)
-_GAIT = Gait(ROBOT, SETTINGS)
+_GAIT = Gait(ROBOT)
 BOX = np.array(list(itertools.product(*((low, 0.0, high) for low, high in zip(_GAIT.lower, _GAIT.upper, strict=True)))))
 
 
 def pose(phase: np.ndarray, velocity: np.ndarray, activity: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     velocity = np.broadcast_to(velocity, (*phase.shape, 3))
-    return Gait(ROBOT, SETTINGS).pose(phase, velocity, np.full(phase.shape, activity))
+    return Gait(ROBOT).pose(phase, velocity, np.full(phase.shape, activity))
 
 
 def soles(phase: np.ndarray, velocity: np.ndarray) -> np.ndarray:
@@ -106,7 +107,7 @@ def walked(gait: Gait, velocity: np.ndarray, ticks: int) -> None:
 
 
 def test_it_stands_when_nothing_is_asked_and_again_after_a_walk() -> None:
-    gait = Gait(ROBOT, SETTINGS)
+    gait = Gait(ROBOT)
     stand = gait.frames(NOW)
     walked(gait, np.zeros(3), 50)
     np.testing.assert_array_equal(gait.frames(NOW).position, stand.position)
@@ -122,7 +123,7 @@ def test_it_stands_when_nothing_is_asked_and_again_after_a_walk() -> None:
 def test_the_foot_on_the_side_it_goes_to_takes_the_first_step() -> None:
     for velocity, foot in (([0.2, 0, 0], 0), ([0, 0.1, 0], 0), ([0, -0.1, 0], 1), ([0.1, 0, -0.5], 1)):
         for before in (0, 37):  # however long it walked and stood before
-            gait = Gait(ROBOT, SETTINGS)
+            gait = Gait(ROBOT)
             walked(gait, np.array([0.2, 0.0, 0.0]), before)
             walked(gait, np.zeros(3), 100)
             gait.command(np.array(velocity))
@@ -135,7 +136,7 @@ def test_fast_steps_swing_evenly_so_that_joints_can_follow() -> None:
     """A smooth swing asks a hip for twice its mean speed."""
 
     def fastest(settings: GaitSettings, speed: float) -> float:
-        gait = Gait(ROBOT, settings)
+        gait = Gait(ROBOT, settings=settings)
         joints, _ = gait.pose(PHASES, np.tile([speed, 0.0, 0.0], (len(PHASES), 1)), np.ones(len(PHASES)))
         hips = joints[:, [ROBOT.names.index(f"{side}_hip_pitch") for side in "lr"]]
         return float(np.abs(np.diff(hips, axis=0)).max() * len(PHASES) / settings.cycle)
@@ -146,7 +147,7 @@ def test_fast_steps_swing_evenly_so_that_joints_can_follow() -> None:
 
 
 def test_velocity_is_slewed_and_clipped() -> None:
-    gait, last = Gait(ROBOT, SETTINGS), np.zeros(3)
+    gait, last = Gait(ROBOT), np.zeros(3)
     gait.command(np.array([9.0, -9.0, 9.0]))
     for _ in range(120):
         gait.advance()
@@ -157,7 +158,7 @@ def test_velocity_is_slewed_and_clipped() -> None:
 
 
 def test_starting_and_stopping_asks_for_no_faster_joints_than_walking() -> None:
-    gait, targets = Gait(ROBOT, SETTINGS), []
+    gait, targets = Gait(ROBOT), []
     for velocity, ticks in ((np.array([0.3, 0.0, 0.0]), 100), (np.zeros(3), 100)):
         gait.command(velocity)
         for _ in range(ticks):
@@ -171,7 +172,7 @@ def test_starting_and_stopping_asks_for_no_faster_joints_than_walking() -> None:
 
 
 def test_frames_ahead_are_what_comes() -> None:
-    gait = Gait(ROBOT, SETTINGS)
+    gait = Gait(ROBOT)
     walked(gait, np.array([0.2, 0.0, 0.4]), 80)
     ahead = gait.frames(np.array([0, 3, 8]))
     for _ in range(8):
@@ -182,12 +183,45 @@ def test_frames_ahead_are_what_comes() -> None:
     assert ahead.height == pytest.approx(ROBOT.standing_height)
 
 
+def test_the_root_goes_the_way_of_the_twist_from_where_it_is_now() -> None:
+    """A tracker holds the robot's own way since now against it: an origin that moved on would be a drift."""
+    gait = Gait(ROBOT)
+    walked(gait, np.array([0.2, 0.1, 0.8]), 80)
+    ticks = np.arange(60)
+    frames = gait.frames(ticks)
+    np.testing.assert_allclose(frames.root_position[0], [0, 0, ROBOT.standing_height], atol=1e-12)
+    np.testing.assert_allclose(frames.root_position[:, 2], frames.height)
+    heading = yaw_of(frames.root_orientation)
+    np.testing.assert_allclose(heading, frames.yaw_rate * ticks * ROBOT.dt, atol=1e-9)
+    steps = np.diff(frames.root_position[:, :2], axis=0) / ROBOT.dt  # a chord: it heads between its two ends
+    np.testing.assert_allclose(turned(steps, -(heading[1:] + heading[:-1]) / 2), frames.velocity[1:], atol=1e-4)
+    up = up_vector(frames.root_orientation)  # leaning forward, the base sees up behind
+    np.testing.assert_allclose(up, np.tile([-np.sin(SETTINGS.lean), 0, np.cos(SETTINGS.lean)], (60, 1)), atol=1e-12)
+
+
+def test_a_straight_walk_is_no_division_by_zero_and_standing_stays() -> None:
+    gait = Gait(ROBOT, (2,))
+    walked(gait, np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.0]]), 80)
+    frames = gait.frames(np.array([0, 50]))
+    np.testing.assert_allclose(frames.root_position[:, 1, :2], [[0.2, 0], [0, 0]], atol=1e-12)
+    assert not frames.joint_velocity[1].any()
+    assert gait.ended.tolist() == [False, False]
+
+
+def test_joint_velocity_leads_from_frame_to_frame() -> None:
+    gait = Gait(ROBOT)
+    walked(gait, np.array([0.3, 0.0, 0.4]), 80)
+    frames = gait.frames(np.arange(10))
+    np.testing.assert_allclose(np.diff(frames.position, axis=0) / ROBOT.dt, frames.joint_velocity[:-1], atol=1e-9)
+    assert np.abs(frames.joint_velocity).max() > 1.0
+
+
 def test_many_worlds_walk_as_one_robot_does_and_reset_alone() -> None:
     commands = np.array([[0.2, 0.0, 0.0], [0.0, 0.1, 0.5], [0.0, 0.0, 0.0]])
-    many = Gait(ROBOT, SETTINGS, (3,))
+    many = Gait(ROBOT, (3,))
     walked(many, commands, 37)
     for i in range(3):
-        one = Gait(ROBOT, SETTINGS)
+        one = Gait(ROBOT)
         walked(one, commands[i], 37)
         np.testing.assert_allclose(many.frames(NOW).position[i], one.frames(NOW).position, atol=1e-12)
     many.reset(np.array([0]))
@@ -197,7 +231,7 @@ def test_many_worlds_walk_as_one_robot_does_and_reset_alone() -> None:
 
 def test_gyro_feedback_turns_both_ankles_the_same_way_in_space() -> None:
     """A body that pitches forward gets its toes pressed down: both feet pitch further than the body asks."""
-    feedback, home = GyroFeedback(ROBOT, SETTINGS), ROBOT.home
+    feedback, home = GyroFeedback(ROBOT), ROBOT.home
     for axis in (0, 1):
         rate = np.zeros(3)
         rate[axis] = 1.0
@@ -223,7 +257,7 @@ def test_legs_whose_axes_do_not_meet_are_refused() -> None:
 def test_a_robot_with_other_arms_can_walk() -> None:
     joints = tuple(replace(j, name=j.name.replace("sho_pitch", "shoulder")) for j in ROBOT.joints)
     joints = tuple(replace(j, mirror=j.mirror.replace("sho_pitch", "shoulder")) for j in joints)
-    gait = Gait(replace(ROBOT, joints=joints), SETTINGS)
+    gait = Gait(replace(ROBOT, joints=joints))
     walked(gait, np.array([0.3, 0.0, 0.0]), 30)
     assert np.isfinite(gait.frames(NOW).position).all()
 

@@ -32,6 +32,8 @@ def test_every_phrasing_is_understood(book: Phrasebook) -> None:
         ("rotate counter-clockwise in place", "turn left"),
         ("back up to the right", "backward arc right"),
         ("run", "forward fast"),
+        ("gently walk on", "forward slowly"),
+        ("slowly go straight on", "forward slowly"),
     ],
 )
 def test_what_people_say_is_understood(book: Phrasebook, text: str, expected: str) -> None:
@@ -59,11 +61,23 @@ def test_a_motion_that_is_not_known_is_refused(book: Phrasebook, text: str) -> N
         ("向左转", "no English word"),
         ("do not walk", "says what not to do"),
         ("don't turn left", "says what not to do"),
-        ("turn left, then right", "both left and right"),
+        ("turn left, then right", "one thing after another"),
+        ("turn left and right", "both left and right"),
         ("walk back and forth", "both forward and back"),
         ("turn", "does not say to which side"),
         ("walk diagonally", "does not say to which side"),
         ("turn right now", "does not say to which side"),
+        ("turn left slowly", "says how fast, but 'turn left' has one speed"),
+        ("quickly side-step to the right", "says how fast, but 'side-step right' has one speed"),
+        ("walk fast, slowly", "both slow and fast"),
+        ("walk forward and then turn left", "one thing after another; give one instruction at a time"),
+        ("turn left before you walk forward", "one thing after another"),
+        ("walk forward. turn left", "one thing after another"),
+        ("first walk ahead", "one thing after another"),
+        ("walk 2 m forward", "says how much; that is not understood"),
+        ("turn left by 90 degrees", "says how much"),
+        ("take two steps back", "says how much"),
+        ("turn left twice", "says how much"),
     ],
 )
 def test_an_instruction_that_cannot_be_followed_says_why(book: Phrasebook, text: str, reason: str) -> None:

@@ -11,7 +11,7 @@ import pytest
 from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.mirror import Mirror
-from servoid.policy.references.gait import Gait, load_gait
+from servoid.policy.references.gait import Gait
 from servoid.policy.tracker import rewards
 from servoid.policy.tracker.observation import AHEAD, TrackerObservation
 from servoid.policy.tracker.rewards import TERMS, Step
@@ -40,7 +40,7 @@ def state(position: Any = None, shape: tuple[int, ...] = (), **changes: Any) -> 
 
 
 def gait(shape: tuple[int, ...] = ()) -> Gait:
-    return Gait(ROBOT, load_gait(), shape)
+    return Gait(ROBOT, shape)
 
 
 def test_it_does_not_see_the_command() -> None:

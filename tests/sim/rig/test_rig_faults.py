@@ -84,7 +84,7 @@ def test_a_spoiled_status_never_passes_as_good(host: Host, kind: str, fast: bool
             assert len(good) >= 18
         assert host.ids[3] not in good
         assert all(truth[id] == data for id, data in good.items())
-    assert host.rig.dice.struck[kind, host.ids[3]] == 20
+    assert host.rig.injector.struck[kind, host.ids[3]] == 20
 
 
 def test_other_ways_of_answering_wrong(host: Host) -> None:

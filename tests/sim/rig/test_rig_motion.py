@@ -15,9 +15,9 @@ from servoid.hw.dynamixel.tables import table
 from servoid.hw.imu.mounting import Mounting
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
-from servoid.sim.rig.board import Board
-from servoid.sim.rig.plant import Plant
 from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.servo.board import VirtualBoard
+from servoid.sim.rig.servo.plant import Plant
 from servoid.sim.worlds import Worlds
 
 PAN = 19  # the head: it turns freely while the robot is held
@@ -263,9 +263,9 @@ def test_an_imu_is_read_in_the_axes_of_its_mounting(rig: Rig, robot: Robot) -> N
     """The registers of this robot's board are those of a real one: x and y negated. Mounted on its side, they turn."""
     assert robot.imu.signs == (-1.0, -1.0, 1.0)
     boards = {
-        "plain": Board(rig.motors, {}, lambda on: None),
+        "plain": VirtualBoard(rig.motors, {}, lambda on: None),
         "real": rig.board,
-        "side": Board(rig.motors, {}, lambda on: None, Mounting(angles=(math.pi / 2, 0.0, 0.0))),
+        "side": VirtualBoard(rig.motors, {}, lambda on: None, Mounting(angles=(math.pi / 2, 0.0, 0.0))),
     }
     registers = {}
     for name, board in boards.items():

@@ -12,9 +12,9 @@ from servoid.hw.dynamixel import codec
 from servoid.hw.dynamixel.codec import Reset, StatusError
 from servoid.hw.dynamixel.tables import models
 from servoid.hw.robot.description import Robot
-from servoid.sim.rig import control_requests as operations
+from servoid.sim.rig.process import control_requests
 from servoid.sim.rig.rig import Rig
-from servoid.sim.rig.servo import VirtualServo
+from servoid.sim.rig.servo.virtual_servo import VirtualServo
 
 
 def test_servos_are_silent_until_the_board_gives_them_power(rig: Rig, robot: Robot) -> None:
@@ -256,7 +256,7 @@ def test_older_firmware_stays_silent_on_fast_reads(host: Host) -> None:
 
 def test_what_was_forgotten_is_told_once(host: Host, monkeypatch: pytest.MonkeyPatch) -> None:
     """A long walk that nobody asked about must not spoil all that comes after."""
-    ask = operations.find("accepted", host.rig)
+    ask = control_requests.find("accepted", host.rig)
     monkeypatch.setattr(servoid.sim.rig.rig, "_REMEMBERED", 3)
     host.rig.reset(0)
     host.start()

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 from rig_host import BOARD, XM430
 
-from servoid.sim.rig.control import RigProcess
+from servoid.sim.rig.process.control import RigProcess
 
 sdk = pytest.importorskip("dynamixel_sdk")
 OK = sdk.COMM_SUCCESS

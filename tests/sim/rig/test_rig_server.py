@@ -18,9 +18,9 @@ from rig_host import BOARD, XM430
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.dynamixel import codec
 from servoid.hw.robot.description import Robot, load_robot
-from servoid.sim.rig.control import Control, LockedClock, RigProcess
+from servoid.sim.rig.process.control import Control, LockedClock, RigProcess
+from servoid.sim.rig.process.server import Server
 from servoid.sim.rig.rig import Rig
-from servoid.sim.rig.server import Server
 
 MS = 1_000_000
 
@@ -101,7 +101,7 @@ def test_time_stands_still_until_the_controller_lets_it_pass() -> None:
             LockedClock(observer)
         with pytest.raises(BackendError, match="no joint 'l_kne'"):
             rig.control.inject("dead", servo="l_kne")
-        with pytest.raises(BackendError, match=r"unknown operation 'truht'.*truth"):
+        with pytest.raises(BackendError, match=r"unknown request 'truht'.*truth"):
             observer.call("truht")
         observer.close()
 
@@ -149,7 +149,7 @@ def test_a_clock_step_and_a_vanishing_port() -> None:
 
 def test_an_unused_rig_ends_by_itself(tmp_path: Path) -> None:
     control = tmp_path / "control"
-    command = [sys.executable, "-m", "servoid.sim.rig.server", "--control", str(control), "--linger", "0.5"]
+    command = [sys.executable, "-m", "servoid.sim.rig.process.server", "--control", str(control), "--linger", "0.5"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stdout.readline()
@@ -160,7 +160,7 @@ def test_an_unused_rig_ends_by_itself(tmp_path: Path) -> None:
 
 _STARTED = """
 import sys, time
-from servoid.sim.rig.control import LockedClock, RigProcess
+from servoid.sim.rig.process.control import LockedClock, RigProcess
 rig = RigProcess(linger=float(sys.argv[1]))
 clock = LockedClock(rig.control)
 print(rig.process.pid, rig.port, rig._folder.name, flush=True)
@@ -195,7 +195,7 @@ def test_a_rig_whose_controller_was_killed_lives_on_and_then_leaves_nothing_behi
 def test_a_rig_whose_controller_was_killed_before_it_had_begun_leaves_nothing_behind(tmp_path: Path) -> None:
     folder = tmp_path / "rig"
     folder.mkdir()
-    command = [sys.executable, "-m", "servoid.sim.rig.server", "--linger", "60", "--folder", str(folder)]
+    command = [sys.executable, "-m", "servoid.sim.rig.process.server", "--linger", "60", "--folder", str(folder)]
     process = subprocess.Popen([*command, "--control", str(folder / "control")], stdout=subprocess.PIPE)
     assert process.stdout is not None
     process.stdout.close()
@@ -205,11 +205,8 @@ def test_a_rig_whose_controller_was_killed_before_it_had_begun_leaves_nothing_be
 
 def test_the_command_serves_a_linked_port_until_ctrl_c(tmp_path: Path) -> None:
     link = tmp_path / "rig"
-    code = (
-        "import argparse, sys; from tools import virtual; p = argparse.ArgumentParser(); virtual.add_arguments(p); "
-        "sys.exit(virtual.main(p.parse_args(sys.argv[1:])))"
-    )
-    process = subprocess.Popen([sys.executable, "-c", code, "--link", str(link)], stdout=subprocess.PIPE, text=True)
+    command = [sys.executable, "-m", "servoid", "virtual", "--link", str(link)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert str(link) in process.stdout.readline()
     with serial.Serial(str(link), 2_000_000, timeout=1.0) as port:
@@ -230,7 +227,7 @@ def test_two_rigs_do_not_share_a_control_socket_but_a_leftover_is_replaced(tmp_p
     first._listener.close()  # as a killed one leaves it
     second = Server(rig, control=path)
     second.close()
-    first.terminal.close()
+    first.pty.close()
 
 
 def test_a_rig_that_cannot_start_says_why(tmp_path: Path) -> None:
@@ -270,7 +267,7 @@ def test_no_bytes_whatever_upset_a_rig(seed: int) -> None:
         rig.host_sends(data)
         rig.advance(rig.now_ns + 3 * MS)
     assert len(rig.wire._line) < 1000
-    assert rig.bus._parser.pending < 4096
+    assert rig.dispatcher._parser.pending < 4096
     rig.advance(rig.now_ns + 400 * MS)
     rig.host_sends(codec.ping(BOARD))
     assert len(rig.advance(rig.now_ns + 20 * MS)) >= 14

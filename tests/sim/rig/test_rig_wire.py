@@ -7,9 +7,9 @@ from rig_host import BOARD, XM430, Host
 
 from servoid.hw.dynamixel import codec
 from servoid.hw.dynamixel.codec import parse_fast
-from servoid.sim.rig.bus import TURNAROUND_NS
 from servoid.sim.rig.rig import Rig
-from servoid.sim.rig.wire import Wire
+from servoid.sim.rig.wire.dispatcher import TURNAROUND_NS
+from servoid.sim.rig.wire.half_duplex import Wire
 
 
 def when(rig: Rig, packet: bytes, count: int, limit: float = 0.05) -> float:

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pytest
@@ -16,10 +17,10 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Plan, PlanRequest, State
 from servoid.hw.robot.description import load_robot
-from servoid.policy.diffusion import checkpoint
-from servoid.policy.diffusion.config import DenoiserConfig
-from servoid.policy.diffusion.denoiser import Denoiser
 from servoid.policy.diffusion.features import Normaliser, raw_layout
+from servoid.policy.diffusion.model import checkpoint
+from servoid.policy.diffusion.model.config import DenoiserConfig
+from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 from servoid.stack.control import planner as planner_module
 from servoid.stack.control.diffusion import DiffusionPolicy, diffusion_policy
@@ -69,11 +70,27 @@ class Spy(InlinePlanner):
         return None if self.late[tick] >= 0 else super().collect(tick, wait)
 
 
+_ADOPTED: WeakKeyDictionary[DiffusionPolicy, list[tuple[int, int]]] = WeakKeyDictionary()
+
+
+def act(policy: DiffusionPolicy, at: State, applied: Array, instruction: Instruction) -> Array:
+    """Act, and note which plan was adopted."""
+    target = policy.act(at, applied, instruction)
+    if policy.adopted is not None:
+        _ADOPTED.setdefault(policy, []).append((policy.adopted.requested, policy.adopted.adopted))
+    return target
+
+
+def adoptions(policy: DiffusionPolicy) -> list[tuple[int, int]]:
+    """Ticks of request and adoption of all plans so far."""
+    return _ADOPTED.get(policy, [])
+
+
 def run(policy: DiffusionPolicy, ticks: int) -> list[float]:
     """Act for so many ticks, the guard accepting everything; the first joint's targets."""
     applied, out = np.full(20, 0.5), []
     for tick in range(ticks):
-        applied = policy.act(state(tick), applied, INSTRUCTION)
+        applied = act(policy, state(tick), applied, INSTRUCTION)
         out.append(float(applied[0]))
     return out
 
@@ -82,7 +99,7 @@ def test_plans_are_adopted_after_the_delay_and_run_by_tick() -> None:
     policy = DiffusionPolicy(Spy(), history=4, replan=4, delay=2)
     # The history is full at tick 3; the first request is that of tick 4, adopted at 6; the next, of 8, at 10.
     assert run(policy, 14) == [0.5] * 6 + [4006, 4007, 4008, 4009, 8010, 8011, 8012, 8013]
-    assert policy.adopted == [(4, 6), (8, 10)]
+    assert adoptions(policy) == [(4, 6), (8, 10)]
     assert policy.latest_plan is not None
     assert policy.latest_plan.tick == 8
     assert policy.take_events() == ()
@@ -109,14 +126,14 @@ def test_what_the_guard_changed_is_what_the_planner_is_told() -> None:
     planner = Spy()
     policy = DiffusionPolicy(planner, history=4, replan=4, delay=1)
     for tick in range(5):
-        policy.act(state(tick), np.full(20, tick / 10), INSTRUCTION)
+        act(policy, state(tick), np.full(20, tick / 10), INSTRUCTION)
     assert planner.requests[0].actions[:3, 0].tolist() == pytest.approx([0.2, 0.3, 0.4])
 
 
 def test_a_late_plan_is_adopted_when_it_comes_and_the_last_goes_on_until_then() -> None:
     policy = DiffusionPolicy(Spy(late={8: 2}), history=4, replan=4, delay=1)
     assert run(policy, 15)[8:] == [4008, 4009, 4010, 8011, 8012, 12013, 12014]
-    assert policy.adopted == [(4, 5), (8, 11), (12, 13)]
+    assert adoptions(policy) == [(4, 5), (8, 11), (12, 13)]
     assert policy.take_events() == ("the plan requested at tick 8 was not ready at 9: that of 4 goes on",)
     assert policy.take_events() == ()
 
@@ -126,13 +143,13 @@ def test_nothing_else_is_asked_of_a_planner_that_is_late_and_what_has_passed_is_
     policy = DiffusionPolicy(planner, history=4, replan=4, delay=1)
     assert run(policy, 33)[8:] == [*range(4008, 4020), *[4019] * 9, 28029, 28030, 28031, 28032]
     assert [asked.tick for asked in planner.requests] == [4, 8, 28, 32]
-    assert policy.adopted == [(4, 5), (28, 29)]
+    assert adoptions(policy) == [(4, 5), (28, 29)]
 
 
 def test_a_machine_that_is_too_slow_walks_by_later_plans_and_says_so() -> None:
     policy = DiffusionPolicy(Spy(late=dict.fromkeys(range(200), 1)), history=4, replan=2, delay=1)
     targets = run(policy, 80)
-    assert policy.adopted == [(tick, tick + 2) for tick in range(4, 78, 2)]
+    assert adoptions(policy) == [(tick, tick + 2) for tick in range(4, 78, 2)]
     assert targets[10:14] == [8010, 8011, 10012, 10013]
     first, many = policy.take_events()
     assert "requested at tick 4 was not ready at 5" in first
@@ -142,13 +159,14 @@ def test_a_machine_that_is_too_slow_walks_by_later_plans_and_says_so() -> None:
 def test_a_recorded_run_is_repeated_with_its_late_plans() -> None:
     def walk(planner: Spy, only: dict[int, int] | None) -> tuple[list[float], list[int], tuple[str, ...]]:
         policy = DiffusionPolicy(planner, history=4, replan=2, delay=1)
-        policy.only = only
+        if only is not None:
+            policy.repeat(only)
         return run(policy, 60), [asked.tick for asked in planner.requests], policy.take_events()
 
     late = {8: 2, 14: 1, 20: 16}
     policy = DiffusionPolicy(Spy(late=late), history=4, replan=2, delay=1)
     run(policy, 60)
-    repeated = walk(Spy(), dict(policy.adopted))
+    repeated = walk(Spy(), dict(adoptions(policy)))
     assert repeated == walk(Spy(late=late), None)
     assert repeated[0] != walk(Spy(), None)[0]
 
@@ -187,10 +205,10 @@ def test_planning_goes_on_after_a_slow_plan(
     policy = DiffusionPolicy(ProcessPlanner(MagicMock()), history=4, replan=replan, delay=delay, wait=False)
     for tick in range(60):
         pipe.now = float(tick)
-        policy.act(state(tick), np.full(20, 0.5), INSTRUCTION)
+        act(policy, state(tick), np.full(20, 0.5), INSTRUCTION)
     comes = 20 + math.ceil(slow)
     requested = [tick for tick in range(3, 60 - delay) if tick % replan == 0 and not 20 < tick < comes]
-    assert policy.adopted == [(tick, comes if tick == 20 else tick + delay) for tick in requested]
+    assert adoptions(policy) == [(tick, comes if tick == 20 else tick + delay) for tick in requested]
 
 
 def test_what_is_asked_is_corrected_and_has_the_name_of_its_correction() -> None:
@@ -199,7 +217,7 @@ def test_what_is_asked_is_corrected_and_has_the_name_of_its_correction() -> None
     policy = DiffusionPolicy(spy, history=4, replan=4, delay=2, trim=Trim(ROBOT.dt, rate=5.0))
     turning = replace(state(0), angular_velocity=np.array([0.0, 0.0, 0.4]))
     for tick in range(200):
-        policy.act(replace(turning, time_ns=tick * 20_000_000), np.full(20, 0.5), INSTRUCTION)
+        act(policy, replace(turning, time_ns=tick * 20_000_000), np.full(20, 0.5), INSTRUCTION)
     asked = spy.requests[-1].instruction
     assert asked.velocity[2] < INSTRUCTION.velocity[2] - 0.2
     assert asked.text is None
@@ -264,10 +282,10 @@ def test_a_plan_that_could_not_be_made_is_said_once_and_the_last_goes_on() -> No
     policy = DiffusionPolicy(Refusing(), history=4, replan=4, delay=1)
     assert run(policy, 18)[8:] == [*range(4008, 4017), 16017]
     assert policy.take_events() == ("no plan for tick 8: guidance diverged: that of 4 goes on",)
-    assert policy.adopted == [(4, 5), (16, 17)]
+    assert adoptions(policy) == [(4, 5), (16, 17)]
     applied = np.zeros(20)
     for tick in range(18, 22):
-        applied = policy.act(state(tick), applied, INSTRUCTION)
+        applied = act(policy, state(tick), applied, INSTRUCTION)
     assert policy.take_events() == ("no plan for tick 20: guidance diverged: that of 16 goes on",)
 
 
@@ -275,7 +293,7 @@ def test_reset_forgets_the_episode() -> None:
     policy = DiffusionPolicy(Spy(), history=4, replan=4, delay=1)
     first = run(policy, 12)
     policy.reset(1)
-    assert policy.adopted == []
+    assert policy.adopted is None
     assert run(policy, 12) == first
 
 
@@ -304,7 +322,7 @@ def trace(policy: DiffusionPolicy, seed: int, wait: bool) -> Array:
     policy.reset(seed)
     applied, out = ROBOT.home, []
     for tick in range(13):
-        applied = policy.act(state(tick), applied, INSTRUCTION)
+        applied = act(policy, state(tick), applied, INSTRUCTION)
         out.append(applied)
     return np.stack(out)
 
@@ -316,7 +334,7 @@ def test_in_line_and_beside_the_loop_a_seed_gives_the_same_actions(settings: Dif
         first = trace(inline, 3, wait=True)
         np.testing.assert_array_equal(first, trace(inline, 3, wait=True))
         np.testing.assert_array_equal(first, trace(process, 3, wait=True))
-        assert process.adopted == [(4, 6), (8, 10)]
+        assert adoptions(process) == [(4, 6), (8, 10)]
         assert not np.array_equal(first, trace(inline, 4, wait=True))
     finally:
         process.close()
@@ -376,6 +394,6 @@ def test_rolling_gives_the_same_actions_in_line_and_beside_the_loop(settings: Di
         first = trace(inline, 3, wait=True)
         np.testing.assert_array_equal(first, trace(process, 3, wait=True))
         np.testing.assert_array_equal(first, trace(inline, 3, wait=True))  # a new episode starts afresh
-        assert inline.adopted[:2] == [(3, 4), (4, 5)]
+        assert adoptions(inline)[:2] == [(3, 4), (4, 5)]
     finally:
         process.close()

@@ -9,10 +9,10 @@ import pytest
 
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.robot.description import load_robot
+from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.gait import GaitPolicy
 from servoid.stack.control.tracker import ExpertPolicy
 from servoid.stack.estimation.odometry import load_odometry
-from servoid.tools.learn.envs.fleet import Fleet
 from servoid.tools.learn.envs.walker import Walker, load_tracker
 
 ROBOT = load_robot()

@@ -14,10 +14,10 @@ from test_diffusion_policy import INSTRUCTION, ROBOT, Spy, state
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Plan, PlanRequest
 from servoid.policy.checkpoint import CheckpointError, read, read_header, write
-from servoid.policy.diffusion import checkpoint
-from servoid.policy.diffusion.config import DenoiserConfig
-from servoid.policy.diffusion.denoiser import Denoiser
 from servoid.policy.diffusion.features import Normaliser, raw_layout, raw_row
+from servoid.policy.diffusion.model import checkpoint
+from servoid.policy.diffusion.model.config import DenoiserConfig
+from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.settings import DiffusionSettings
 from servoid.policy.latent.actions import LatentActions, LatentConfig
 from servoid.policy.latent.network import LatentNetwork

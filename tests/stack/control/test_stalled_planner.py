@@ -16,8 +16,8 @@ from servoid.policy.diffusion.settings import load_settings
 from servoid.stack.control.diffusion import STAND_SECONDS, DiffusionPolicy, diffusion_policy
 from servoid.stack.control.planner import Planner
 from servoid.stack.log.tick import TickRecord
-from servoid.stack.runtime.run import Result, Settings, prepare, run
-from servoid.tools.common.ground_truth import Witness
+from servoid.stack.runtime.run import Result, RunSettings, prepare, run
+from servoid.tools.common.ground_truth import GroundTruth
 
 STALL = 50  # ticks: twice as long as a plan lasts
 PHASES = (100, 103, 106, 109)  # ticks of the task at which it begins: over half a gait cycle, so over all of a step
@@ -61,20 +61,20 @@ class Walk:
 
 
 def walk(first: int) -> Walk:
-    job = Settings("walk", seconds=(first + STALL + AFTER) * ROBOT.dt, seed=1, set={"vx": str(SPEED)})
+    job = RunSettings("walk", seconds=(first + STALL + AFTER) * ROBOT.dt, seed=1, set={"vx": str(SPEED)})
     task, backend = prepare(job)
     body: Any = backend
     policy = diffusion_policy(ROBOT, cost=task.cost)
     stalled = Stalled(policy._planner, first)
     stalled.policy = policy
     policy._planner, policy._wait = stalled, False  # as beside the loop
-    witness, records = Witness(body.truth, ROBOT.dt), list[TickRecord]()
+    ground_truth, records = GroundTruth(body.simulation, ROBOT.dt), list[TickRecord]()
 
     def watch(record: TickRecord) -> None:
-        witness(record)
+        ground_truth(record)
         records.append(record)
 
-    return Walk(first, run(job, backend=body, on_tick=watch, policy=policy), witness.trace(), records, policy)
+    return Walk(first, run(job, backend=body, on_tick=watch, policy=policy), ground_truth.trace(), records, policy)
 
 
 @pytest.fixture(scope="module")

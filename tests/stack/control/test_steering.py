@@ -19,7 +19,7 @@ from servoid.hw.contracts.world import Percept
 from servoid.stack.control import operator as steering
 from servoid.stack.control.operator import Gamepad, Keyboard, Recorded, open_steering
 from servoid.stack.log.flightlog import read_log
-from servoid.stack.runtime.run import Settings, run
+from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.tasks import load_task
 from servoid.tools.commands import replay
 
@@ -167,7 +167,7 @@ def test_a_run_is_steered_by_the_gamepad_and_can_be_replayed(pad: VirtualPad, tm
                 pad.press(steering.END_BUTTON)
 
     ticks: list[int] = []
-    settings = Settings("steer", policy="gait", set={"device": "gamepad"}, record=tmp_path / "steer.mcap")
+    settings = RunSettings("steer", policy="gait", set={"device": "gamepad"}, record=tmp_path / "steer.mcap")
     result = run(settings, on_tick=steer)
     assert result.outcome == "succeeded"
     assert result.ticks == 151

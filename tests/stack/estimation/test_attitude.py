@@ -7,9 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
+from servoid.hw.geometry import rotate, up_vector, yaw_of
 from servoid.hw.robot.description import load_robot
-from servoid.stack.estimation.attitude import Attitude, rotate, up_vector, yaw_of
-from servoid.tools.learn.envs.fleet import Fleet
+from servoid.stack.control.fleet import Fleet
+from servoid.stack.estimation.attitude import Attitude
 from servoid.tools.learn.envs.walker import Walker
 
 DT = 0.02

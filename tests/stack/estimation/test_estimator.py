@@ -9,11 +9,11 @@ import pytest
 
 from servoid.hw.contracts.body import Observation
 from servoid.hw.contracts.control import State
+from servoid.hw.geometry import rotate
 from servoid.hw.robot.description import load_robot
-from servoid.stack.estimation.attitude import rotate
+from servoid.stack.control.fleet import Fleet
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import load_odometry
-from servoid.tools.learn.envs.fleet import Fleet
 from servoid.tools.learn.envs.walker import Walker, load_tracker
 from servoid.tools.learn.walks import drift, driver
 

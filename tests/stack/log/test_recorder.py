@@ -17,13 +17,13 @@ from fake_body import StillEstimator, observation
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Command, Mode
-from servoid.hw.contracts.control import Instruction, Plan
+from servoid.hw.contracts.control import Adopted, Instruction, Plan
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import load_robot
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.log.format import FORMAT
 from servoid.stack.log.recorder import Recorder
-from servoid.stack.log.tick import Adopted, Proposal, TickRecord, Timing
+from servoid.stack.log.tick import Proposal, TickRecord, Timing
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Phase
 
@@ -198,8 +198,8 @@ def test_a_disk_that_hangs_does_not_hold_up_a_real_loop(monkeypatch):
 
 
 KILLED = """
-import sys, time
-sys.path.insert(0, sys.argv[2])
+import os, sys, time
+sys.path[:0] = sys.argv[2].split(os.pathsep)
 import numpy as np
 from pathlib import Path
 from test_recorder import HEADER, tick_record
@@ -214,7 +214,7 @@ for i in range(10_000):
 
 def test_a_killed_recording_loses_less_than_a_second(tmp_path):
     path = tmp_path / "a.mcap"
-    here = os.path.dirname(__file__)
+    here = os.pathsep.join(sys.path)
     with subprocess.Popen([sys.executable, "-c", KILLED, str(path), here], stdout=subprocess.PIPE) as process:
         for line in process.stdout:
             if int(line) == 200:

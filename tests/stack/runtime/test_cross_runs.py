@@ -13,7 +13,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Mode
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.log.tick import TickRecord
-from servoid.stack.runtime.run import Script, Settings, prepare, run
+from servoid.stack.runtime.run import RunSettings, Script, prepare, run
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Phase
 from servoid.tools.cli import main
@@ -26,13 +26,13 @@ BLIND = NEAR | {"passing.apart": "0.001"}
 
 
 def test_two_that_walk_at_each_other_touch_and_it_is_seen() -> None:
-    row = episode(Settings("cross", policy="gait", seconds=8.0, set=BLIND))
+    row = episode(RunSettings("cross", policy="gait", seconds=8.0, set=BLIND))
     assert row["metrics"]["touched"] == 1.0
     assert not row["success"]
 
 
 def test_two_that_heed_each_other_get_across() -> None:
-    judged = judge(Settings("cross", policy="gait", seconds=25.0, set=NEAR))
+    judged = judge(RunSettings("cross", policy="gait", seconds=25.0, set=NEAR))
     assert judged.row["outcome"] == "succeeded"
     assert judged.row["success"]
     assert judged.trace.touched is False
@@ -42,7 +42,7 @@ def test_two_that_heed_each_other_get_across() -> None:
 
 
 def test_a_run_is_repeated_from_its_log(tmp_path: Path) -> None:
-    settings = Settings("cross", policy="gait", seconds=3.0, seed=4, randomise=True, record=tmp_path / "a.mcap")
+    settings = RunSettings("cross", policy="gait", seconds=3.0, seed=4, randomise=True, record=tmp_path / "a.mcap")
     run(settings)
     log = read_log(tmp_path / "a.mcap")
     assert replay.replay(log)[1] is None
@@ -50,14 +50,14 @@ def test_a_run_is_repeated_from_its_log(tmp_path: Path) -> None:
     assert seen is not None
     assert seen.shape[1:] == (2, 3)
     assert len(log.header["scene"]["robots"]) == 2
-    other = run(Settings("cross", policy="gait", seconds=1.0, seed=5, randomise=True)).trace.robots
+    other = run(RunSettings("cross", policy="gait", seconds=1.0, seed=5, randomise=True)).trace.robots
     assert other is not None
     assert not np.allclose(seen[0], other[0], atol=1e-3)
 
 
 def watched(script: Script = Script(), shove: float = 0.0, **more: Any) -> tuple[Any, Any, list[Any]]:  # noqa: B008
     """A run, its body, and each tick's phase, the robots' tilt and their height; `shove` [m/s] is of robot 2."""
-    settings = Settings("cross", policy="gait", set={"circle": "0.6"}, **more)
+    settings = RunSettings("cross", policy="gait", set={"circle": "0.6"}, **more)
     _, body = prepare(settings)
     world: Any = body
     rows = []
@@ -94,7 +94,7 @@ def test_each_robot_needs_a_policy_of_its_own() -> None:
         pass
 
     with pytest.raises(ConfigError, match="has 3 robots, each with its own policy: name one instead"):
-        run(Settings("cross"), policy=Still())  # type: ignore[arg-type]
+        run(RunSettings("cross"), policy=Still())  # type: ignore[arg-type]
 
 
 def test_the_command_line_runs_it_and_lists_it(

@@ -21,7 +21,7 @@ from servoid.stack.safety.guard import Guard, Phase
 ROBOT = load_robot("op3")
 
 
-class Pilot:
+class Homes:
     """Homes, starts, then proposes `targets(tick)`."""
 
     def __init__(self, guard, targets):
@@ -46,7 +46,7 @@ def make(targets=lambda tick: ROBOT.home, script=(), listeners=(), failure=lambd
     loop = Loop(
         body,
         StillEstimator(ROBOT),
-        Pilot(guard, targets),
+        Homes(guard, targets),
         guard,
         Schedule(body.clock, ROBOT.rate),
         interrupt,

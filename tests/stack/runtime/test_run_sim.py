@@ -12,7 +12,7 @@ from servoid.hw.robot.description import load_robot
 from servoid.sim.backend import SimBackend
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.log.format import MACHINE_DEPENDENT
-from servoid.stack.runtime.run import Script, Settings, run
+from servoid.stack.runtime.run import RunSettings, Script, run
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Phase
 
@@ -20,7 +20,7 @@ ROBOT = load_robot("op3")
 
 
 def record(path: Path, **changes):
-    settings = Settings(
+    settings = RunSettings(
         **({"task": "walk", "policy": "gait", "seconds": 3.0, "seed": 5, "set": {"push": "0.1"}} | changes), record=path
     )
     return run(settings), read_log(path)
@@ -69,7 +69,7 @@ def test_interrupted_while_walking_it_is_lowered_upright_then_off(policy, seed):
 
     script = Script((Event(stop, 0.0, "interrupt", None, "Ctrl-C"),))
     speed = "0.1" if policy == "gait" else "0.25"
-    settings = Settings("walk", policy=policy, seed=seed, seconds=20.0, set={"vx": speed})
+    settings = RunSettings("walk", policy=policy, seed=seed, seconds=20.0, set={"vx": speed})
     result = run(settings, backend=body, on_tick=watch, script=script)
     assert result.outcome == "interrupted"
     assert max(tilt for tilt, _ in lowering) < np.radians(15)
@@ -87,7 +87,7 @@ def test_the_estimate_starts_upright_and_at_the_origin():
             errors.append(float(np.arccos(np.clip(record.state.gravity @ body.truth.gravity[0], -1.0, 1.0))))
             places.append(record.state.displacement[:2])
 
-    run(Settings("stand", policy="gait", seed=1, seconds=0.5), backend=body, on_tick=watch)
+    run(RunSettings("stand", policy="gait", seed=1, seconds=0.5), backend=body, on_tick=watch)
     assert errors[0] < np.radians(3)
     assert np.linalg.norm(places[0]) < 0.005
 
@@ -99,7 +99,7 @@ def test_a_fallen_robot_is_damped_and_the_run_says_so():
         if record.proposal.instruction is not None:
             body.push(np.array([0.15, 0.0]))
 
-    result = run(Settings("stand", policy="gait", seconds=10.0), backend=body, on_tick=shove)
+    result = run(RunSettings("stand", policy="gait", seconds=10.0), backend=body, on_tick=shove)
     assert result.outcome == "fell"
     assert not result.success
     assert result.trace.fallen
@@ -108,7 +108,7 @@ def test_a_fallen_robot_is_damped_and_the_run_says_so():
 def test_python_api_in_ten_lines():
     poses = []
     result = run(
-        Settings(task="walk", policy="gait", seconds=2.0, seed=1, set={"vx": "0.1"}),
+        RunSettings(task="walk", policy="gait", seconds=2.0, seed=1, set={"vx": "0.1"}),
         on_tick=lambda record: poses.append(record.observation.position),
     )
     assert result.outcome == "succeeded"

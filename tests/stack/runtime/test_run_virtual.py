@@ -14,8 +14,9 @@ from servoid.hw.contracts.world import Truth
 from servoid.hw.robot.description import load_robot
 from servoid.sim.backend import SimBackend
 from servoid.sim.rig.backend import VirtualBackend
+from servoid.stack.control.base import BasePolicy
 from servoid.stack.log.tick import TickRecord
-from servoid.stack.runtime.run import Settings, run
+from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.safety.guard import Phase
 
 ROBOT = load_robot()
@@ -43,7 +44,7 @@ def walk(body: Any, seconds: float) -> tuple[Array, Array]:
             joints.append(record.observation.position)
             path.append(truth.position[0].copy())
 
-    result = run(Settings("walk", policy="gait", set=STRAIGHT, seconds=seconds), backend=body, on_tick=note)
+    result = run(RunSettings("walk", policy="gait", set=STRAIGHT, seconds=seconds), backend=body, on_tick=note)
     assert result.outcome == "succeeded"
     assert result.missed == 0
     return np.array(joints), np.array(path)
@@ -65,7 +66,7 @@ def test_a_walk_is_that_of_the_simulation_and_repeats_bit_for_bit() -> None:
 @pytest.mark.parametrize("policy", ["gait", "expert"])
 def test_a_run_ends_damped_and_then_off(policy: str) -> None:
     body, phases = Watched(ROBOT, seed=2), []
-    settings = Settings("walk", policy=policy, seconds=1.0, seed=2, backend="virtual", set={"push": "0.05"})
+    settings = RunSettings("walk", policy=policy, seconds=1.0, seed=2, backend="virtual", set={"push": "0.05"})
     result = run(settings, backend=body, on_tick=lambda record: phases.append((record.phase, record.command.mode.name)))
     assert result.outcome == "succeeded"
     assert phases[-1] == (Phase.DAMPED, "OFF")
@@ -83,7 +84,7 @@ def test_ctrl_c_at_any_phase_ends_with_torque_off(tick: int, count: int) -> None
             for _ in range(count):
                 os.kill(os.getpid(), signal.SIGINT)
 
-    settings = Settings("walk", policy="gait", seconds=60.0, backend="virtual")
+    settings = RunSettings("walk", policy="gait", seconds=60.0, backend="virtual")
     result = run(settings, backend=body, on_tick=interrupt)
     assert result.outcome == "interrupted"
     assert body.torque == (0,) * 20
@@ -92,7 +93,7 @@ def test_ctrl_c_at_any_phase_ends_with_torque_off(tick: int, count: int) -> None
 def test_a_policy_that_hangs_after_a_push_is_broken_off_with_torque_off() -> None:
     """The second Ctrl-C is an exception in the middle of a tick: no request to the rig may be cut in half by it."""
 
-    class Hangs:
+    class Hangs(BasePolicy):
         def reset(self, seed: int) -> None: ...
 
         def act(self, *_: Any) -> Array:
@@ -101,7 +102,7 @@ def test_a_policy_that_hangs_after_a_push_is_broken_off_with_torque_off() -> Non
             raise AssertionError("not broken off")
 
     body = Watched(ROBOT)
-    settings = Settings("walk", seconds=60.0, backend="virtual", set={"push": "0.1", "push_every": "0.02"})
+    settings = RunSettings("walk", seconds=60.0, backend="virtual", set={"push": "0.1", "push_every": "0.02"})
     result = run(settings, backend=body, policy=Hangs())
     assert result.outcome == "interrupted"
     assert body.torque == (0,) * 20
@@ -117,6 +118,6 @@ def test_an_exception_in_a_run_ends_the_rig_too() -> None:
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        run(Settings("walk", policy="gait", backend="virtual"), backend=body, on_tick=broken)
+        run(RunSettings("walk", policy="gait", backend="virtual"), backend=body, on_tick=broken)
     assert body.torque == (0,) * 20
     assert processes[0].poll() is not None

@@ -12,7 +12,7 @@ from servoid.hw.contracts.body import Mode
 from servoid.hw.robot.description import load_robot
 from servoid.sim.rig.backend import VirtualBackend
 from servoid.stack.log.tick import TickRecord
-from servoid.stack.runtime.run import Result, Settings, run
+from servoid.stack.runtime.run import Result, RunSettings, run
 from servoid.stack.safety.guard import Phase
 from servoid.stack.safety.health import DERATED
 
@@ -44,7 +44,7 @@ def walk(happens: Any, robot: Any = ROBOT, seconds: float = 20.0) -> tuple[Resul
             assert record.phase is Phase.RUNNING
             happens(body.rig.control)
 
-    result = run(Settings("walk", policy="gait", seconds=seconds, backend="virtual"), backend=body, on_tick=note)
+    result = run(RunSettings("walk", policy="gait", seconds=seconds, backend="virtual"), backend=body, on_tick=note)
     return result, records, body
 
 

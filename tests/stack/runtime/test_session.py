@@ -12,12 +12,14 @@ import pytest
 from fake_body import FakeBody, spoiled, tilted
 
 from servoid.hw.config import ConfigError
+from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import BackendError, Mode
-from servoid.hw.contracts.control import Plan
+from servoid.hw.contracts.control import Adopted, Plan
 from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import CheckpointError
+from servoid.stack.control.base import BasePolicy
 from servoid.stack.log.flightlog import read_log
-from servoid.stack.runtime.run import Script, Settings, run
+from servoid.stack.runtime.run import RunSettings, Script, run
 from servoid.stack.safety.guard import Phase
 
 ROBOT = load_robot("op3")
@@ -29,7 +31,7 @@ def plain_odometry(monkeypatch):
     monkeypatch.setattr("servoid.stack.runtime.run.load_odometry", lambda robot: None)
 
 
-class Still:
+class Still(BasePolicy):
     """Proposes the home pose."""
 
     closed = False
@@ -51,13 +53,13 @@ class Still:
 class Simulated(FakeBody):
     """A fake that counts as simulated, so that it starts itself."""
 
-    truth = None
+    simulation = Simulation(truth=None, push=lambda velocity: None)
 
 
 def stand(body=None, policy=None, seconds=1.0, **kwargs):
     body = body or Simulated(ROBOT)
     policy = policy or Still()
-    settings = Settings("stand", seconds=seconds, **kwargs.pop("settings", {}))
+    settings = RunSettings("stand", seconds=seconds, **kwargs.pop("settings", {}))
     return run(settings, backend=body, policy=policy, **kwargs), body, policy
 
 
@@ -218,14 +220,14 @@ def test_a_real_robot_asks_before_anything_is_sent():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (Settings("stnd"), "did you mean 'stand'"),
-        (Settings("stand", backend="simm"), "did you mean 'sim'"),
-        (Settings("stand", policy="gate"), "did you mean 'gait'"),
-        (Settings("stand", robot="op4"), "op3"),
-        (Settings("stand", set={"speeed": "1"}), "speeed"),
-        (Settings("stand", set={"gain": "soft"}), "gain: 'soft' is not a number"),
-        (Settings("stand", set={"gain": "nan"}), "gain: nan is outside"),
-        (Settings("stand", policy="gait", port="/dev/ttyUSB0"), "no port"),
+        (RunSettings("stnd"), "did you mean 'stand'"),
+        (RunSettings("stand", backend="simm"), "did you mean 'sim'"),
+        (RunSettings("stand", policy="gate"), "did you mean 'gait'"),
+        (RunSettings("stand", robot="op4"), "op3"),
+        (RunSettings("stand", set={"speeed": "1"}), "speeed"),
+        (RunSettings("stand", set={"gain": "soft"}), "gain: 'soft' is not a number"),
+        (RunSettings("stand", set={"gain": "nan"}), "gain: nan is outside"),
+        (RunSettings("stand", policy="gait", port="/dev/ttyUSB0"), "no port"),
     ],
 )
 def test_what_is_unknown_is_refused_with_the_remedy(settings, message):
@@ -258,13 +260,13 @@ def test_odometry_that_does_not_fit_is_refused_before_the_robot_is_asked(monkeyp
 
 def test_pushes_are_refused_where_the_body_cannot_be_pushed():
     with pytest.raises(ConfigError, match="cannot push"):
-        run(Settings("walk", set={"push": "0.3"}), backend=Simulated(ROBOT), policy=Still())
+        run(RunSettings("walk", set={"push": "0.3"}, start=True), backend=FakeBody(ROBOT), policy=Still())
 
 
 def test_pushes_reach_the_body():
     body, pushes = Simulated(ROBOT), []
-    body.push = pushes.append
-    run(Settings("walk", seconds=3.5, set={"push": "0.3"}), backend=body, policy=Still())
+    body.simulation = Simulation(truth=None, push=pushes.append)
+    run(RunSettings("walk", seconds=3.5, set={"push": "0.3"}), backend=body, policy=Still())
     np.testing.assert_allclose(np.linalg.norm(pushes, axis=1), [0.3, 0.3, 0.3])
 
 
@@ -293,17 +295,20 @@ def test_the_log_tells_the_run(tmp_path):
 class Planning(Still):
     """Adopts a plan every fourth tick, two ticks after it was asked for; `late` requests come to nothing."""
 
-    only = None
+    adopted = None
 
     def __init__(self, late=()):
-        self.late = late
+        self.late, self.only = late, None
+
+    def repeat(self, plans):
+        self.only = plans
 
     def reset(self, seed):
         super().reset(seed)
-        self.adopted, self.latest_plan, self.notes = [], None, []
+        self.latest_plan, self.notes = None, []
 
     def target(self, call):
-        tick = call - 1
+        tick, self.adopted = call - 1, None
         requested = tick - 2
         if requested >= 0 and requested % 4 == 0:
             late = requested in self.late if self.only is None else requested not in self.only
@@ -313,7 +318,7 @@ class Planning(Still):
                 path = np.array([[0.1, 0.0], [0.2, 0.0]])
                 actions = np.tile(ROBOT.home + 0.001 * requested, (2, 1))
                 self.latest_plan = Plan(requested, actions, np.zeros((2, 5)), path, 0.01)
-                self.adopted.append((requested, tick))
+                self.adopted = Adopted(requested, tick, self.latest_plan)
         return ROBOT.home if self.latest_plan is None else self.latest_plan.actions[0]
 
     def take_events(self):

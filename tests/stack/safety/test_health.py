@@ -11,7 +11,7 @@ from fake_body import FakeBody, StillEstimator, observation
 from servoid.hw.contracts.body import Mode, Observation
 from servoid.hw.faults import IMU_FROZEN, INPUT_VOLTAGE, STOP_BUTTON, STOP_BUTTON_AGAIN, TORQUE_LOST
 from servoid.hw.robot.description import load_robot
-from servoid.stack.estimation.sample_hold import Coast
+from servoid.stack.estimation.sample_hold import SampleHold
 from servoid.stack.safety.guard import Guard, Phase
 from servoid.stack.safety.health import DERATED, LOW_TICKS
 
@@ -27,7 +27,7 @@ class Rig:
     def __init__(self, gain: float = 1.0) -> None:
         self.body = FakeBody(ROBOT)
         self.guard = Guard(ROBOT, self.body, gain)
-        self.coast, self.estimator = Coast(), StillEstimator(ROBOT)
+        self.hold, self.estimator = SampleHold(), StillEstimator(ROBOT)
         self.tick = 0
         self.events: list = []
         self.temperature, self.voltage = np.full(N, 40.0), np.full(N, 12.0)
@@ -53,7 +53,7 @@ class Rig:
     def step(self, ticks: int = 1) -> Rig:
         for _ in range(ticks):
             self.tick += 1
-            seen = self.coast.update(self.read())
+            seen = self.hold.update(self.read())
             state = self.estimator.update(seen, self.guard.applied)
             self.guard.begin(self.tick, seen.time_ns)
             self.guard.decide(seen, state, ROBOT.home)

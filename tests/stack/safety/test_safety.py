@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from servoid.hw.contracts.body import BackendError, Mode
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.legs import Legs
-from servoid.stack.estimation.sample_hold import Coast
+from servoid.stack.estimation.sample_hold import SampleHold
 from servoid.stack.safety.guard import DAMP_SECONDS, PATIENCE, Guard, Phase
-from servoid.stack.safety.lowering import crouch
+from servoid.stack.safety.lowering import lowered_pose
 
 ROBOT = load_robot("op3")
 N = len(ROBOT.names)
@@ -29,7 +29,7 @@ class Rig:
     def __init__(self, start=None):
         self.body = FakeBody(ROBOT, start)
         self.guard = Guard(ROBOT, self.body)
-        self.coast = Coast()
+        self.hold = SampleHold()
         self.estimator = StillEstimator(ROBOT)
         self.tick = 0
         self.events = []
@@ -37,7 +37,7 @@ class Rig:
     def step(self, target=None, ticks=1, spoil=lambda o: o):
         self.tick += ticks
         raw = spoil(observation(ROBOT, round(self.tick * ROBOT.dt * 1e9), self.body.position))
-        seen = self.coast.update(raw)
+        seen = self.hold.update(raw)
         state = self.estimator.update(seen, self.guard.applied)
         self.guard.begin(self.tick, raw.time_ns)
         command = self.guard.decide(seen, state, target)
@@ -317,7 +317,7 @@ def test_release_tries_both_writes_and_says_that_it_failed():
 
 def test_crouch_keeps_the_soles_flat_and_the_base_over_them():
     legs = Legs(ROBOT)
-    low = crouch(ROBOT)
+    low = lowered_pose(ROBOT)
     before, _ = legs.soles(legs.pick(ROBOT.home))
     after, corners = legs.soles(legs.pick(low))
     np.testing.assert_allclose(after[:, 1], before[:, 1], atol=1e-4)

@@ -12,8 +12,8 @@ from shipped_runs import ROBOT, drive
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import PlanRequest
 from servoid.policy.checkpoint import resolve
-from servoid.policy.diffusion.checkpoint import load
 from servoid.policy.diffusion.engines import ENGINES, check_engine, deviation, load_engine
+from servoid.policy.diffusion.model.checkpoint import load
 from servoid.policy.diffusion.runtime import Runtime, load_runtime
 from servoid.policy.diffusion.settings import load_settings
 from servoid.stack.tasks import load_task

@@ -20,10 +20,11 @@ from servoid.hw.contracts.control import Instruction, PlanRequest, State
 from servoid.hw.contracts.task import Trace
 from servoid.policy.diffusion.runtime import Runtime, load_runtime
 from servoid.policy.diffusion.settings import DiffusionSettings, load_settings
+from servoid.stack.control.base import BasePolicy
 from servoid.stack.control.diffusion import DiffusionPolicy, diffusion_policy
-from servoid.stack.runtime.run import Settings, prepare, run
+from servoid.stack.runtime.run import RunSettings, prepare, run
 from servoid.stack.tasks import load_task
-from servoid.tools.common.ground_truth import Witness
+from servoid.tools.common.ground_truth import GroundTruth
 from servoid.tools.evaluate.policies import Pilots
 from servoid.tools.evaluate.table import ROWS
 
@@ -71,7 +72,7 @@ def test_what_the_cost_asks_for_moves_the_actions_further_than_noise_does(
         assert size(request.mean(0)) > 0.8 * size(request)
 
 
-class Told:
+class Told(BasePolicy):
     """The policy that ships, which is told to walk forward at every tick, whatever velocity the task asks for."""
 
     def __init__(self, policy: DiffusionPolicy) -> None:
@@ -86,12 +87,12 @@ class Told:
 
 def walk(settings: DiffusionSettings, chosen: Mapping[str, str], seconds: float = 2.5) -> Trace:
     """A run by the truth."""
-    job = Settings("walk", seconds=seconds, seed=1, set=chosen)
+    job = RunSettings("walk", seconds=seconds, seed=1, set=chosen)
     task, backend = prepare(job)
     body: Any = backend
-    witness = Witness(body.truth, ROBOT.dt)
-    run(job, backend=body, on_tick=witness, policy=Told(diffusion_policy(ROBOT, settings, task.cost)))
-    trace = witness.trace()
+    ground_truth = GroundTruth(body.simulation, ROBOT.dt)
+    run(job, backend=body, on_tick=ground_truth, policy=Told(diffusion_policy(ROBOT, settings, task.cost)))
+    trace = ground_truth.trace()
     assert not trace.fallen
     assert len(trace.yaw) == 1 + round(seconds / ROBOT.dt)
     return trace

@@ -12,7 +12,7 @@ from shipped_runs import drive, walked
 from servoid.hw.config import CONFIGS
 from servoid.hw.robot.description import load_robot
 from servoid.sim.backend import SimBackend
-from servoid.stack.runtime.run import Settings, run
+from servoid.stack.runtime.run import RunSettings, run
 
 ROBOT = load_robot()
 
@@ -33,7 +33,7 @@ def test_it_starts_from_rest_and_walks_ten_seconds_where_it_is_asked(
         turned += (now - heading + np.pi) % (2 * np.pi) - np.pi
         heading = now
 
-    result = run(Settings("walk", seed=4, seconds=10.0, set=asked), backend=body, on_tick=follow)
+    result = run(RunSettings("walk", seed=4, seconds=10.0, set=asked), backend=body, on_tick=follow)
     assert result.outcome == "succeeded"
     went = np.array([*result.trace.displacement[-1][:2], turned])
     for reached, wanted in zip(went, least, strict=True):

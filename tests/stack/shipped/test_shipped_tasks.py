@@ -19,7 +19,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Plan, PlanRequest
 from servoid.policy.diffusion.features import Trajectory, raw_layout, to_tokens
 from servoid.policy.text.captions import caption
-from servoid.stack.runtime.run import Settings, run
+from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.tasks.guidance import Weights, obstacle_cost
 
 LAYOUT = raw_layout(len(ROBOT.joints))
@@ -142,7 +142,7 @@ def test_who_survives_is_set_going_by_a_sentence_and_then_told_nothing() -> None
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("clips") / "walk.mcap"
-    run(Settings("walk", policy="expert", seconds=3.0, set={"vx": "0.15", "yaw_rate": "0.3"}, record=path))
+    run(RunSettings("walk", policy="expert", seconds=3.0, set={"vx": "0.15", "yaw_rate": "0.3"}, record=path))
     return path
 
 

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from task_bodies import DT, moves, state
+from task_bodies import DT, moves
 
 from servoid.hw.contracts.control import Instruction
 from servoid.hw.robot.description import load_robot
 from servoid.stack.control.policies import make_policy
-from servoid.stack.navigation.frames import to_heading
 from servoid.stack.tasks import load_settings, load_task
 from servoid.stack.tasks.guidance import Weights, goal_cost, ground_cost, obstacle_cost, path_cost, total_cost
 
@@ -21,11 +20,6 @@ TWIST = tuple(f"cost.{name}" for name in ("velocity", "yaw_rate", "displacement"
 
 def value(cost: torch.Tensor) -> float:
     return float(cost.detach())
-
-
-def test_heading_frame_has_the_robot_at_its_origin_facing_x() -> None:
-    now = state(1.0, 2.0, np.pi / 2)
-    np.testing.assert_allclose(to_heading(np.array([[1.0, 3.0], [0.0, 2.0]]), now), [[1, 0], [0, 1]], atol=1e-12)
 
 
 def test_obstacle_cost_is_the_papers_and_pushes_away() -> None:

@@ -67,7 +67,7 @@ def test_velocity_is_the_mean_over_the_window() -> None:
 
 def walk(first: Any, seconds: float) -> Trace:
     """Bodies that at once do what they are told, and see each other."""
-    tasks = [first, *first.others]
+    tasks = [first, *first.teammates]
     scene = first.scene()
     poses = np.vstack([np.zeros(3), scene.robots[:, :3]])
     goals = np.vstack([scene.goal, scene.robots[:, 3:]])
@@ -145,7 +145,7 @@ def test_the_cost_keeps_a_distance_from_where_the_others_will_be() -> None:
 
 def test_who_has_arrived_stands_and_the_first_is_done_when_all_have() -> None:
     task = cross(robots="2")
-    there, other = state(2.2, 0.0, 0.0), task.others[0]
+    there, other = state(2.2, 0.0, 0.0), task.teammates[0]
     alone = Percept("scene", 0.0, robots=np.array([[1.0, 0.0, math.pi]]))
     assert not task.instruct(0, there, alone).velocity.any()
     assert not task.done(there)

@@ -17,7 +17,7 @@ from servoid.hw.robot.description import Robot, load_robot
 from servoid.policy.diffusion.features import raw_layout
 from servoid.sim.kinematics import joint_places
 from servoid.stack.log.flightlog import read_log
-from servoid.stack.runtime.run import Settings, run
+from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.tasks import load_task
 
 DT = 0.02
@@ -32,7 +32,7 @@ def robot() -> Robot:
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("clips") / "walk.mcap"
-    run(Settings("walk", policy="gait", seconds=3.0, set={"vx": "0.15", "yaw_rate": "0.3"}, record=path))
+    run(RunSettings("walk", policy="gait", seconds=3.0, set={"vx": "0.15", "yaw_rate": "0.3"}, record=path))
     return path
 
 
@@ -127,7 +127,7 @@ def test_clips_that_cannot_be_used_are_refused(clip: Path, robot: Robot, tmp_pat
 
 
 def test_a_run_passes_through_keyframes(clip: Path) -> None:
-    result = run(Settings("inbetween", policy="gait", set={"clips": str(clip), "count": "1"}))
+    result = run(RunSettings("inbetween", policy="gait", set={"clips": str(clip), "count": "1"}))
     assert result.outcome == "succeeded"
     assert result.ticks == 26 * 3 + 1
     assert result.metrics["mrpe_m"] < 0.15

@@ -12,7 +12,7 @@ import pytest
 
 import servoid.hw.config
 import servoid.stack.tasks
-from servoid.stack.runtime.run import Settings, run
+from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.tasks.guidance import Weights
 from servoid.tools.commands.tasks import describe
 
@@ -43,7 +43,7 @@ def test_the_example_walks_there_and_back(written: ModuleType) -> None:
     described = describe("return")
     assert described["description"] == "walk to a point ahead and come back"
     assert {row["key"]: row["value"] for row in described["settings"]}["distance"] == "0.6"
-    result = run(Settings("return", policy="gait", set={"distance": "0.3"}))
+    result = run(RunSettings("return", policy="gait", set={"distance": "0.3"}))
     assert result.outcome == "succeeded"
     assert 0.15 < result.metrics["farthest_m"] < 0.7
 

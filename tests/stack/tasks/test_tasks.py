@@ -65,7 +65,10 @@ def trace(
 
 
 def test_tasks_load_without_torch_or_mujoco() -> None:
-    code = "import sys; from servoid.stack.tasks import load_task as a; a('goal'); print({'torch', 'mujoco'} & set(sys.modules))"
+    code = (
+        "import sys; from servoid.stack.tasks import load_task; load_task('goal'); "
+        "print({'torch', 'mujoco'} & set(sys.modules))"
+    )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "set()"
 

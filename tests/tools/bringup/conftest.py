@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 import servoid.sim.rig.backend
-import servoid.sim.rig.control
+import servoid.sim.rig.process.control
 from servoid.hw.robot.description import load_robot
-from servoid.sim.rig.control import RigProcess
+from servoid.sim.rig.process.control import RigProcess
 from servoid.tools.cli import main
 
 
@@ -44,7 +44,7 @@ def rig(one_rig: RigProcess, monkeypatch: pytest.MonkeyPatch) -> RigProcess:
     one_rig.control.reset(0)
     one_rig.control.call("accepted")
     Lent.rig = one_rig
-    monkeypatch.setattr(servoid.sim.rig.control, "RigProcess", Lent)
+    monkeypatch.setattr(servoid.sim.rig.process.control, "RigProcess", Lent)
     monkeypatch.setattr(servoid.sim.rig.backend, "RigProcess", Lent)
     return one_rig
 

@@ -25,8 +25,8 @@ from servoid.hw.robot.calibration import (
 )
 from servoid.hw.robot.description import load_robot
 from servoid.sim.model import build
-from servoid.sim.rig.control import LockedClock, RigProcess
-from servoid.sim.rig.factory_state import Delivery
+from servoid.sim.rig.factory_state import FactoryState
+from servoid.sim.rig.process.control import LockedClock, RigProcess
 from servoid.tools.bringup import calibrate
 from servoid.tools.bringup.calibrate import MOVED, check_range, directions_of, turned
 from servoid.tools.bringup.encoders import Encoders
@@ -46,9 +46,9 @@ def test_it_finds_the_assembly_of_a_rig_on_a_serial_port_and_check_then_uses_it(
     bringup: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A rig whose horns sit off and whose servos are partly the other way round, as a person builds one."""
-    delivery = Delivery(assembly="random")
-    truth = delivery.assembled(ROBOT, 5)
-    with RigProcess(ROBOT, seed=5, delivery=delivery, linger=120.0) as rig:
+    factory_state = FactoryState(assembly="random")
+    truth = factory_state.assembled(ROBOT, 5)
+    with RigProcess(ROBOT, seed=5, factory_state=factory_state, linger=120.0) as rig:
         link = Path(str(rig.control_path)).with_name("rig")
         link.symlink_to(rig.port)
         link.with_name("rig.control").symlink_to(rig.control_path)

@@ -17,8 +17,8 @@ from servoid.hw.contracts.body import Observation
 from servoid.hw.dynamixel.bus import Bus
 from servoid.hw.robot.description import load_robot
 from servoid.sim.model import build
-from servoid.sim.rig.control import RigProcess
-from servoid.sim.rig.in_process import LocalLine
+from servoid.sim.rig.in_process import InProcessLine
+from servoid.sim.rig.process.control import RigProcess
 from servoid.sim.rig.rig import Rig
 from servoid.tools.bringup import watch
 from servoid.tools.bringup.jogging import IDLE_SECONDS, KEY_SECONDS, SPAN, SPEED, There, Wish, reach, restrict
@@ -297,7 +297,7 @@ def test_watch_counts_more_reads_than_it_keeps_the_times_of(
 
 def test_watch_does_not_hurry_after_reads_that_it_missed() -> None:
     """A terminal that was stopped for a second must not be followed by twenty reads in a burst."""
-    line = LocalLine(Rig(ROBOT))
+    line = InProcessLine(Rig(ROBOT))
     watched = watch.Watched(Line(Bus(line, line), line, None), ROBOT)
     watched._clock = line  # its own time, which no wall keeps
     read, times = watched._sensors.read, []

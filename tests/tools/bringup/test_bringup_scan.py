@@ -15,8 +15,8 @@ from servoid.hw.dynamixel.bus_scan import power_on
 from servoid.hw.dynamixel.port import SerialPort
 from servoid.hw.dynamixel.tables import table
 from servoid.hw.robot.description import load_robot
-from servoid.sim.rig.control import LockedClock, RigProcess
-from servoid.sim.rig.factory_state import Delivery
+from servoid.sim.rig.factory_state import FactoryState
+from servoid.sim.rig.process.control import LockedClock, RigProcess
 
 ROBOT = load_robot()
 XM430 = table("xm430-w350")
@@ -183,8 +183,8 @@ def test_what_no_servo_can_be_set_to_is_a_usage_error(bringup: Any, words: tuple
 def test_a_fresh_servo_is_adopted_on_a_serial_port_and_the_official_sdk_finds_it(bringup: Any) -> None:
     """A port like any other, in real time; the SDK is the judge."""
     sdk = pytest.importorskip("dynamixel_sdk")
-    delivery = Delivery(fresh=("l_knee",), only=("l_knee",))
-    with RigProcess(ROBOT, clock="real", delivery=delivery, linger=60.0) as rig:
+    factory_state = FactoryState(fresh=("l_knee",), only=("l_knee",))
+    with RigProcess(ROBOT, clock="real", factory_state=factory_state, linger=60.0) as rig:
         code, answer, err = bringup("setup", "l_knee", "--port", rig.port, "--yes")
         assert code == 0, err
         assert (answer["before"], answer["after"]) == ({"id": 1, "baud": 57600}, {"id": 14, "baud": 2000000})

@@ -9,7 +9,7 @@ import pytest
 from servoid.hw.config import ConfigError
 from servoid.stack.control.policies import policy_fingerprint
 from servoid.stack.log.flightlog import read_log
-from servoid.stack.runtime.run import Script, Settings, run
+from servoid.stack.runtime.run import RunSettings, Script, run
 from servoid.stack.safety.event import Event
 from servoid.tools.commands.replay import changes, replay
 from servoid.tools.common.flightpath import plans
@@ -18,7 +18,7 @@ from servoid.tools.common.flightpath import plans
 def test_what_a_policy_is_made_of_is_in_the_log_and_changes_are_named(tmp_path: Path) -> None:
     mine = tmp_path / "mine.yaml"
     mine.write_text("replan: 6\ndelay: 2\n")
-    chosen = Settings(
+    chosen = RunSettings(
         "walk", policy=str(mine), seconds=0.4, set={"vx": "0.1", "gain": "0.9"}, record=tmp_path / "a.mcap"
     )
     run(chosen)
@@ -54,7 +54,7 @@ def test_a_walk_by_the_gait_tells_its_settings(name: str) -> None:
 
 def test_a_run_in_which_no_plan_was_in_time_is_repeated_without_one(tmp_path: Path) -> None:
     """As on a machine that is far too slow for the planner."""
-    chosen = Settings("walk", seconds=0.6, set={"vx": "0.1"}, record=tmp_path / "a.mcap")
+    chosen = RunSettings("walk", seconds=0.6, set={"vx": "0.1"}, record=tmp_path / "a.mcap")
     late = run(chosen, script=Script(plans={}))
     assert any("was not ready" in event.text for event in late.events)
     log = read_log(tmp_path / "a.mcap")
@@ -65,10 +65,10 @@ def test_a_run_in_which_no_plan_was_in_time_is_repeated_without_one(tmp_path: Pa
 def test_a_clip_that_is_not_the_one_it_was_is_named(tmp_path: Path) -> None:
     for name, turn in (("clip", "0.3"), ("other", "-0.3")):
         turned = {"vx": "0.15", "yaw_rate": turn}
-        run(Settings("walk", policy="gait", seconds=2.0, set=turned, record=tmp_path / f"{name}.mcap"))
+        run(RunSettings("walk", policy="gait", seconds=2.0, set=turned, record=tmp_path / f"{name}.mcap"))
     clip = tmp_path / "clip.mcap"
     chosen = {"clips": str(clip), "count": "1"}
-    run(Settings("inbetween", policy="gait", set=chosen, record=tmp_path / "a.mcap"))
+    run(RunSettings("inbetween", policy="gait", set=chosen, record=tmp_path / "a.mcap"))
     log = read_log(tmp_path / "a.mcap")
     assert list(log.header["task_files"]) == [str(clip)]
     assert changes(log) == []
@@ -79,7 +79,7 @@ def test_a_clip_that_is_not_the_one_it_was_is_named(tmp_path: Path) -> None:
 
 def test_a_walk_that_is_stopped_in_mid_step_is_repeated_and_drawn(tmp_path: Path) -> None:
     """The planner goes on until the robot has come to rest, after the last tick of the task."""
-    chosen = Settings("walk", seconds=9.0, set={"vx": "0.2"}, record=tmp_path / "a.mcap")
+    chosen = RunSettings("walk", seconds=9.0, set={"vx": "0.2"}, record=tmp_path / "a.mcap")
     stopped = run(chosen, script=Script((Event(200, 0.0, "interrupt", None, "Ctrl-C"),)))
     assert stopped.outcome == "interrupted"
     log = read_log(tmp_path / "a.mcap")

@@ -19,11 +19,11 @@ from servoid.hw.contracts.task import Trace
 from servoid.hw.robot.description import load_robot
 from servoid.sim.backend import SimBackend
 from servoid.stack.log.tick import TickRecord
-from servoid.stack.runtime.run import Settings, run
+from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.safety.guard import Phase
 from servoid.tools.cli import main
 from servoid.tools.commands import rollout
-from servoid.tools.common.ground_truth import Witness
+from servoid.tools.common.ground_truth import GroundTruth
 
 WORDS = ["walk", "--policy", "gait", "--seconds", "3", "--episodes", "2", "--seed", "3"]
 KEYS = {
@@ -62,14 +62,14 @@ def test_one_and_two_workers_give_the_same_and_all_that_was_promised(capfd: pyte
 def test_an_episode_can_be_run_again_by_its_seed() -> None:
     seed = rollout.episode_seed(3, 1)
     assert seed == rollout.episode_seed(3, 1) != rollout.episode_seed(3, 0)
-    job = Settings(task="walk", policy="gait", seconds=2.0, seed=seed, randomise=True, set={"push": "0.1"})
+    job = RunSettings(task="walk", policy="gait", seconds=2.0, seed=seed, randomise=True, set={"push": "0.1"})
     row = rollout.episode(job)
     backend = SimBackend(load_robot(), seed=seed, randomise=True)
-    witness = Witness(backend.truth, 0.02)
-    again = run(job, backend=backend, on_tick=witness)
+    ground_truth = GroundTruth(backend.simulation, 0.02)
+    again = run(job, backend=backend, on_tick=ground_truth)
     assert row["outcome"] == again.outcome
     assert row["seconds"] == again.seconds
-    assert row["odometry_error_m"] == witness.odometry_error(again.trace)
+    assert row["odometry_error_m"] == ground_truth.odometry_error(again.trace)
     plain = run(job)  # as `servoid run --seed` does it
     np.testing.assert_array_equal(plain.trace.displacement, again.trace.displacement)
 
@@ -84,12 +84,12 @@ def test_an_episode_that_cannot_be_done_does_not_take_the_others_with_it(
 ) -> None:
     done = []
 
-    def episode(job: Settings) -> dict:
+    def episode(job: RunSettings) -> dict:
         if len(done) == 2:
             raise BackendError("the rig did not answer")
         done.append(job.seed)
         return {
-            "seed": job.seed, "success": True, "fell": False, "broken_off": False, "fell_ending": False, "seconds": 3.0,
+            "seed": job.seed, "success": True, "fell": False, "aborted": False, "fell_ending": False, "seconds": 3.0,
             "metrics": {},
             "odometry_error_m": 0.01,
         }  # fmt: skip
@@ -112,11 +112,11 @@ def test_many_episodes_take_no_more_memory_than_one() -> None:
     """In a process of its own: what else was freed in this one would be used again, and hide it."""
     code = """
         from pathlib import Path
-        from servoid.stack.runtime.run import Settings
+        from servoid.stack.runtime.run import RunSettings
         from servoid.tools.commands.rollout import episode
         sizes = []
         for seed in range(6):
-            episode(Settings("goal", seed=seed, seconds=0.5))
+            episode(RunSettings("goal", seed=seed, seconds=0.5))
             sizes.append(int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6)
         print(max(sizes[1:]) - sizes[0])
     """
@@ -139,10 +139,10 @@ def test_success_is_by_the_truth_and_only_of_whole_runs(
 ) -> None:
     result = SimpleNamespace(outcome=outcome, seconds=4.0, trace=trace(False), interrupted=False)
     monkeypatch.setattr("servoid.stack.runtime.run.run", lambda *a, **k: result)
-    monkeypatch.setattr(Witness, "trace", lambda self: trace(fallen))
-    monkeypatch.setattr(Witness, "odometry_error", lambda self, estimate: 0.01)
-    row = rollout.episode(Settings(task="walk", policy="gait"))
-    assert (row["success"], row["fell"], row["broken_off"]) == (success, fell, outcome == "stopped")
+    monkeypatch.setattr(GroundTruth, "trace", lambda self: trace(fallen))
+    monkeypatch.setattr(GroundTruth, "odometry_error", lambda self, estimate: 0.01)
+    row = rollout.episode(RunSettings(task="walk", policy="gait"))
+    assert (row["success"], row["fell"], row["aborted"]) == (success, fell, outcome == "stopped")
 
 
 def test_a_run_that_is_told_to_end_is_no_episode_even_where_its_task_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,9 +154,9 @@ def test_a_run_that_is_told_to_end_is_no_episode_even_where_its_task_was_done(mo
             lowering.append(record.tick)
             signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(Witness, "__call__", lambda self, record: told(record))
+    monkeypatch.setattr(GroundTruth, "__call__", lambda self, record: told(record))
     with pytest.raises(KeyboardInterrupt):
-        rollout.episode(Settings(task="stand", policy="gait", seconds=0.5))
+        rollout.episode(RunSettings(task="stand", policy="gait", seconds=0.5))
     assert lowering
 
 
@@ -165,13 +165,13 @@ def test_a_run_that_never_began_is_counted_and_not_a_crash(monkeypatch: pytest.M
     for task in ("walk", "goal", "stand", "text"):
         result = SimpleNamespace(outcome="stopped", seconds=0.0, trace=trace(False), interrupted=False)
         monkeypatch.setattr("servoid.stack.runtime.run.run", lambda *a, result=result, **k: result)
-        row = rollout.episode(Settings(task=task, policy="gait"))
-        assert (row["success"], row["fell"], row["broken_off"]) == (False, False, True)
+        row = rollout.episode(RunSettings(task=task, policy="gait"))
+        assert (row["success"], row["fell"], row["aborted"]) == (False, False, True)
         assert row["metrics"] == ({"followed_share": 0.0} if task == "text" else {})
         good = {
             **row,
             "success": True,
-            "broken_off": False,
+            "aborted": False,
             "fell_ending": False,
             "metrics": {"distance_m": 2.0},
             "odometry_error_m": 0.02,
@@ -179,31 +179,31 @@ def test_a_run_that_never_began_is_counted_and_not_a_crash(monkeypatch: pytest.M
         }
         summary = rollout.summarise(options(), [row, good], 1.0)
         assert summary["metrics"] == {**row["metrics"], "distance_m": 2.0, "odometry_error_m": 0.02}
-        assert (summary["success_rate"], summary["broken_off_rate"]) == (0.5, 0.5)
+        assert (summary["success_rate"], summary["aborted_rate"]) == (0.5, 0.5)
         assert summary["failed_seeds"] == [row["seed"]]
 
 
 def test_the_witness_sees_the_run_in_the_frame_it_started_in() -> None:
     backend = SimBackend(load_robot(), seed=1)
-    witness = Witness(backend.truth, 0.02)
+    ground_truth = GroundTruth(backend.simulation, 0.02)
     half = np.pi / 4  # facing along y
     truth = backend.truth
     instruction = SimpleNamespace(velocity=np.array([0.1, 0, 0]))
     record = SimpleNamespace(proposal=SimpleNamespace(instruction=instruction), phase=Phase.RUNNING)
     nothing = SimpleNamespace(instruction=None)
     truth.qpos[0, :2], truth.qpos[0, 3:7] = (1.0, 2.0), (np.cos(half), 0, 0, np.sin(half))
-    witness(record)
+    ground_truth(record)
     truth.qpos[0, :2] = 1.0, 2.5
-    witness(record)
-    witness(SimpleNamespace(proposal=nothing, phase=Phase.HOMING, events=()))  # which is not the task
-    seen = witness.trace()
+    ground_truth(record)
+    ground_truth(SimpleNamespace(proposal=nothing, phase=Phase.HOMING, events=()))  # which is not the task
+    seen = ground_truth.trace()
     np.testing.assert_allclose(seen.displacement[:, :2], [[0, 0], [0.5, 0]], atol=1e-12)
     np.testing.assert_allclose(seen.yaw, 0.0, atol=1e-12)
     assert not seen.fallen
-    assert witness.odometry_error(seen) == 0.0
+    assert ground_truth.odometry_error(seen) == 0.0
     truth.qpos[0, 2] = 0.1
-    witness(record)
-    assert witness.trace().fallen
+    ground_truth(record)
+    assert ground_truth.trace().fallen
 
 
 @pytest.mark.parametrize(
@@ -218,13 +218,13 @@ def test_the_witness_sees_the_run_in_the_frame_it_started_in() -> None:
 )
 def test_a_fall_after_the_task_is_one_while_ending(phase: Phase, kinds: tuple[str, ...], counts: bool) -> None:
     backend = SimBackend(load_robot(), seed=1)
-    witness = Witness(backend.truth, 0.02)
+    ground_truth = GroundTruth(backend.simulation, 0.02)
     asked, nothing = (SimpleNamespace(instruction=i) for i in (SimpleNamespace(velocity=np.zeros(3)), None))
-    witness(SimpleNamespace(proposal=asked, phase=Phase.RUNNING))
+    ground_truth(SimpleNamespace(proposal=asked, phase=Phase.RUNNING))
     backend.truth.qpos[0, 2] = 0.1
-    witness(SimpleNamespace(proposal=nothing, phase=phase, events=[SimpleNamespace(kind=kind) for kind in kinds]))
-    assert witness.fell_ending == counts
-    assert not witness.trace().fallen
+    ground_truth(SimpleNamespace(proposal=nothing, phase=phase, events=[SimpleNamespace(kind=kind) for kind in kinds]))
+    assert ground_truth.fell_ending == counts
+    assert not ground_truth.trace().fallen
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from servoid.hw.dynamixel.bus import Bus
 from servoid.hw.dynamixel.port import SerialPort
 from servoid.hw.dynamixel.tables import table
 from servoid.hw.robot.description import load_robot
-from servoid.sim.rig.control import RigProcess
+from servoid.sim.rig.process.control import RigProcess
 from servoid.stack.log.flightlog import read_log
 from servoid.tools.cli import main
 from servoid.tools.faults.controller import free_rig

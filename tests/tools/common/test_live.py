@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 import pytest
 
-from servoid.stack.runtime.run import Settings, run
+from servoid.stack.runtime.run import RunSettings, run
 from servoid.tools.common import live
 from servoid.tools.common.live import LiveLine
 from servoid.tools.common.output import Screen
@@ -91,7 +91,7 @@ class Gone(io.StringIO):
 def test_a_reader_that_left_does_not_end_the_run() -> None:
     stream = Gone()
     line = LiveLine(stream)
-    result = run(Settings("stand", policy="gait", seconds=0.4), on_tick=line)
+    result = run(RunSettings("stand", policy="gait", seconds=0.4), on_tick=line)
     line.close()
     assert result.outcome == "succeeded"
     assert stream.tries == 1

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from servoid.hw.config import ConfigError
-from servoid.sim.rig.control import RigProcess
+from servoid.sim.rig.process.control import RigProcess
 from servoid.tools.cli import main
 from servoid.tools.common.prompt import Cancelled, confirm
 from servoid.tools.faults.controller import free_rig

@@ -12,7 +12,7 @@ import pytest
 from servoid.hw.config import CONFIGS, ConfigError
 from servoid.hw.contracts.body import BackendError
 from servoid.policy.checkpoint import resolve
-from servoid.stack.runtime.run import Settings
+from servoid.stack.runtime.run import RunSettings
 from servoid.tools.cli import main
 from servoid.tools.commands import rollout
 from servoid.tools.evaluate import clips
@@ -111,7 +111,7 @@ def test_quick_cuts_the_longest_episodes_and_does_not_mistake_them_for_whole_one
     "name",
     [
         "hw/robot/legs.py",
-        "sim/rig/servo.py",
+        "sim/rig/servo/virtual_servo.py",
         "policy/diffusion/sampler.py",
         "stack/control/trim.py",
         "configs/servos/xm430-w350.yaml",
@@ -221,7 +221,7 @@ def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done
 def test_an_error_of_one_run_does_not_stop_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
-    def record(settings: Settings) -> dict[str, Any]:
+    def record(settings: RunSettings) -> dict[str, Any]:
         if settings.task == "goal-far":
             raise error
         return {"success": True}

@@ -200,7 +200,7 @@ def test_networks_are_named_apart() -> None:
 
 
 def test_commands_that_train_networks_can_be_typed() -> None:
-    from servoid.policy.diffusion.masks import MASKS
+    from servoid.policy.diffusion.model.masks import MASKS
     from servoid.tools.learn.flags import read_settings
     from servoid.tools.learn.settings import DiffusionTraining
     from servoid.tools.learn.trainers import diffusion

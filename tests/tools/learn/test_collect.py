@@ -18,12 +18,12 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.policy.diffusion.dataset import read_recording
 from servoid.policy.diffusion.features import raw_layout
+from servoid.stack.control.fleet import Fleet
 from servoid.tools import cli
 from servoid.tools.learn.collect.disturbances import Disturbances, DisturbanceSettings, joint_noise
 from servoid.tools.learn.collect.episode_cutter import Recorder
 from servoid.tools.learn.collect.lerobot import DatasetWriter, Feature
 from servoid.tools.learn.collect.skills import SKILLS
-from servoid.tools.learn.envs.fleet import Fleet
 from servoid.tools.learn.envs.walker import Walker
 
 TICKS = 250  # 5 s

@@ -13,13 +13,11 @@ import torch
 from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import read_header
-from servoid.policy.diffusion.checkpoint import load
-from servoid.policy.diffusion.config import DenoiserConfig, Objective
 from servoid.policy.diffusion.dataset import Windows, read_recording
-from servoid.policy.diffusion.denoiser import Denoiser
-from servoid.policy.diffusion.schedule import cosine_signal
-from servoid.policy.diffusion.settings import load_settings
-from servoid.policy.diffusion.training import (
+from servoid.policy.diffusion.model.checkpoint import load
+from servoid.policy.diffusion.model.config import DenoiserConfig, Objective
+from servoid.policy.diffusion.model.denoiser import Denoiser
+from servoid.policy.diffusion.objective import (
     Average,
     action_weight,
     draw_levels,
@@ -28,7 +26,9 @@ from servoid.policy.diffusion.training import (
     rate_error,
     rising_levels,
 )
-from servoid.tools.learn.envs import fleet
+from servoid.policy.diffusion.schedule import cosine_signal
+from servoid.policy.diffusion.settings import load_settings
+from servoid.stack.control import fleet
 from servoid.tools.learn.settings import DiffusionTraining
 from servoid.tools.learn.survival import closed_loop_survival
 from servoid.tools.learn.trainers import diffusion

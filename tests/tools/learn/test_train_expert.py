@@ -17,7 +17,7 @@ from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import CheckpointError, read_header
 from servoid.policy.mlp import Mlp
 from servoid.policy.tracker.observation import TrackerObservation
-from servoid.tools.learn.envs.fleet import Fleet
+from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.envs.tracking import Tracking, _draw
 from servoid.tools.learn.settings import ExpertTraining
 from servoid.tools.learn.trainers.expert import ExpertTrainer

@@ -16,14 +16,14 @@ from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.checkpoint import read_header
-from servoid.policy.diffusion.checkpoint import load
-from servoid.policy.diffusion.config import DenoiserConfig
 from servoid.policy.diffusion.dataset import Windows, read_recording
 from servoid.policy.diffusion.features import raw_mirror, raw_row
+from servoid.policy.diffusion.model.checkpoint import load
+from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.runtime import load_runtime
 from servoid.policy.diffusion.settings import load_settings
 from servoid.policy.latent.actions import load_latents, same_latents
-from servoid.tools.learn.envs.fleet import Fleet
+from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.envs.planned import PlannedWalker
 from servoid.tools.learn.latent_roundtrip import recoded_survival
 from servoid.tools.learn.survival import closed_loop_survival

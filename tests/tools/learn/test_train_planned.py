@@ -11,10 +11,10 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction
 from servoid.hw.robot.description import load_robot
-from servoid.policy.diffusion.actions import JOINT_TARGETS
 from servoid.policy.diffusion.features import raw_layout
+from servoid.policy.diffusion.model.action_space import JOINT_TARGETS
 from servoid.policy.diffusion.settings import DiffusionSettings
-from servoid.tools.learn.envs.fleet import Fleet
+from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.envs.planned import PlannedWalker
 
 ROBOT = load_robot()

@@ -7,8 +7,8 @@ import pytest
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
+from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn import survival
-from servoid.tools.learn.envs.fleet import Fleet
 
 ROBOT = load_robot()
 

@@ -95,12 +95,12 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
 
     from servoid.hw.robot.description import load_robot
     from servoid.policy.checkpoint import resolve
+    from servoid.stack.control.fleet import Fleet
     from servoid.stack.estimation.odometry import load_odometry
     from servoid.tools.learn.collect.disturbances import DisturbanceSettings
     from servoid.tools.learn.collect.episode_cutter import Recorder
     from servoid.tools.learn.collect.lerobot import DatasetWriter
     from servoid.tools.learn.collect.skills import SKILLS
-    from servoid.tools.learn.envs.fleet import Fleet
     from servoid.tools.learn.envs.walker import Walker, load_tracker
 
     begin = time.perf_counter()

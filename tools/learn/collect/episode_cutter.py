@@ -11,9 +11,9 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.policy.diffusion.features import raw_layout, raw_row
+from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.collect.disturbances import Disturbances, DisturbanceSettings
 from servoid.tools.learn.collect.skills import Commands
-from servoid.tools.learn.envs.fleet import Fleet
 
 FALL_SECONDS = 1.0  # dropped from the end of an episode that fell: nobody shall learn how
 SHORTEST_SECONDS = 2.0  # of what is left

@@ -9,8 +9,8 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction
 from servoid.policy.diffusion.features import raw_layout, raw_row
+from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.trim import Trim
-from servoid.tools.learn.envs.fleet import Fleet
 
 if TYPE_CHECKING:
     from servoid.policy.diffusion.runtime import Runtime

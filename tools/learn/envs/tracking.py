@@ -8,10 +8,10 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.mlp import Mlp
-from servoid.policy.references.gait import Gait, load_gait
+from servoid.policy.references.gait import Gait
 from servoid.policy.tracker.observation import AHEAD, RESIDUAL, TrackerObservation
 from servoid.policy.tracker.rewards import TERMS, Step
-from servoid.tools.learn.envs.fleet import Fleet
+from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.settings import TrackingSettings
 from servoid.tools.learn.terms import Terms
 
@@ -26,7 +26,7 @@ class Tracking:
         """Call `reset` first."""
         self.robot, self.n, self.settings = robot, n, settings
         self.fleet = Fleet(robot, n, odometry, randomise=settings.randomised, seed=seed)
-        self.gait = Gait(robot, load_gait(), (n,))
+        self.gait = Gait(robot, (n,))
         self.observation = TrackerObservation(robot, (n,))
         joints, feet = Mirror.joints(robot), Mirror.feet(robot)
         critic = Mirror.join(

@@ -7,9 +7,9 @@ from servoid.hw.contracts.control import ReferenceFrames
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import resolve
 from servoid.policy.mlp import Mlp
-from servoid.policy.references.gait import Gait, GyroFeedback, load_gait
+from servoid.policy.references.gait import Gait, GyroFeedback
 from servoid.policy.tracker.observation import AHEAD, RESIDUAL, TrackerObservation
-from servoid.tools.learn.envs.fleet import Fleet
+from servoid.stack.control.fleet import Fleet
 
 
 class Walker:
@@ -17,9 +17,8 @@ class Walker:
 
     def __init__(self, fleet: Fleet, tracker: Mlp | None) -> None:
         self.fleet, self._tracker = fleet, tracker
-        settings = load_gait()
-        self.gait = Gait(fleet.robot, settings, (fleet.n,))
-        self._feedback = GyroFeedback(fleet.robot, settings)
+        self.gait = Gait(fleet.robot, (fleet.n,))
+        self._feedback = GyroFeedback(fleet.robot)
         self._observation = TrackerObservation(fleet.robot, (fleet.n,))
 
     def reset(self, where: Array) -> None:

@@ -16,8 +16,8 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
-from servoid.policy.diffusion.config import DenoiserConfig, DenoiserShape, Objective
 from servoid.policy.diffusion.features import token_layout
+from servoid.policy.diffusion.model.config import DenoiserConfig, DenoiserShape, Objective
 from servoid.policy.text.encoder import load_encoder
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.settings import DiffusionTraining
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from servoid.hw.robot.description import Robot
     from servoid.policy.diffusion.dataset import Windows
+    from servoid.policy.diffusion.model.config import DenoiserConfig
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -120,9 +121,9 @@ class DiffusionTrainer(Trainer):
     ) -> None:
         import torch
 
-        from servoid.policy.diffusion.denoiser import Denoiser
+        from servoid.policy.diffusion.model.denoiser import Denoiser
+        from servoid.policy.diffusion.objective import Average
         from servoid.policy.diffusion.schedule import cosine_signal
-        from servoid.policy.diffusion.training import Average
 
         super().__init__(out, settings, source, judge)
         torch.manual_seed(settings.seed)
@@ -137,7 +138,7 @@ class DiffusionTrainer(Trainer):
 
     def adopt(self, path: Path) -> None:
         """Take weights and normalisation of a checkpoint, to go on with other data. Raises ConfigError."""
-        from servoid.policy.diffusion.checkpoint import load
+        from servoid.policy.diffusion.model.checkpoint import load
         from servoid.policy.latent.actions import same_latents
 
         model = load(path, self.robot)
@@ -165,7 +166,7 @@ class DiffusionTrainer(Trainer):
         """See `Trainer.learn`."""
         import torch
 
-        from servoid.policy.diffusion.training import losses
+        from servoid.policy.diffusion.objective import losses
 
         settings = self.settings
         warm = min(1.0, (self.step + 1) / settings.warmup_steps)
@@ -206,8 +207,8 @@ class DiffusionTrainer(Trainer):
         """Action loss of the averaged network on held-out windows, the same noise every time."""
         import torch
 
-        from servoid.policy.diffusion.denoiser import Denoiser
-        from servoid.policy.diffusion.training import losses
+        from servoid.policy.diffusion.model.denoiser import Denoiser
+        from servoid.policy.diffusion.objective import losses
 
         network = Denoiser(self.config).eval()
         network.load_state_dict(self.average.weights)
@@ -221,7 +222,7 @@ class DiffusionTrainer(Trainer):
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
         """See `Trainer.ship`."""
-        from servoid.policy.diffusion import checkpoint
+        from servoid.policy.diffusion.model import checkpoint
 
         checkpoint.save(
             path,

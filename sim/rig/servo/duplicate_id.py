@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from servoid.hw.dynamixel.codec import StatusError
 from servoid.hw.dynamixel.tables import Item, table
-from servoid.sim.rig.device import Device
-from servoid.sim.rig.servo import FIRMWARE
+from servoid.sim.rig.servo.device import VirtualDevice
+from servoid.sim.rig.servo.virtual_servo import FIRMWARE
 
 _POSITION = 1234  # ticks: nobody's home
 
 
-class Spare(Device):
+class DuplicateId(VirtualDevice):
     """Registers without a motor. It takes every write that a servo would take with torque off."""
 
     def __init__(self, model: int | str, eeprom: dict[str, int]) -> None:

@@ -9,15 +9,15 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.sim.model import TIMESTEP
-from servoid.sim.rig.firmware import Firmware
-from servoid.sim.rig.plant import Plant
-from servoid.sim.rig.wire import FRAME_BITS
+from servoid.sim.rig.servo.firmware import Firmware
+from servoid.sim.rig.servo.plant import Plant
+from servoid.sim.rig.wire.half_duplex import FRAME_BITS
 
 BATTERY_RESISTANCE = 0.04  # Ohm: a 3S pack of the size that fits such a robot, with its wires
 STEP_NS = round(TIMESTEP * 1e9)
 
 
-class Sample(NamedTuple):
+class MotorSample(NamedTuple):
     """What a servo's firmware knows of its motor. Angles rad, speeds rad/s, current A, temperature degrees C."""
 
     angle: float
@@ -30,7 +30,7 @@ class Sample(NamedTuple):
     temperature: float
 
 
-class Motors:
+class MotorBank:
     """Servo-side quantities `(n_joints,)` in the robot's order, angles from the centre tick as the encoder counts."""
 
     def __init__(self, robot: Robot, plant: Plant) -> None:
@@ -86,7 +86,7 @@ class Motors:
             f.reference != f.goal_position,
             f.winding,
         )
-        self.samples = [Sample(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+        self.samples = [MotorSample(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 
 
 def _cycle(robot: Robot) -> float:

@@ -16,16 +16,16 @@ from typing import Any
 
 import torch
 
-from servoid.policy.diffusion.denoiser import Denoiser
+from servoid.policy.diffusion.model.denoiser import Denoiser
 
 OPSET = 18
 OUTPUTS = ("clean_states", "clean_actions")
 _DIGEST = 32  # bytes of a file before the graph: its SHA-256
-_VERSION = 1  # of the graph that is made of a denoiser: files of another one are not read
+_VERSION = 2  # of the graph that is made of a denoiser: files of another one are not read
 
 
 def exported(denoiser: Denoiser) -> bytes:
-    """The graph of `to_onnx`, kept in the user's cache folder, for to make it takes seconds."""
+    """The graph of `to_onnx`, kept in the user's cache folder, because exporting takes seconds."""
     path = cache_path(denoiser)
     with contextlib.suppress(OSError):  # it was not made before, or the folder cannot be read
         kept = path.read_bytes()
@@ -56,7 +56,7 @@ def to_onnx(denoiser: Denoiser) -> bytes:
 
     Inputs `states` `(batch, state tokens, state_size)`, `actions` `(batch, action tokens, action_size)` float32,
     `state_levels` and `action_levels` `(batch, tokens)` int64 and, where the network reads instructions, `text`
-    `(batch, text_size)` float32 and `told` `(batch,)` bool. Outputs `clean_states` and `clean_actions`. Any batch.
+    `(batch, text_size)` float32 and `text_mask` `(batch,)` bool. Outputs `clean_states` and `clean_actions`. Any batch.
     """
     config = denoiser.config
     n_states, n_actions, batch = len(config.state_ticks), len(config.action_ticks), 2  # 1 would be taken for fixed
@@ -68,7 +68,7 @@ def to_onnx(denoiser: Denoiser) -> bytes:
     }
     if config.text_size:
         inputs["text"] = torch.zeros(batch, config.text_size)
-        inputs["told"] = torch.ones(batch, dtype=torch.bool)
+        inputs["text_mask"] = torch.ones(batch, dtype=torch.bool)
     any_batch = {0: torch.export.Dim("batch")}
     # With gradients enabled attention is spelled out (see denoiser._attend), which every engine can read and fuse.
     with _quiet(), torch.enable_grad():

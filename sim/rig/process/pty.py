@@ -18,7 +18,7 @@ _VISIBLE_SECONDS = 0.05
 _KERNEL_BUFFER = 4095  # bytes that a terminal holds for its reader
 
 
-class Terminal:
+class Pty:
     """A pty, with a symbolic link to it where one is asked for. Raises OSError where it cannot be made."""
 
     def __init__(self, link: Path | None = None) -> None:

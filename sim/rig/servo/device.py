@@ -11,7 +11,7 @@ from servoid.hw.dynamixel.tables import ControlTable, Item
 _KEPT = {Reset.ALL: (), Reset.EXCEPT_ID: ("id",), Reset.EXCEPT_ID_AND_BAUD: ("id", "baud_rate")}
 
 
-class Device:
+class VirtualDevice:
     """Registers and instructions common to servos and boards. Times are the rig's, in nanoseconds."""
 
     BOOT_NS = 300_000_000

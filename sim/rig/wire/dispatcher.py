@@ -10,9 +10,9 @@ from collections.abc import Iterator, Sequence
 from servoid.hw.dynamixel import codec
 from servoid.hw.dynamixel.codec import Instruction, Packet, Parser, Status
 from servoid.hw.dynamixel.crc import crc16
-from servoid.sim.rig.device import Device
-from servoid.sim.rig.faults import MISSPOKEN, STATUS_KINDS, Chunk, Dice
-from servoid.sim.rig.wire import FRAME_BITS, Wire, same_baud
+from servoid.sim.rig.faults import MISSPOKEN, STATUS_KINDS, Chunk, FaultInjector
+from servoid.sim.rig.servo.device import VirtualDevice
+from servoid.sim.rig.wire.half_duplex import FRAME_BITS, Wire, same_baud
 
 TURNAROUND_NS = 2_000  # from the last byte of a request to the first of the reply, at return delay 0
 _SILENCE_NS = 5_000_000  # a packet that stops for so long is given up
@@ -24,12 +24,12 @@ _PING_BYTES = 14  # of the answer to a ping
 Part = tuple[int, int, int]  # ID, address, length of a read
 
 
-class Bus:
+class Dispatcher:
     """Devices on a wire. Devices at another baud than the host's neither hear it nor count."""
 
-    def __init__(self, wire: Wire, dice: Dice) -> None:
-        self.wire, self.dice = wire, dice
-        self.devices: list[Device] = []
+    def __init__(self, wire: Wire, injector: FaultInjector) -> None:
+        self.wire, self.injector = wire, injector
+        self.devices: list[VirtualDevice] = []
         self.instructions = 0
         self._parser = Parser()
         self._heard_ns = 0
@@ -48,7 +48,7 @@ class Bus:
                 device.heard(now_ns)
             self._dispatch(packet, listening, now_ns)
 
-    def _dispatch(self, packet: Packet, listening: list[Device], now_ns: int) -> None:
+    def _dispatch(self, packet: Packet, listening: list[VirtualDevice], now_ns: int) -> None:
         instruction, params = packet.instruction, packet.params
         if instruction in (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ):
             if len(params) > 4:
@@ -75,7 +75,7 @@ class Bus:
                 if status is not None:
                     self._send(status, now_ns + TURNAROUND_NS + delay, baud, now_ns)
 
-    def _broadcast(self, packet: Packet, listening: list[Device], now_ns: int) -> None:
+    def _broadcast(self, packet: Packet, listening: list[VirtualDevice], now_ns: int) -> None:
         """To everyone: only a ping is answered, by each in the slot of its ID."""
         for device in listening:
             baud, delay = device.baud, device.return_delay_ns
@@ -84,7 +84,7 @@ class Bus:
                 slot = device.id * (_wire_ns(_PING_BYTES, baud) + TURNAROUND_NS)
                 self._send(status, now_ns + TURNAROUND_NS + delay + slot, baud, now_ns)
 
-    def _read_group(self, parts: Sequence[Part], listening: list[Device], fast: bool, now_ns: int) -> None:
+    def _read_group(self, parts: Sequence[Part], listening: list[VirtualDevice], fast: bool, now_ns: int) -> None:
         """Sync and bulk reads. All sample now; each transmits when the one before it has."""
         if fast:
             if parts:
@@ -105,7 +105,7 @@ class Bus:
             if end - now_ns > _LONGEST_CHAIN_NS:
                 return
 
-    def _read_fast(self, parts: Sequence[Part], listening: list[Device], now_ns: int) -> None:
+    def _read_fast(self, parts: Sequence[Part], listening: list[VirtualDevice], now_ns: int) -> None:
         """One frame to which each adds its block. Whoever does not hear its predecessor stays silent."""
         lengths = [length for _, _, length in parts]
         if sum(lengths) > _LONGEST_FRAME:
@@ -122,18 +122,18 @@ class Bus:
             answers = [status for status in sampled if status is not None and len(status.data) == length]
             if not answers:
                 break
-            fault = self.dice.strikes(STATUS_KINDS, id, now_ns)
+            fault = self.injector.strikes(STATUS_KINDS, id, now_ns)
             if fault is not None:
-                answers = [self.dice.misspeak(fault, status) for status in answers]
+                answers = [self.injector.misspeak(fault, status) for status in answers]
             block = _together([_block(status, crc, length) for status in answers])
             crc = crc16(block, crc)
             block, head = head + block, b""
-            if self.dice.strikes(("garbage",), id, now_ns) is not None:
-                chunks.append(Chunk(self.dice.noise(9)))
+            if self.injector.strikes(("garbage",), id, now_ns) is not None:
+                chunks.append(Chunk(self.injector.noise(9)))
             if fault is None or fault.kind in MISSPOKEN:
                 chunks.append(Chunk(block))
                 continue
-            chunks += self.dice.spoil(fault, block)
+            chunks += self.injector.spoil(fault, block)
             if fault.kind in ("drop", "truncate"):
                 break
         self._put(chunks, now_ns + TURNAROUND_NS + first.return_delay_ns, first.baud, now_ns)
@@ -141,13 +141,13 @@ class Bus:
     def _send(self, status: Status, start_ns: int, baud: int, now_ns: int) -> int:
         """Put a status on the wire; returns when it ends."""
         frame = _frame(status)
-        fault = self.dice.strikes(STATUS_KINDS, status.id, now_ns)
+        fault = self.injector.strikes(STATUS_KINDS, status.id, now_ns)
         if fault is not None and fault.kind in MISSPOKEN:
-            chunks = [Chunk(_frame(self.dice.misspeak(fault, status)))]
+            chunks = [Chunk(_frame(self.injector.misspeak(fault, status)))]
         else:
-            chunks = [Chunk(frame)] if fault is None else self.dice.spoil(fault, frame)
-        if self.dice.strikes(("garbage",), status.id, now_ns) is not None:
-            chunks.insert(0, Chunk(self.dice.noise(9)))
+            chunks = [Chunk(frame)] if fault is None else self.injector.spoil(fault, frame)
+        if self.injector.strikes(("garbage",), status.id, now_ns) is not None:
+            chunks.insert(0, Chunk(self.injector.noise(9)))
         return self._put(chunks, start_ns, baud, now_ns)
 
     def _put(self, chunks: list[Chunk], start_ns: int, baud: int, now_ns: int) -> int:
@@ -162,7 +162,7 @@ class Bus:
         return self.wire.device_sends(bytes(joined), at, baud, now_ns).end_ns if joined else at
 
 
-def _called(devices: list[Device], id: int) -> list[Device]:
+def _called(devices: list[VirtualDevice], id: int) -> list[VirtualDevice]:
     return [device for device in devices if device.answers_to(id)]
 
 

@@ -1,4 +1,4 @@
-"""The tape of a run: the numbers that were put in come out, and a long run takes no more memory than was taken."""
+"""The trace of a run: the numbers that were put in come out, and a long run takes no more memory than was taken."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import pytest
 
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.world import Percept
-from servoid.stack.log import trace_buffer as tape
-from servoid.stack.log.trace_buffer import Tape
+from servoid.stack.log import trace_buffer
+from servoid.stack.log.trace_buffer import TraceBuffer
 
 
-def add(to: Tape, tick: int, goal: bool = True) -> None:
+def add(to: TraceBuffer, tick: int, goal: bool = True) -> None:
     row = np.arange(3.0) + tick
     state = State(
         time_ns=tick,
@@ -30,7 +30,7 @@ def add(to: Tape, tick: int, goal: bool = True) -> None:
 
 @pytest.mark.parametrize("ticks", [2, 50])
 def test_what_was_kept_comes_back(ticks: int) -> None:
-    kept = Tape(2, ticks)
+    kept = TraceBuffer(2, ticks)
     assert len(kept.trace(0.02, fallen=False).yaw) == 0
     for tick in range(12):  # with room for 2 it has to take more
         add(kept, tick)
@@ -50,13 +50,13 @@ def test_what_was_kept_comes_back(ticks: int) -> None:
 
 
 def test_what_was_seen_in_some_ticks_only_is_left_out() -> None:
-    kept = Tape(2, 4)
+    kept = TraceBuffer(2, 4)
     add(kept, 0)
     add(kept, 1, goal=False)
     assert kept.trace(0.02, fallen=False).goal is None
 
 
 def test_room_is_made_before_the_run_and_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert len(Tape(2, 500)._rows) == 501
-    monkeypatch.setattr(tape, "_LONGEST", 100)
-    assert len(Tape(2, 10**9)._rows) == 101
+    assert len(TraceBuffer(2, 500)._rows) == 501
+    monkeypatch.setattr(trace_buffer, "_LONGEST", 100)
+    assert len(TraceBuffer(2, 10**9)._rows) == 101

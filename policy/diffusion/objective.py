@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from servoid.policy.diffusion.config import TOGETHER, DenoiserConfig, Objective
-from servoid.policy.diffusion.denoiser import Denoiser
+from servoid.policy.diffusion.model.config import TOGETHER, DenoiserConfig, Objective
+from servoid.policy.diffusion.model.denoiser import Denoiser
 
 UNTOLD = 0.1  # share of windows without an instruction
 
@@ -115,8 +115,8 @@ def losses(
     state_levels, action_levels = draw_levels(config, len(states), generator, objective)
     noisy_states = add_noise(states, state_levels, signal, generator)
     noisy_actions = add_noise(actions, action_levels, signal, generator)
-    told = torch.rand(len(states), generator=generator) >= UNTOLD
-    clean_states, clean_actions = denoiser(noisy_states, noisy_actions, state_levels, action_levels, text, told)
+    text_mask = torch.rand(len(states), generator=generator) >= UNTOLD
+    clean_states, clean_actions = denoiser(noisy_states, noisy_actions, state_levels, action_levels, text, text_mask)
     state_weight, weight = (level_weight(x, signal, objective.min_snr) for x in (state_levels, action_levels))
     weight = weight * action_weight(config, objective.near_actions, objective.far_actions)
     action_loss = token_error(clean_actions, actions, weight)

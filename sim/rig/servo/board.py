@@ -10,19 +10,19 @@ import numpy as np
 from servoid.hw.dynamixel.codec import StatusError
 from servoid.hw.dynamixel.tables import Item, table
 from servoid.hw.imu.mounting import Mounting
-from servoid.sim.rig.device import Device
-from servoid.sim.rig.motors import Motors
+from servoid.sim.rig.servo.device import VirtualDevice
+from servoid.sim.rig.servo.motor_bank import MotorBank
 
 FIRMWARE = 17
 AXES = "xyz"
 
 
-class Board(Device):
+class VirtualBoard(VirtualDevice):
     """An OpenCR whose IMU is mounted as the robot's file says, its registers negated where the real one's are."""
 
     def __init__(
         self,
-        motors: Motors,
+        motors: MotorBank,
         eeprom: dict[str, int],
         switch: Callable[[bool], None],
         mounting: Mounting | None = None,

@@ -17,7 +17,7 @@ from servoid.hw.contracts.body import Array, BackendError
 from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.description import Robot, load_robot, save_robot
 from servoid.sim.model import build
-from servoid.sim.rig.factory_state import Delivery
+from servoid.sim.rig.factory_state import FactoryState
 from servoid.sim.scene import plain, scene_sensors
 from servoid.sim.truth import Truth
 
@@ -162,7 +162,7 @@ class RigProcess:
         seed: int = 0,
         randomise: bool = False,
         faults: str | Path | None = None,
-        delivery: Delivery | None = None,
+        factory_state: FactoryState | None = None,
         linger: float = 10.0,
     ) -> None:
         """`robot` is a name, a file, or a robot as it is. Raises BackendError with the reason if it does not start."""
@@ -176,7 +176,7 @@ class RigProcess:
             sys.executable,
             "-P",  # or a file in the present folder could stand for a module
             "-m",
-            "servoid.sim.rig.server",
+            "servoid.sim.rig.process.server",
             "--robot",
             str(robot),
             "--clock",
@@ -187,7 +187,7 @@ class RigProcess:
         command += ["--seed", str(seed), "--linger", str(linger), "--folder", self._folder.name]
         command += ["--randomise"] if randomise else []
         command += ["--faults", str(faults)] if faults else []
-        command += [] if delivery is None else delivery.arguments()
+        command += [] if factory_state is None else factory_state.arguments()
         # A session of its own: Ctrl-C in the terminal is meant for the controller.
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True)
         try:

@@ -1,6 +1,6 @@
 """A virtual rig in a process of its own: its serial port, its control socket, and its time.
 
-    python -m servoid.sim.rig.server --robot op3 --link /tmp/rig --control /tmp/rig.sock --clock locked
+    python -m servoid.sim.rig.process.server --robot op3 --link /tmp/rig --control /tmp/rig.sock --clock locked
 
 The first line of standard output is a JSON object with `port` and `control`. Time is the machine's, or stands still
 until the control connection that locked it advances it. When that connection closes, the rig goes on at the machine's
@@ -28,11 +28,11 @@ from typing import Any, Literal
 from servoid.hw.clock import wake_sharply
 from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
-from servoid.sim.rig import control_requests as operations
-from servoid.sim.rig.control_requests import Connection
-from servoid.sim.rig.factory_state import Delivery, add_delivery_arguments
+from servoid.sim.rig.factory_state import FactoryState, add_factory_state_arguments
 from servoid.sim.rig.faults import Scenario, load_scenario
-from servoid.sim.rig.pty import Terminal
+from servoid.sim.rig.process import control_requests
+from servoid.sim.rig.process.control_requests import Connection
+from servoid.sim.rig.process.pty import Pty
 from servoid.sim.rig.rig import Rig
 
 ClockKind = Literal["real", "locked"]
@@ -56,7 +56,7 @@ class Server:
         self.rig = rig
         self._listener = None if control is None else _listen(control)
         try:
-            self.terminal = Terminal(link)
+            self.pty = Pty(link)
         except OSError:
             if self._listener is not None and control is not None:
                 self._listener.close()
@@ -76,7 +76,7 @@ class Server:
 
     @property
     def port(self) -> str:
-        return self.terminal.port
+        return self.pty.port
 
     def stop(self) -> None:
         self._running = False
@@ -99,7 +99,7 @@ class Server:
         return time.monotonic() - self._used > self._linger
 
     def close(self) -> None:
-        self.terminal.close()
+        self.pty.close()
         for connection in self._connections.values():
             connection.stream.close()
         if self._listener is not None:
@@ -116,8 +116,8 @@ class Server:
         watched: list[int] = list(self._connections)
         if self._listener is not None:
             watched.append(self._listener.fileno())
-        if self.terminal.is_open and not self._stalled and not self._locked:
-            watched.append(self.terminal.master)
+        if self.pty.is_open and not self._stalled and not self._locked:
+            watched.append(self.pty.master)
         for ready in select.select(watched, [], [], timeout)[0]:
             if self._listener is not None and ready == self._listener.fileno():
                 stream, _ = self._listener.accept()
@@ -136,11 +136,11 @@ class Server:
 
     def _exchange(self, to_ns: int, *, visible: bool) -> int:
         """Let the rig live until `to_ns` with what the host has sent; returns the bytes that the host can now read."""
-        rig, terminal = self.rig, self.terminal
+        rig, pty = self.rig, self.pty
         sent = b""
-        if terminal.is_open and not self._stalled:
-            sent = terminal.read()
-            rig.wire.host_baud = terminal.baud or rig.wire.host_baud
+        if pty.is_open and not self._stalled:
+            sent = pty.read()
+            rig.wire.host_baud = pty.baud or rig.wire.host_baud
         if visible:  # locked: what the host wrote, it wrote before time went on
             rig.host_sends(sent)
             heard = rig.advance(to_ns)
@@ -153,22 +153,22 @@ class Server:
             skew, rig.skew_ns = rig.skew_ns, 0
             self._rig_ns += skew
             heard += rig.advance(rig.now_ns + skew)
-        if terminal.is_open:
-            terminal.write(heard, visible=visible)
+        if pty.is_open:
+            pty.write(heard, visible=visible)
         self._plug()
         return len(heard)
 
     def _plug(self) -> None:
         """Make the port what the faults say."""
-        if self.rig.port_open != self.terminal.is_open:
+        if self.rig.port_open != self.pty.is_open:
             if self.rig.port_open:
-                self.terminal.open()
+                self.pty.open()
             else:
-                self.terminal.close()
+                self.pty.close()
             self._stalled = False
-        if self.terminal.is_open and self.rig.stalled != self._stalled:
+        if self.pty.is_open and self.rig.stalled != self._stalled:
             self._stalled = self.rig.stalled
-            self.terminal.stall(self._stalled)
+            self.pty.stall(self._stalled)
 
     def _pick_up(self) -> None:
         """Nobody leaves a robot lying: without torque for a while, it is held at its home pose again."""
@@ -211,8 +211,8 @@ class Server:
         try:
             request = json.loads(line)
             name = request.pop("op")
-            operation = own[name] if name in own else operations.find(name, self.rig)
-            return {"now": self.rig.now_ns, **operation(**request)}
+            request_of = own[name] if name in own else control_requests.find(name, self.rig)
+            return {"now": self.rig.now_ns, **request_of(**request)}
         except (ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
             return {"error": f"{type(error).__name__}: {error}"}
 
@@ -233,8 +233,8 @@ class Server:
         return {"now": self.rig.now_ns, "heard": heard}
 
     def _reset(self, seed: int, randomise: bool = False) -> dict[str, Any]:
-        if self.terminal.is_open:
-            self.terminal.flush()
+        if self.pty.is_open:
+            self.pty.flush()
         self.rig.reset(seed, randomise=randomise)
         self._plug()
         return {}
@@ -263,19 +263,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--faults", type=Path, help="fault scenario (YAML)")
     parser.add_argument("--clock", choices=("real", "locked"), default="real")
     parser.add_argument("--control", type=Path, help="control socket")
-    add_delivery_arguments(parser)
+    add_factory_state_arguments(parser)
 
 
 def build(args: argparse.Namespace, *, linger: float | None = None) -> Server:
     """A server as the arguments say. Raises ConfigError, and OSError for a link or socket that cannot be made."""
     scenario = load_scenario(args.faults) if args.faults else Scenario()
-    delivery = Delivery(tuple(args.fresh), tuple(args.only), args.assembly)
-    rig = Rig(load_robot(args.robot), seed=args.seed, randomise=args.randomise, scenario=scenario, delivery=delivery)
+    factory_state = FactoryState(tuple(args.fresh), tuple(args.only), args.assembly)
+    rig = Rig(
+        load_robot(args.robot), seed=args.seed, randomise=args.randomise, scenario=scenario, factory_state=factory_state
+    )
     return Server(rig, clock=args.clock, link=args.link, control=args.control, linger=linger)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="servoid.sim.rig.server")
+    parser = argparse.ArgumentParser(prog="servoid.sim.rig.process.server")
     add_arguments(parser)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--randomise", action="store_true")

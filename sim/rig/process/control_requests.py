@@ -44,10 +44,10 @@ class Connection:
 
 
 def find(name: str, rig: Rig) -> Callable[..., dict[str, Any]]:
-    """The operation of that name on `rig`. Raises ValueError with the nearest name if there is none."""
-    if name not in _OPERATIONS:
-        raise ValueError(f"unknown operation '{name}'; {nearest(str(name), _OPERATIONS)}")
-    return partial(_OPERATIONS[name], rig)
+    """The request of that name on `rig`. Raises ValueError with the nearest name if there is none."""
+    if name not in _REQUESTS:
+        raise ValueError(f"unknown request '{name}'; {nearest(str(name), _REQUESTS)}")
+    return partial(_REQUESTS[name], rig)
 
 
 def _hold(rig: Rig) -> dict[str, Any]:
@@ -108,11 +108,11 @@ def _servos(rig: Rig) -> dict[str, Any]:
 
 
 def _statistics(rig: Rig) -> dict[str, Any]:
-    struck = [{"kind": kind, "id": id, "count": n} for (kind, id), n in rig.dice.struck.items()]
-    return {"struck": struck, "collisions": rig.wire.collisions, "instructions": rig.bus.instructions}
+    struck = [{"kind": kind, "id": id, "count": n} for (kind, id), n in rig.injector.struck.items()]
+    return {"struck": struck, "collisions": rig.wire.collisions, "instructions": rig.dispatcher.instructions}
 
 
-_OPERATIONS: dict[str, Callable[..., dict[str, Any]]] = {
+_REQUESTS: dict[str, Callable[..., dict[str, Any]]] = {
     "hold": _hold,
     "push": _push,
     "furnish": _furnish,

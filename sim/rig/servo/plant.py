@@ -1,8 +1,9 @@
 """The body that a virtual rig's motors move: the simulated backend's model, driven by voltages and read by encoders.
 
-The motor is the actuator of `sim/model.py`. Its controller makes a voltage of `gain * (control - angle)`; here the gain
-is one volt a radian and the control is `angle + voltage`, so that firmware of any operating mode can drive the very same
-motor: in position mode with a P gain alone, the torque is that of the simulated backend to the last bit but rounding.
+The motor is the actuator of `sim/model.py`. Its controller makes a voltage of `gain * (control - angle)`; here the
+gain is one volt a radian and the control is `angle + voltage`, so that firmware of any operating mode can drive the
+very same motor: in position mode with a P gain alone, the torque is that of the simulated backend to the last bit but
+rounding.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
-from servoid.sim.model import TIMESTEP, build
+from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.randomise import Body, draw
 from servoid.sim.scene import robot_bodies, scene_sensors
 from servoid.sim.truth import Truth
@@ -72,7 +73,7 @@ class Plant:
         self.model.body_mass[own] = self._nominal["body_mass"][own] * self.body.mass
         self.model.body_inertia[own] = self._nominal["body_inertia"][own] * self.body.mass[:, None]
         self.model.geom_friction[:] = self._nominal["geom_friction"]
-        self.model.geom_friction[self.model.geom("floor").id, 0] = self.body.friction
+        self.model.geom_friction[self.model.geom(FLOOR).id, 0] = self.body.friction
         mujoco.mj_setConst(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
         self.held, self._noise_block, self._ticks = True, -1, 0

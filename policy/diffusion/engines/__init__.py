@@ -20,18 +20,18 @@ from servoid.hw.contracts.body import Array
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from servoid.policy.diffusion.denoiser import Denoiser
+    from servoid.policy.diffusion.model.denoiser import Denoiser
 
-# The call of a Denoiser: (states, actions, state levels, action levels, text, told) -> clean states, clean actions
+# The call of a Denoiser: (states, actions, state levels, action levels, text, text_mask) -> clean states, clean actions
 Engine = Callable[..., "tuple[Tensor, Tensor]"]
 # Inputs by name -> clean states, clean actions
-Run = Callable[[Mapping[str, Array]], "tuple[Array, Array]"]
+RunGraph = Callable[[Mapping[str, Array]], "tuple[Array, Array]"]
 
 REFERENCE = "torch"
 
 
 @dataclass(frozen=True)
-class Kind:
+class EngineKind:
     """What an engine needs, and how far it may be from torch."""
 
     tolerance: float
@@ -41,12 +41,12 @@ class Kind:
 
 _ONNX = ("onnxruntime", "onnxscript")
 _OPENVINO = ("openvino", "onnxscript")
-ENGINES: dict[str, Kind] = {
-    REFERENCE: Kind(0.0),
-    "onnx": Kind(1e-4, _ONNX, "onnx"),
-    "onnx-int8": Kind(0.08, _ONNX, "onnx"),
-    "openvino": Kind(1e-4, _OPENVINO, "openvino"),
-    "openvino-bf16": Kind(0.04, _OPENVINO, "openvino"),
+ENGINES: dict[str, EngineKind] = {
+    REFERENCE: EngineKind(0.0),
+    "onnx": EngineKind(1e-4, _ONNX, "onnx"),
+    "onnx-int8": EngineKind(0.08, _ONNX, "onnx"),
+    "openvino": EngineKind(1e-4, _OPENVINO, "openvino"),
+    "openvino-bf16": EngineKind(0.04, _OPENVINO, "openvino"),
 }
 
 
@@ -72,7 +72,7 @@ def load_engine(name: str, denoiser: Denoiser) -> Engine:
     check_engine(name)
     if name == REFERENCE:
         return denoiser
-    from servoid.policy.diffusion.export import exported, quantised
+    from servoid.policy.diffusion.engines.export import exported, quantised
 
     graph = exported(denoiser)
     if name == "onnx-int8":
@@ -91,7 +91,7 @@ def load_engine(name: str, denoiser: Denoiser) -> Engine:
 class Exported:
     """A denoiser's graph, called with torch tensors like the denoiser itself."""
 
-    def __init__(self, run: Run, text_size: int) -> None:
+    def __init__(self, run: RunGraph, text_size: int) -> None:
         self._run = run
         self._text_size = text_size
 
@@ -102,7 +102,7 @@ class Exported:
         state_levels: Tensor,
         action_levels: Tensor,
         text: Tensor | None = None,
-        told: Tensor | None = None,
+        text_mask: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """See `Denoiser.forward`. Raises RuntimeError when a gradient is wanted: only torch has one."""
         import torch
@@ -119,9 +119,9 @@ class Exported:
         if self._text_size:
             # The graph always reads a text; a window that is not told it has none.
             if text is None:
-                text, told = torch.zeros(batch, self._text_size), torch.zeros(batch, dtype=torch.bool)
+                text, text_mask = torch.zeros(batch, self._text_size), torch.zeros(batch, dtype=torch.bool)
             inputs["text"] = text
-            inputs["told"] = torch.ones(batch, dtype=torch.bool) if told is None else told
+            inputs["text_mask"] = torch.ones(batch, dtype=torch.bool) if text_mask is None else text_mask
         clean = self._run({name: np.ascontiguousarray(value.numpy()) for name, value in inputs.items()})
         return torch.from_numpy(clean[0]), torch.from_numpy(clean[1])
 
@@ -149,14 +149,14 @@ def deviation(engine: Engine, denoiser: Denoiser) -> float:
         text = {}
         if config.text_size and batch == 2:
             words = torch.randn(batch, config.text_size, generator=generator) / config.text_size**0.5
-            text = {"text": words, "told": torch.tensor([True, False])}
+            text = {"text": words, "text_mask": torch.tensor([True, False])}
         with torch.no_grad():
             for ours, theirs in zip(engine(*inputs, **text), denoiser(*inputs, **text), strict=True):
                 found.append((ours - theirs).norm() / theirs.norm().clamp_min(1e-9))
     return float(torch.stack(found).max())  # not a number where any of them is not
 
 
-def _onnx_runtime(graph: bytes) -> Run:
+def _onnx_runtime(graph: bytes) -> RunGraph:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -171,7 +171,7 @@ def _onnx_runtime(graph: bytes) -> Run:
     return run
 
 
-def _openvino(graph: bytes, precision: str) -> Run:
+def _openvino(graph: bytes, precision: str) -> RunGraph:
     """`precision` is "f32" or "bf16". It must be said: left to itself, OpenVINO takes bf16 where the CPU has it."""
     import openvino
 

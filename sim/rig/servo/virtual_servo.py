@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 from servoid.hw.dynamixel.codec import StatusError
 from servoid.hw.dynamixel.tables import Item, table
-from servoid.sim.rig.device import Device
 from servoid.sim.rig.factory_state import ticks_per_turn
-from servoid.sim.rig.firmware import CURRENT, CURRENT_POSITION, EXTENDED, FULL_PWM, POSITION, PWM
-from servoid.sim.rig.motors import Motors
+from servoid.sim.rig.servo.device import VirtualDevice
+from servoid.sim.rig.servo.firmware import CURRENT, CURRENT_POSITION, EXTENDED, FULL_PWM, POSITION, PWM
+from servoid.sim.rig.servo.motor_bank import MotorBank
 
 FIRMWARE = 52  # the newest that changed anything in the tables
 _HOMING_RANGE = 1024  # ticks that count in position mode
@@ -32,11 +32,11 @@ _MODE_RESETS = (  # registers that go back to their defaults with a new operatin
 Accepted = Callable[[int, str, int, float, int], None]  # joint, register, value, goal angle [rad] or NaN, time [ns]
 
 
-class VirtualServo(Device):
+class VirtualServo(VirtualDevice):
     """Servo `index` of the rig's motors."""
 
     def __init__(
-        self, motors: Motors, index: int, model: int | str, eeprom: dict[str, int], accepted: Accepted | None = None
+        self, motors: MotorBank, index: int, model: int | str, eeprom: dict[str, int], accepted: Accepted | None = None
     ) -> None:
         """`accepted` is told of every write to a goal, the torque or the P gain that the servo took, and of the 255
         that an expired watchdog writes to its register."""

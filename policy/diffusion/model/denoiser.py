@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from servoid.policy.diffusion.config import DenoiserConfig
-from servoid.policy.diffusion.masks import attention_mask
+from servoid.policy.diffusion.model.config import DenoiserConfig
+from servoid.policy.diffusion.model.masks import attention_mask
 
 
 def _attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
@@ -82,13 +82,13 @@ class Denoiser(nn.Module):
         state_levels: Tensor,
         action_levels: Tensor,
         text: Tensor | None = None,
-        told: Tensor | None = None,
+        text_mask: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Clean states and actions predicted from noisy ones.
 
         Shapes `(batch, state tokens, state_size)`, `(batch, action tokens, action_size)`; levels are integers
         `(batch, tokens)`, or `(tokens,)` when the batch shares them. `text` `(batch, text_size)` is the encoded
-        instruction, None for a window without one; `told` `(batch,)` bool says which windows of a batch have one.
+        instruction, None for a window without one; `text_mask` `(batch,)` bool says which windows of a batch have one.
         """
         n = states.shape[1]
         at_state = self.embed_state(states) + self.level(state_levels) + self.position + self.kind[0]
@@ -96,19 +96,19 @@ class Denoiser(nn.Module):
         at_action = self.embed_action(actions) + self.level(action_levels) + place + self.kind[1]
         x = torch.cat([at_state, at_action], 1)
         if self.config.text_size:
-            x = x + self._instruction(text, told)
+            x = x + self._instruction(text, text_mask)
         for block in self.blocks:
             x = block(x, self.mask)
         x = self.norm(x)
         return self.head_state(x[:, :n]), self.head_action(x[:, n:])
 
-    def _instruction(self, text: Tensor | None, told: Tensor | None) -> Tensor:
+    def _instruction(self, text: Tensor | None, text_mask: Tensor | None) -> Tensor:
         """What is added to every token: `(batch, 1, width)` or, without an instruction, `(width,)`."""
         if text is None:
             return self.no_text
         embedded = self.embed_text(text)
-        if told is not None:
-            embedded = torch.where(told[:, None], embedded, self.no_text)
+        if text_mask is not None:
+            embedded = torch.where(text_mask[:, None], embedded, self.no_text)
         return embedded[:, None]
 
     @property
