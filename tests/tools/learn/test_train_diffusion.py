@@ -65,6 +65,7 @@ def trainer(windows: Windows, out: Path, survival: Measured, settings: Diffusion
     return DiffusionTrainer(windows, ROBOT, settings, out, "made up", survival)
 
 
+@pytest.mark.slow
 def test_the_checkpoint_with_the_best_survival_is_kept_not_the_newest(windows: Windows, tmp_path: Path) -> None:
     measured = Measured(0.2, 0.9, 0.5)
     trainer(windows, tmp_path, measured).run()

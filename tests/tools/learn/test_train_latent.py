@@ -68,6 +68,7 @@ def test_the_file_says_what_was_measured(made: Path) -> None:
     assert (made.parent / "learning_curve.png").exists()
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_and_another_network_is_refused(synthetic_dataset: Path, tmp_path: Path) -> None:
     options = ["--data", synthetic_dataset, "--out", tmp_path, *SMALL, "--survival-worlds", 0]
     train(latent, *options, "--steps", 4)
@@ -120,6 +121,7 @@ def driven_by_the_present_state(path: Path) -> None:
     assert np.abs(target - runtime.model.space.decode(then, planned)).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_diffusion_model_learns_to_plan_latents_and_carries_their_decoder(
     made: Path, synthetic_dataset: Path, tmp_path: Path
 ) -> None:

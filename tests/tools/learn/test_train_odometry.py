@@ -71,6 +71,7 @@ def test_fitting_takes_a_systematic_slip_out(slipping: dict[str, np.ndarray], tm
     }
 
 
+@pytest.mark.slow
 def test_a_fit_that_was_interrupted_ends_as_one_that_was_not(slipping: dict[str, np.ndarray], tmp_path: Path) -> None:
     whole, parted = tmp_path / "whole", tmp_path / "parted"
     trainer(slipping, whole).run()
