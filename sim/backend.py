@@ -11,7 +11,7 @@ import numpy as np
 
 from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array, Command, Mode, Observation
-from servoid.hw.contracts.world import Scene, World
+from servoid.hw.contracts.world import Scene, Start, World
 from servoid.hw.robot.description import Robot
 from servoid.sim.model import build
 from servoid.sim.scene import Stage, count_robots
@@ -35,10 +35,11 @@ class SimBackend:
         # numpy pads a seed with zeros: what other streams of this seed are told apart by must not be 0 either.
         streams = [[seed, 0], *([seed, OTHERS_STREAM, number] for number in range(1, n))]
         rngs = [np.random.default_rng(stream) for stream in streams]
-        places = np.zeros((n, 3))
+        start, places = Start(), np.zeros((n, 3))
         if scene is not None and scene.robots is not None:
             places[1:] = scene.robots[:, :3]
-        self._worlds.reset(np.arange(n), rngs, places=places if n > 1 else None)
+            start = Start(position=places * [1.0, 1.0, np.nan], heading=places[:, 2])
+        self._worlds.reset(np.arange(n), rngs, start)
         self._commands = [Command(robot.home, np.zeros(len(robot.joints)), Mode.OFF)] * n
         self.clock = SimClock(self)
         self.stage: Stage | None = None

@@ -14,9 +14,11 @@ from mujoco.batch import Batch
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array, Command, Mode, Observation
+from servoid.hw.contracts.world import Start
 from servoid.hw.geometry import headed
 from servoid.hw.robot.description import Imu, Robot
 from servoid.hw.robot.legs import Legs
+from servoid.sim.ground import Ground
 from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.multi_robot import Crowd
 from servoid.sim.randomise import Body, draw, longest
@@ -53,7 +55,7 @@ class Worlds:
             whole = round(1 / TIMESTEP)
             raise ConfigError(f"{robot.name}: rate: {robot.rate} does not divide the physics' {whole} steps a second")
         self.batch: Batch | Crowd = Crowd(self.model, n) if together else Batch(self.model, n, threads)
-        self._legs = Legs(robot)
+        self._legs, self._ground = Legs(robot), Ground(self.model)
         self._bodies = robot_bodies(self.model)
         joints = [self.model.joint(name) for name in robot.names]
         self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
@@ -101,29 +103,31 @@ class Worlds:
             self.model, robot, self._state_qpos, self._state_qvel, self._sensors, self._fresh["sensordata"]
         )
 
-    def reset(
-        self,
-        ids: Array,
-        rngs: Sequence[np.random.Generator],
-        joints: Array | None = None,
-        places: Array | None = None,
-    ) -> None:
-        """Put worlds `ids` on the ground at pose `joints` `(len(ids), n_joints)` (default: home); draws new robots.
+    def reset(self, ids: Array, rngs: Sequence[np.random.Generator], start: Start | None = None) -> None:
+        """Begin new episodes in the worlds `ids`, drawing new robots; `start` has a row for each of them.
 
-        `places` `(len(ids), 3)`, x, y m and heading rad: where they stand and face, by default the origin and along x.
+        Sensors and motors have known the robot for long as it begins: the accelerometer reads gravity alone, so that an
+        estimator finds its tilt, the gyro and the servos the velocities it begins with, and the joints' targets are
+        where the joints are.
         """
-        pose = np.broadcast_to(self.robot.home if joints is None else joints, (len(ids), len(self.robot.joints)))
+        start = start or Start()
+        shape = (len(ids), len(self.robot.joints))
+        pose = np.broadcast_to(self.robot.home if start.joints is None else start.joints, shape)
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for i, rng in zip(ids, rngs, strict=True):
             self._rngs[i] = rng
             self._place(i, draw(rng, self.robot, self._bodies, rng.random() < self.randomise))
         self._state_qpos[ids] = 0.0
-        self._state_qpos[ids, 2], self._state_qpos[ids, 3:7] = self._legs.stand(pose - self._zero[ids])
-        if places is not None:
-            self._state_qpos[ids, :2] = places[:, :2]
-            self._state_qpos[ids, 3:7] = headed(self._state_qpos[ids, 3:7], places[:, 2])
         self._state_qpos[ids[:, None], self._qpos] = pose - self._zero[ids]
+        self._put(ids, pose - self._zero[ids], start)
         self._state_qvel[ids] = 0.0
+        for dofs, velocity in (
+            (np.arange(0, 3), start.velocity),
+            (np.arange(3, 6), start.angular_velocity),
+            (self._dof, start.joint_velocity),
+        ):
+            if velocity is not None:
+                self._state_qvel[ids[:, None], dofs] = velocity
         if self.randomise > 0:
             self.batch.set_const(ids)
         self._gain[ids, :, _KP], self._force[ids, :, 0], self._force[ids, :, 1] = 0.0, 0.0, 0.0
@@ -133,10 +137,24 @@ class Worlds:
         for key, value in self._record.items():
             value[ids] = self.batch.bind(key)[ids][:, None]
         self._fresh["sensordata"][ids] = self._sensors[ids][:, None]
-        # The limp body has just been put down; its sensors have read a standing one for long.
-        self._record["sensordata"][ids, :, 0:3] = 0.0
+        self._record["sensordata"][ids, :, 0:3] = self.truth.angular_velocity[ids][:, None]
         self._record["sensordata"][ids, :, 3:6] = -_GRAVITY * self.truth.gravity[ids][:, None]
         self.ticks[ids], self._noise_block[ids] = 0, -1
+
+    def _put(self, ids: Array, joints: Array, start: Start) -> None:
+        """Place and turn the bases of bodies whose joints are there."""
+        height, orientation = self._legs.stand(joints)
+        if start.orientation is not None:
+            orientation = start.orientation
+        if start.heading is not None:
+            orientation = headed(orientation, start.heading)
+        self._state_qpos[ids, 3:7] = orientation
+        position = np.full((len(ids), 3), [0.0, 0.0, np.nan]) if start.position is None else start.position
+        self._state_qpos[ids, 0:3] = position
+        down = np.isnan(position[:, 2])
+        if start.orientation is not None and down.any():
+            height = np.array([self._ground.height(self._state_qpos[i]) for i in ids])
+        self._state_qpos[ids, 2] = np.where(down, height, position[:, 2])
 
     def _place(self, i: int, body: Body) -> None:
         self.bodies[i] = body
@@ -178,6 +196,11 @@ class Worlds:
             value[:, -self.substeps :] = self._fresh[key]
         self.ticks += 1
         self.tick += 1
+
+    @property
+    def weight(self) -> float:
+        """Of a nominal robot [N]."""
+        return _GRAVITY * float(self.model.body_mass[1 : self._bodies].sum())
 
     @property
     def effort(self) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from servoid.hw.config import ConfigError
-from servoid.hw.robot.description import Imu, Joint, Limits, Link, Robot, load_robot
+from servoid.hw.robot.description import Imu, Joint, Limits, Link, Robot, Walking, load_robot
 from servoid.policy.checkpoint import REQUIRED
 from servoid.policy.diffusion.features import raw_layout
 from servoid.sim.model import build
@@ -80,8 +80,22 @@ def test_what_the_body_lacks_is_reported_as_promised(folder: Path, change: tuple
 def test_every_key_is_explained() -> None:
     """A key that is added to the robot's file must be added to the table."""
     table = "\n".join(line for line in PAGE.splitlines() if line.startswith("| `"))
-    parts = {"bus": "bus.baud", "limits": Limits, "imu": Imu, "feet": "feet.NAME", "legs": Link, "joints": Joint}
-    prefixes = {"limits": "limits.", "imu": "imu.", "legs": "legs.NAME[i].", "joints": "joints[i]."}
+    parts = {
+        "bus": "bus.baud",
+        "limits": Limits,
+        "imu": Imu,
+        "walking": Walking,
+        "feet": "feet.NAME",
+        "legs": Link,
+        "joints": Joint,
+    }
+    prefixes = {
+        "limits": "limits.",
+        "imu": "imu.",
+        "walking": "walking.",
+        "legs": "legs.NAME[i].",
+        "joints": "joints[i].",
+    }
     for key in (f.name for f in fields(Robot)):
         part = parts.get(key, key)
         names = [part] if isinstance(part, str) else [prefixes[key] + f.name for f in fields(part)]

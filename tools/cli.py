@@ -14,6 +14,7 @@ from importlib import metadata
 from types import ModuleType
 
 from servoid.tools.common import exit_codes
+from servoid.tools.common.output import say
 from servoid.tools.common.parser import Parser, suggestion
 
 
@@ -57,14 +58,7 @@ VERBS: dict[str, Verb] = {
             "diffusion": Verb("the diffusion planner-controller", "servoid.tools.learn.trainers.diffusion"),
         },
     ),
-    "evaluate": Verb(
-        "measure a policy the way that papers do",
-        verbs={
-            "papers": Verb(
-                "the tables of UniPhys and Diffuse-CLoC, with a column of one's own", "servoid.tools.evaluate.papers"
-            )
-        },
-    ),
+    "evaluate": Verb("measure a policy the way that papers do, or yours", "servoid.tools.commands.evaluate"),
     "bench": Verb(
         "measure speed and what faults do, on this machine",
         verbs={
@@ -74,6 +68,7 @@ VERBS: dict[str, Verb] = {
             "kill": Verb("what becomes of the servos when the controller is killed", "servoid.tools.faults.kill"),
             "interrupt": Verb("whether torque is off after Ctrl-C at any instant", "servoid.tools.faults.interrupt"),
             "bus": Verb("time of a control cycle on the servo bus", "servoid.tools.bench.bus"),
+            "clients": Verb("what other people's clients do, against the virtual rig", "servoid.tools.bench.clients"),
             "faults": Verb("what faults of the rig do to a walking robot", "servoid.tools.faults.campaign"),
             "soak": Verb("long walk over a line that loses packets", "servoid.tools.faults.soak"),
             "fuzz": Verb("random bytes into everything that reads bytes", "servoid.tools.faults.fuzz"),
@@ -99,8 +94,8 @@ def main(argv: list[str] | None = None) -> int:
         if debug:
             traceback.print_exc()
         for note in getattr(error, "__notes__", ()):  # a table, say: what the message is about
-            print(note, file=sys.stderr)
-        print(f"servoid: {exit_codes.explain(error)}", file=sys.stderr)
+            say(note, sys.stderr)
+        say(f"servoid: {exit_codes.explain(error)}", sys.stderr)
         return exit_codes.exit_code(error)
 
 

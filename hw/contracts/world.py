@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
@@ -110,6 +110,28 @@ class Truth(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class Start:
+    """How bodies begin an episode, a row for each: what is None is as of a robot that stands at its home pose, at rest.
+
+    A body whose height is NaN is put down: so that it touches the ground with its lowest point, however it lies, or,
+    without an `orientation`, stands flat on its first foot.
+    """
+
+    joints: Array | None = None  # (n, n_joints) rad
+    position: Array | None = None  # (n, 3) m of the base, world frame; a height of NaN: put down
+    orientation: Array | None = None  # (n, 4) unit quaternion w x y z, base in the world frame
+    heading: Array | None = None  # (n,) rad by which that is turned about the vertical
+    velocity: Array | None = None  # (n, 3) m/s of the base, world frame
+    angular_velocity: Array | None = None  # (n, 3) rad/s, base frame
+    joint_velocity: Array | None = None  # (n, n_joints) rad/s
+
+    def of(self, ids: Array) -> Start:
+        """The rows `ids` `(k,)`."""
+        values = (getattr(self, field.name) for field in fields(self))
+        return Start(*(None if value is None else value[ids] for value in values))
+
+
 class World(Protocol):
     """Many simulated bodies. An episode draws from its own random stream, so it does not depend on its neighbours."""
 
@@ -118,8 +140,8 @@ class World(Protocol):
     @property
     def truth(self) -> Truth: ...
 
-    def reset(self, ids: Array, rngs: Sequence[np.random.Generator], joints: Array | None = None) -> None:
-        """Start new episodes in the worlds `ids`, drawing their robots anew, at a pose `(len(ids), n_joints)` rad."""
+    def reset(self, ids: Array, rngs: Sequence[np.random.Generator], start: Start | None = None) -> None:
+        """Begin new episodes in the worlds `ids`, drawing their robots anew; `start` has a row for each of them."""
         ...
 
     def observe(self) -> Observation: ...

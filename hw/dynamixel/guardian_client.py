@@ -72,8 +72,9 @@ class Lifeline:
             self._process = process
             self._say(b"+" if self._on else b"-")
 
-    def close(self) -> None:
-        """End the guardian; when torque may still be on, after it has done its work."""
+    def close(self) -> bool:
+        """End the guardian; when torque may still be on, after it has done its work. Returns whether it had to, and
+        every servo has told it that its torque is off."""
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):  # nobody reads it any more
             self._process.stdin.close()
@@ -83,6 +84,7 @@ class Lifeline:
             self._process.kill()
             self._process.wait()
         self._forget()
+        return self._on and self._process.returncode == 0
 
     def _start(self) -> subprocess.Popen[bytes]:
         self._starts += 1

@@ -26,6 +26,18 @@ AWAY = 68  # ticks (6 degrees) that a joint may have moved since it was read, fo
 _GAINS = struct.Struct("<HHH")  # D, I, P in the order of their registers
 
 
+class TorqueUnproven(BackendError):
+    """Servos did not say in time that their torque is off. They may say it later, before a person reads of it."""
+
+    def __init__(self, names: str) -> None:
+        super().__init__(f"{names} did not say that torque is off: hold the robot and switch its power off")
+        self._names = names
+
+    def settle(self, how: str) -> None:
+        """They did."""
+        self.args = (f"{self._names} were late to say that torque is off: it is off now, {how}",)
+
+
 class DynamixelMotors:
     """The writing half of the backend."""
 
@@ -50,6 +62,7 @@ class DynamixelMotors:
         self._goals = SyncWriter(self._ids, self._goal.address, self._goal.width, signed=True)
         self._default_d = [servo.table.item("position_d_gain").default or 0 for servo in found]
         self._default_i = [servo.table.item("position_i_gain").default or 0 for servo in found]
+        self._unproven: list[TorqueUnproven] = []
         self._gain: Array | None = None  # P gains that were sent last
         self.on = any(servo.get("torque_enable") for servo in found)  # torque may be on
         if self.on and lifeline is not None:
@@ -86,14 +99,20 @@ class DynamixelMotors:
             self._write(self._torque.address, left, [b"\0"] * len(left))
             left = self._unconfirmed(left, b"\0")
             if not left:
-                self.on, self._gain = False, None
+                self.proven("acknowledged")
+                self._gain = None
                 self._monitor.expect(False)
                 if self._lifeline is not None:
                     self._lifeline.let_go()
                 return
-        raise BackendError(
-            f"{self._names(left)} did not say that torque is off: hold the robot and switch its power off"
-        )
+        self._unproven.append(TorqueUnproven(self._names(left)))
+        raise self._unproven[-1]
+
+    def proven(self, how: str) -> None:
+        """Every servo has said that its torque is off, and errors that were raised before must not say otherwise."""
+        self.on = False
+        while self._unproven:
+            self._unproven.pop().settle(how)
 
     def _arm(self, gain: Array, wanted: Array) -> None:
         """Torque on without a jump: goal at the present position, then gains, all checked before torque.

@@ -52,6 +52,10 @@ def _check_numbers(robot: Robot, marks: Marks) -> None:
         _require_positive(getattr(robot.limits, key), f"limits.{key}", marks)
     _require_not_negative(robot.limits.margin, "limits.margin", marks)
     _require_radians(robot.limits.tilt, "limits.tilt", marks)
+    for key in ("forward", "backward", "sideways", "turning", "height"):
+        _require_positive(getattr(robot.walking, key), f"walking.{key}", marks)
+    if robot.weight is not None:
+        _require_positive(robot.weight, "weight", marks)
     _check_derating(robot, marks)
     _check_imu(robot, marks)
 

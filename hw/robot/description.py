@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +14,9 @@ import yaml
 from servoid.hw.config import ConfigError, load_marked, resolve
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.checks import check_robot, check_servo
+from servoid.hw.robot.plausible import check_plausible
+
+_GRAVITY = 9.81  # m/s2
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,47 @@ class Imu:
     yaw_sign: float = 1.0  # of a bno08x: -1 if its yaw counts clockwise
 
 
+@dataclass(frozen=True)
+class Walking:
+    """What a controller may ask of the robot at most, and how high it walks.
+
+    What a file leaves out is NaN until `load_robot` derives it from the standing height.
+    """
+
+    forward: float = math.nan  # m/s
+    backward: float = math.nan  # m/s
+    sideways: float = math.nan  # m/s
+    turning: float = math.nan  # rad/s
+    height: float = math.nan  # m of the base above the ground while it walks
+
+    @property
+    def lower(self) -> Array:
+        """The least twist to ask for `(3,)`: m/s forward, m/s left, rad/s."""
+        return -np.array([self.backward, self.sideways, self.turning])
+
+    @property
+    def upper(self) -> Array:
+        """The greatest twist to ask for `(3,)`."""
+        return np.array([self.forward, self.sideways, self.turning])
+
+    @property
+    def scale(self) -> Array:
+        """Top speed in any direction, and of turning `(3,)`: by shares of it robots of any size are asked alike."""
+        return np.array([self.forward, self.forward, self.turning])
+
+    def derived(self, standing_height: float) -> Walking:
+        """With what is NaN derived from the standing height [m], as alike robots of any size walk alike.
+
+        Forward they reach a Froude number v^2 / (g h) of 0.1, backward and sideways 0.3 and 0.26 of that speed. They
+        turn by half a radian while they walk as far as they are tall.
+        """
+        height = standing_height if math.isnan(self.height) else self.height
+        forward = math.sqrt(0.1 * _GRAVITY * height) if math.isnan(self.forward) else self.forward
+        found = {"height": height, "forward": forward, "backward": 0.3 * forward, "sideways": 0.26 * forward}
+        found["turning"] = 0.5 * forward / height
+        return replace(self, **{key: value for key, value in found.items() if math.isnan(getattr(self, key))})
+
+
 Button = Literal["mode", "start", "user"]
 
 
@@ -146,6 +191,8 @@ class Robot:
     feet: dict[str, Foot]
     legs: dict[str, tuple[Link, ...]]
     joints: tuple[Joint, ...]
+    walking: Walking = Walking()
+    weight: float | None = None  # N; None: the file does not say it
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -203,8 +250,9 @@ def load_robot(name: str | Path = "op3") -> Robot:
         replace(joint, servo=str(folder / joint.servo)) if joint.servo.endswith((".yaml", ".yml")) else joint
         for joint in robot.joints
     )
-    robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints)
-    _ = robot.servos  # a servo's file that cannot be used is found now, not when the robot stands
+    walking = robot.walking.derived(robot.standing_height)
+    robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints, walking=walking)
+    check_plausible(robot, marks)  # loads the servos' files: one that cannot be used is found now
     return robot
 
 

@@ -40,7 +40,7 @@ def draw_levels(
 
 
 def rising_levels(config: DenoiserConfig, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Levels that rise along the frames of a window: from a gentle slope (gradual, rolling) to a step (autoregressive).
+    """Levels that rise along the frames of a window: from a gentle slope (pyramid, rolling) to a step (autoregressive).
 
     In half of the windows actions are ahead of the states of their frame, or behind them, by some levels: when rolling,
     or with a lead, they are not denoised together.

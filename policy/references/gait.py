@@ -73,6 +73,7 @@ class Gait(Reference):
         self.lower = -np.array([settings.max_backward, *settings.max_velocity[1:]])
         self._slew = np.array(settings.acceleration) * robot.dt
         self._phase_step = robot.dt / settings.cycle
+        self.cycle_ticks = round(settings.cycle / robot.dt)
         self.phase = np.zeros(shape)
         self.velocity = np.zeros((*shape, 3))
         self.target = np.zeros((*shape, 3))

@@ -23,7 +23,7 @@ class TrackerObservation:
     """Builds observations `(..., size)` float32; keeps the short history. `shape` are the leading dimensions."""
 
     def __init__(self, robot: Robot, shape: tuple[int, ...] = ()) -> None:
-        self._home = robot.home
+        self._home, self._walking = robot.home, robot.walking
         n, feet = len(robot.joints), len(robot.feet)
         self._past = np.zeros((*shape, _HISTORY, n + 3))
         self._before = np.zeros((*shape, _COMMANDS, n))  # newest first
@@ -49,13 +49,14 @@ class TrackerObservation:
             self._past = np.where(self._fresh[..., None, None], row[..., None, :], self._past)
             self._before = np.where(self._fresh[..., None, None], applied[..., None, :], self._before)
             self._fresh = np.zeros_like(self._fresh)
-        lead = state.yaw.shape
+        lead, m = state.yaw.shape, self._walking
+        rise = 2.5 / m.height  # heights are seen from that of walking, speeds as shares of the fastest
         observation = np.concatenate(
             [
                 state.gravity,
                 0.25 * state.angular_velocity,
-                2.0 * state.velocity[..., :2],
-                10.0 * (state.displacement[..., 2:] - 0.25),
+                state.velocity[..., :2] / m.forward,
+                rise * (state.displacement[..., 2:] - m.height),
                 state.contact,
                 joints,
                 0.1 * state.joint_velocity,
@@ -63,9 +64,9 @@ class TrackerObservation:
                 (self._before - self._home).reshape(*lead, -1),
                 self._past.reshape(*lead, -1),
                 (frames.position - self._home).reshape(*lead, -1),
-                2.0 * frames.velocity.reshape(*lead, -1),
+                frames.velocity.reshape(*lead, -1) / m.forward,
                 frames.yaw_rate,
-                10.0 * (frames.height - 0.25),
+                rise * (frames.height - m.height),
                 frames.contact.reshape(*lead, -1),
             ],
             -1,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Walking
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,29 +35,36 @@ class Step:
     reference_joints: Array  # (n, n_joints)
     reference_contact: Array  # (n, n_feet)
     fallen: Array  # (n,)
+    walking: Walking  # of the robot: what is far, fast and high depends on its size
+    weight: float  # N
 
 
 def _kernel(squared: Array, width: float) -> Array:
     return np.exp(-squared / width**2)
 
 
+def _carries(s: Step) -> Array:
+    """Whether a foot bears more than a thirtieth of the weight `(n, n_feet)`."""
+    return s.foot_force > s.weight / 30.0
+
+
 def velocity(s: Step) -> Array:
     """Planar velocity near the reference's: a wide kernel to find it and a narrow one to hold it."""
     error = ((s.velocity - s.reference_velocity) ** 2).sum(-1)
-    return 0.5 * _kernel(error, 0.15) + 0.5 * _kernel(error, 0.05)
+    return 0.5 * _kernel(error, 0.3 * s.walking.forward) + 0.5 * _kernel(error, 0.1 * s.walking.forward)
 
 
 def progress(s: Step) -> Array:
     """Share of the reference's speed that is reached along its direction: it pulls where `velocity` is flat."""
     squared = (s.reference_velocity**2).sum(-1)
     along = (s.velocity * s.reference_velocity).sum(-1) / np.maximum(squared, 1e-6)
-    return np.where(squared > 0.03**2, np.clip(along, 0.0, 1.0), 1.0)
+    return np.where(squared > (0.06 * s.walking.forward) ** 2, np.clip(along, 0.0, 1.0), 1.0)
 
 
 def yaw_rate(s: Step) -> Array:
     """Yaw rate near the reference's."""
     error = (s.yaw_rate - s.reference_yaw_rate) ** 2
-    return 0.5 * _kernel(error, 0.6) + 0.5 * _kernel(error, 0.2)
+    return 0.5 * _kernel(error, 0.6 * s.walking.turning) + 0.5 * _kernel(error, 0.2 * s.walking.turning)
 
 
 def pose(s: Step) -> Array:
@@ -66,13 +74,13 @@ def pose(s: Step) -> Array:
 
 def contact(s: Step) -> Array:
     """Share of feet that carry, or do not, as the reference plans."""
-    return ((s.foot_force > 1.0) == (s.reference_contact > 0.5)).mean(-1)
+    return (_carries(s) == (s.reference_contact > 0.5)).mean(-1)
 
 
 def clearance(s: Step) -> Array:
-    """How far swinging feet are lifted, up to 2 cm."""
+    """How far swinging feet are lifted, up to 8 % of the base's height."""
     swing = s.reference_contact < 0.5
-    return (np.clip(s.foot_height / 0.02, 0.0, 1.0) * swing).sum(-1)
+    return (np.clip(s.foot_height / (0.08 * s.walking.height), 0.0, 1.0) * swing).sum(-1)
 
 
 def upright(s: Step) -> Array:
@@ -92,7 +100,7 @@ def sway_rate(s: Step) -> Array:
 
 def slip(s: Step) -> Array:
     """Squared speed of feet that carry [m2/s2]."""
-    return ((s.foot_velocity[..., :2] ** 2).sum(-1) * (s.foot_force > 1.0)).sum(-1)
+    return ((s.foot_velocity[..., :2] ** 2).sum(-1) * _carries(s)).sum(-1)
 
 
 def level_feet(s: Step) -> Array:
@@ -102,7 +110,7 @@ def level_feet(s: Step) -> Array:
 
 def impact(s: Step) -> Array:
     """Force of a foot beyond twice the robot's weight, in units of that [1]."""
-    return np.clip(s.foot_force / 60.0 - 1.0, 0.0, 2.0).sum(-1)
+    return np.clip(s.foot_force / (2.0 * s.weight) - 1.0, 0.0, 2.0).sum(-1)
 
 
 def target_rate(s: Step) -> Array:

@@ -26,16 +26,28 @@ class FactoryState:
     """`fresh` servos are as the factory sends them (ID 1, 57600 bit/s); those not in `only`, if given, are unplugged.
 
     With `assembly` "random" zeros and directions are not those of the robot's file: calibration has to find them.
+    Without a `board` the servos are on an adapter such as a U2D2 and always have power; with one they have it when the
+    board is told to give it, or are `powered` already. `baud` [bit/s] is another than the file's.
     """
 
     fresh: tuple[str, ...] = ()
     only: tuple[str, ...] = ()
     assembly: Assembly = "file"
+    board: bool = True
+    powered: bool = False
+    baud: int | None = None
+
+    def bus_baud(self, robot: Robot) -> int:
+        """What servos that were set up, and the board, listen at [bit/s]."""
+        return robot.bus.baud if self.baud is None else self.baud
 
     def arguments(self) -> list[str]:
         """The same on a command line."""
         named = [(option, name) for option, names in (("--fresh", self.fresh), ("--only", self.only)) for name in names]
-        return [word for pair in named for word in pair] + ["--assembly", self.assembly]
+        words = [word for pair in named for word in pair] + ["--assembly", self.assembly]
+        words += [] if self.board else ["--no-board"]
+        words += ["--powered"] if self.powered else []
+        return words if self.baud is None else [*words, "--baud", str(self.baud)]
 
     def check(self, robot: Robot) -> None:
         """Raise ConfigError for a joint that the robot has not, and for a baud or ticks that its servos have not."""
@@ -44,9 +56,10 @@ class FactoryState:
                 raise ConfigError(f"{robot.name} has no joint '{name}'; {nearest(name, robot.names)}")
         for servo in robot.servos:
             items = table(servo.model_number)
-            if robot.bus.baud not in items.bauds:
-                known = ", ".join(map(str, items.bauds))
-                raise ConfigError(f"{robot.name}: bus.baud: servos have no {robot.bus.baud} bit/s; they have {known}")
+            for what, baud in ((f"{robot.name}: bus.baud", robot.bus.baud), ("--baud", self.bus_baud(robot))):
+                if baud not in items.bauds:
+                    known = ", ".join(map(str, items.bauds))
+                    raise ConfigError(f"{what}: servos have no {baud} bit/s; they have {known}")
             turn = ticks_per_turn(items)
             if (servo.ticks_per_turn, servo.center_tick) != (turn, turn // 2):
                 raise ConfigError(
@@ -79,7 +92,7 @@ class FactoryState:
                 continue
             set_up = {
                 "id": joint.id,
-                "baud_rate": table(servo.model_number).bauds.index(robot.bus.baud),
+                "baud_rate": table(servo.model_number).bauds.index(self.bus_baud(robot)),
                 "return_delay_time": 0,
             }
             if self.assembly == "file":
@@ -112,3 +125,16 @@ def add_factory_state_arguments(parser: argparse.ArgumentParser) -> None:
         default="file",
         help="zeros and directions: as in the robot's file (default), or others that calibration has to find",
     )
+    parser.add_argument(
+        "--no-board",
+        action="store_false",
+        dest="board",
+        help="servos alone, always powered, as on a U2D2 with a supply of their own",
+    )
+    parser.add_argument("--powered", action="store_true", help="the board gives the servos power from the start")
+    parser.add_argument("--baud", type=int, metavar="BPS", help="of servos and board (default: as in the robot's file)")
+
+
+def factory_state_of(args: argparse.Namespace) -> FactoryState:
+    """What those arguments say."""
+    return FactoryState(tuple(args.fresh), tuple(args.only), args.assembly, args.board, args.powered, args.baud)

@@ -57,9 +57,9 @@ EXPECTED: dict[str, Outcome] = {
     **dict.fromkeys(("vanish", "vanish_in_read", "stall", "brown_out"), Outcome.FATAL),
 }
 NEEDS_SERVO = (*ALERTS, "reboot", "torque_off", "id_conflict", "dead", "baud_mismatch", "watchdog", "heat")
-# s of lateness, V at the servos, s of the step, s of the adapter's batch, error number, bits of the buttons, C
+# s of lateness, s of the step, s of the adapter's batch, error number, bits of the buttons, C
 _VALUES = {
-    "late": 0.003, "brown_out": 5.5, "clock_step": 0.5, "batching": 0.016, "error_status": 1.0, "button": 1.0,
+    "late": 0.003, "clock_step": 0.5, "batching": 0.016, "error_status": 1.0, "button": 1.0,
     "heat": 72.0,
 }  # fmt: skip
 

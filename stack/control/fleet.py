@@ -1,6 +1,7 @@
 """Many robots under the loop's own chain: simulated sensors, the estimator, and the run-time limits.
 
-Training, collection and the survival checks all drive a Fleet, so that what learns sees what runs.
+Training, collection and the survival checks all drive a Fleet, so that what learns sees what runs; what drives it are
+the policies that a run has, of shape `(n,)`.
 """
 
 from __future__ import annotations
@@ -8,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from servoid.hw.contracts.body import Array, Command, Mode
-from servoid.hw.contracts.control import State
+from servoid.hw.contracts.control import Instruction, Policy, State
+from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import Robot
 from servoid.policy.mlp import Mlp
 from servoid.sim.truth import Truth
@@ -43,7 +45,8 @@ class Fleet:
         self.estimator = Estimator(robot, odometry, (n,))
         self.applied = np.tile(robot.home, (n, 1))
         self.rngs = [np.random.default_rng(0)] * n
-        self._episodes = np.zeros(n, int)
+        self._episodes = np.zeros(n, int)  # begun
+        self._seed = seed
         self._ones = np.ones((n, len(robot.joints)))
         self.state: State
 
@@ -52,8 +55,13 @@ class Fleet:
         """The worlds' truth, for rewards and evaluation."""
         return self.worlds.truth
 
-    def reset(self, where: Array, joints: Array | None = None) -> None:
-        """Start new episodes in the worlds `where` `(n,)` bool, at pose `joints` `(n, n_joints)` (default: home).
+    @property
+    def seeds(self) -> Array:
+        """A seed `(n,)` for who drives each world in its present episode."""
+        return self._seed + np.arange(self.n) + self.n * np.maximum(self._episodes - 1, 0)
+
+    def reset(self, where: Array, start: Start | None = None) -> None:
+        """Begin new episodes in the worlds `where` `(n,)` bool; `start` has a row for every world.
 
         Call `observe` afterwards: a reset changes what the sensors say.
         """
@@ -63,14 +71,14 @@ class Fleet:
         for i in ids:
             self.rngs[i] = np.random.default_rng([*self._stream, int(i), int(self._episodes[i])])
             self._episodes[i] += 1
-        pose = np.tile(self.robot.home, (len(ids), 1)) if joints is None else joints[ids]
-        self.worlds.reset(ids, [self.rngs[i] for i in ids], pose)
+        start = Start() if start is None else start.of(ids)
+        self.worlds.reset(ids, [self.rngs[i] for i in ids], start)
         bias = np.zeros((self.n, 3))
         for i in ids:
             bias[i] = self.worlds.bodies[i].gyro_bias + self.rngs[i].normal(0.0, _BIAS_LEFT, 3)  # type: ignore[union-attr]
         self.estimator.reset(where, bias)
         self.applied = self.applied.copy()  # `step` gave the old array away as a label
-        self.applied[ids] = pose
+        self.applied[ids] = self.robot.home if start.joints is None else start.joints
 
     def observe(self) -> State:
         """Read the sensors and estimate."""
@@ -86,3 +94,7 @@ class Fleet:
         self.applied = clean if noise is None else limit(clean + noise, self.applied, self.robot)
         self.worlds.step(Command(self.applied, self._ones, Mode.ACTIVE))
         return clean
+
+    def drive(self, policy: Policy, command: Array, noise: Array | None = None) -> Array:
+        """Observe, and do for a tick what `policy`, of shape `(n,)`, decides under velocities `(n, 3)`; see `step`."""
+        return self.step(policy.act(self.observe(), self.applied, Instruction(command)), noise)

@@ -116,8 +116,12 @@ class Keyboard:
 
     def read(self) -> Wish:
         while select.select([self._fd], [], [], 0.0)[0]:
-            pressed = os.read(self._fd, 64).decode("ascii", "ignore")
-            if not pressed:
+            try:
+                pressed = os.read(self._fd, 64).decode("ascii", "ignore")
+            except OSError:  # a terminal that was closed
+                pressed = ""
+            if not pressed:  # nobody steers any more
+                self._way, self._ends = np.zeros(3), True
                 break
             self._press(pressed)
         return Wish(self._way.copy(), self._ends)

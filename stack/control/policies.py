@@ -36,14 +36,14 @@ def _planner(source: str) -> DiffusionSettings:
 def _expert(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     from servoid.stack.control.tracker import ExpertPolicy
 
-    policy: Policy = ExpertPolicy(robot, task=task, realtime=realtime, checkpoint=source)
+    policy: Policy = ExpertPolicy(robot, source)
     return policy
 
 
 def _gait(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     from servoid.stack.control.gait import GaitPolicy
 
-    policy: Policy = GaitPolicy(robot, task=task, realtime=realtime)
+    policy: Policy = GaitPolicy(robot)
     return policy
 
 

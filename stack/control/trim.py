@@ -12,8 +12,8 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
+from servoid.policy.references.gait import load_gait
 
-_CYCLE = 24  # ticks of a gait cycle: within one, every walk sways
 _JUMP = np.array([0.05, 0.05, 0.2])  # m/s, m/s, rad/s: a larger change of what is asked begins anew
 _LIMIT = np.array([0.08, 0.06, 0.3])  # of the correction
 
@@ -24,7 +24,8 @@ class Trim:
     def __init__(self, dt: float, rate: float, shape: tuple[int, ...] = ()) -> None:
         """`rate` [1/s] is the share of the difference that is added a second; 0 turns the correction off."""
         self._step = rate * dt
-        self._differences: deque[Array] = deque(maxlen=_CYCLE)
+        self._cycle = round(load_gait().cycle / dt)  # ticks: within a cycle, every walk sways
+        self._differences: deque[Array] = deque(maxlen=self._cycle)
         self._asked = np.zeros((*shape, 3))
         self._since = np.zeros(shape, int)  # ticks
         self._correction = np.zeros((*shape, 3))
@@ -42,7 +43,7 @@ class Trim:
         begun = np.any(np.abs(asked - self._asked) > _JUMP, axis=-1)
         self._differences.append(asked - measured)
         self._asked, self._since = asked, np.where(begun, 0, self._since + 1)
-        step = np.where(self._since >= _CYCLE, self._step, 0.0)[..., None]
+        step = np.where(self._since >= self._cycle, self._step, 0.0)[..., None]
         correction = self._correction + step * np.mean(self._differences, axis=0)
         correction = np.where(begun[..., None], 0.0, np.clip(correction, -_LIMIT, _LIMIT))
         moving = (asked != 0.0).any(-1, keepdims=True)

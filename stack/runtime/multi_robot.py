@@ -64,7 +64,7 @@ class Others:
         for number, (task, other) in enumerate(zip(tasks, body.simulation.teammates, strict=True), 1):
             policy = make(task)
             self._open.callback(policy.close)
-            policy.reset(int(np.random.SeedSequence([seed, number]).generate_state(1)[0]))
+            policy.reset(None, np.random.SeedSequence([seed, number]).generate_state(1)[0])
             sensors, motors = other.connect()
             self._open.callback(other.close)
             guard = Guard(robot, motors, gain)

@@ -154,7 +154,7 @@ def run(
         push = None if body.simulation is None else body.simulation.push
         if push is None and task.pushes:
             raise ConfigError(f"backend '{body.name}' cannot push the robot: drop the task's push setting")
-        pilot.reset(settings.seed)
+        pilot.reset(None, np.array(settings.seed))
         sensors, motors = body.connect()
         if not (simulated or settings.start) and confirm is not None:
             known = f"{assembly}. " if assembly is not None else ""

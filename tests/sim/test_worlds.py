@@ -13,6 +13,7 @@ import yaml
 import servoid.sim.worlds
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Command, Mode, Observation
+from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.sim.model import TIMESTEP, build
 from servoid.sim.randomise import (
@@ -44,7 +45,7 @@ def make(monkeypatch: pytest.MonkeyPatch, n: int = 1, robot: Any = ROBOT, **chan
 
 def started(worlds: Worlds, seeds: Any = None, joints: Any = None) -> Worlds:
     seeds = range(worlds.n) if seeds is None else seeds
-    worlds.reset(np.arange(worlds.n), [np.random.default_rng([9, seed]) for seed in seeds], joints)
+    worlds.reset(np.arange(worlds.n), [np.random.default_rng([9, seed]) for seed in seeds], Start(joints=joints))
     return worlds
 
 
@@ -215,7 +216,8 @@ def with_servos(folder: Path, **changes: Any) -> Robot:
     """The robot with servos of the user's own."""
     robot = Path(ROBOT.mjcf).with_suffix(".yaml").read_text().replace("mjcf: op3.xml", f"mjcf: {ROBOT.mjcf}")
     (folder / "servo.yaml").write_text(yaml.safe_dump(asdict(replace(ROBOT.servos[0], **changes))))
-    (folder / "own.yaml").write_text(robot.replace("xm430-w350", "servo.yaml"))
+    limits = [line for line in robot.splitlines(True) if "voltage: 10" not in line]  # of a supply of its own
+    (folder / "own.yaml").write_text("".join(limits).replace("xm430-w350", "servo.yaml"))
     return load_robot(folder / "own.yaml")
 
 

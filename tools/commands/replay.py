@@ -100,11 +100,15 @@ def changes(log: FlightLog) -> list[str]:
     """What is not as it was when the log was written: robot, policy, task, packages, source; as far as the log says."""
     from servoid.hw.robot.description import load_robot
     from servoid.policy.checkpoint import git_commit
+    from servoid.policy.diffusion.settings import with_new_names
     from servoid.stack.control.policies import policy_fingerprint
     from servoid.stack.log.provenance import fingerprint, versions
 
     settings = _settings(log)
-    policy, header = policy_fingerprint(settings.policy), {**log.header, **_part("policy", log.header["policy"])}
+    policy, recorded = policy_fingerprint(settings.policy), dict(log.header["policy"])
+    if recorded.get("planner"):
+        recorded["planner"] = with_new_names(recorded["planner"])
+    header = {**log.header, **_part("policy", recorded)}
     now = fingerprint(load_robot(settings.robot)) | _part("policy", policy)
     now |= _task(settings) | {"versions": versions(), "git_commit": git_commit()}
     names = {

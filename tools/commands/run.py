@@ -96,6 +96,7 @@ def main(args: argparse.Namespace) -> int:
             result = run(plan, on_tick=live, confirm=partial(confirm, remedy="give --start to let the robot move"))
         finally:
             live.close()
+            _tell_lateness(report, args.port)
         files: dict[str, Any] = {"log": result.log}
         _summarise(report, result)
         if args.video is not None and result.log is not None:
@@ -106,6 +107,22 @@ def main(args: argparse.Namespace) -> int:
         chosen = {name: getattr(args, name) for name in ("task", "policy", "backend", "robot", "seed")}
         report.result(chosen | {"randomised": args.randomise} | result.summary() | files)
     return EXIT_CODES[result.outcome]
+
+
+def _tell_lateness(report: Report, port: str | None) -> None:
+    """Of a virtual rig in real time: what it kept waiting is not the cable's fault."""
+    if port is not None and Path(port + ".control").is_socket():  # where `servoid virtual --link` puts it
+        from servoid.hw.contracts.body import BackendError
+        from servoid.sim.rig.process.control import Control
+
+        try:
+            control = Control(port + ".control")
+            text = control.lateness()
+            control.close()
+        except BackendError as error:
+            text = str(error)
+        if text is not None:
+            report.line(text)
 
 
 def positive(text: str) -> float:

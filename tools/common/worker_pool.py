@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 Job = TypeVar("Job")
 Answer = TypeVar("Answer")
@@ -18,7 +20,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Worker:
-    """A process that does one job after the other. What is sent on `pipe` is a job, and then there is an answer."""
+    """A process that does one job after the other. `pipe` is ready when there is an answer."""
 
     def __init__(self, work: Callable[[Any], Any]) -> None:
         """`work` must be picklable."""
@@ -30,6 +32,11 @@ class Worker:
         with _one_thread():
             self._process.start()
         theirs.close()
+
+    def give(self, job: Any) -> None:
+        """Send a job. To a process that has died meanwhile it is not: `answer` says so."""
+        with suppress(OSError):
+            self.pipe.send(job)
 
     def answer(self) -> Any:
         """Wait for the answer. Raises what the work raised, and RuntimeError when the process died."""
@@ -52,6 +59,15 @@ class Worker:
         self.pipe.close()
 
 
+@dataclass(frozen=True)
+class Lost:
+    """A job without an answer, and why."""
+
+    how: Literal["hung", "died"]
+    text: str
+    error: Exception = field(compare=False)
+
+
 def each(
     work: Callable[[Job], Answer], jobs: Iterable[Job], workers: int, deadline: float | None = None
 ) -> Iterator[Answer]:
@@ -62,7 +78,10 @@ def each(
     process, a job that runs is finished. Raises what `work` raises, and RuntimeError when a process dies.
     """
     if workers > 1:
-        yield from _spread(work, iter(jobs), workers, deadline)
+        for _, answer in _spread(work, iter(jobs), workers, math.inf if deadline is None else deadline):
+            if isinstance(answer, Lost):
+                raise answer.error
+            yield answer
         return
     for job in jobs:
         if deadline is not None and time.monotonic() >= deadline:
@@ -70,35 +89,70 @@ def each(
         yield work(job)
 
 
+def each_or_lost(
+    work: Callable[[Job], Answer], jobs: Iterable[Job], workers: int, seconds: float, start_seconds: float = 60.0
+) -> Iterator[tuple[Job, Answer | Lost]]:
+    """Every job with its answer, as they come, for jobs that may hang or kill their process: never in this one.
+
+    Lost is the answer of one that did not end within `seconds`, that raised, or whose process died; the others are
+    done. `work` must be picklable. A process's first job may take `start_seconds` more.
+    """
+    return _spread(work, iter(jobs), workers, seconds=seconds, start_seconds=start_seconds)
+
+
 def _spread(
-    work: Callable[[Job], Answer], jobs: Iterator[Job], workers: int, deadline: float | None
-) -> Iterator[Answer]:
+    work: Callable[[Job], Answer],
+    jobs: Iterator[Job],
+    workers: int,
+    deadline: float = math.inf,
+    seconds: float = math.inf,
+    start_seconds: float = 0.0,
+) -> Iterator[tuple[Job, Answer | Lost]]:
+    """`deadline` is that of all, `seconds` are for each job."""
     from multiprocessing.connection import wait
 
-    free: list[Worker] = []
-    busy: dict[Any, Worker] = {}  # by their pipes
+    idle: list[Worker] = []
+    busy: dict[Connection, tuple[Worker, Job, float]] = {}  # by their pipes: the job, and when it hangs
     try:
         while True:
-            while len(busy) < workers:
+            while len(busy) < workers and time.monotonic() < deadline:
                 try:
                     job = next(jobs)
                 except StopIteration:
                     break
-                worker = free.pop() if free else Worker(work)
-                busy[worker.pipe] = worker
-                worker.pipe.send(job)
+                worker, patience = (idle.pop(), seconds) if idle else (Worker(work), seconds + start_seconds)
+                busy[worker.pipe] = worker, job, time.monotonic() + patience
+                worker.give(job)
             if not busy:
                 return
-            ready = wait(list(busy), None if deadline is None else max(deadline - time.monotonic(), 0.0))
-            if not ready:
+            until = min(deadline, *(hangs for _, _, hangs in busy.values()))
+            ready = wait(list(busy), None if until == math.inf else max(until - time.monotonic(), 0.0))
+            if not ready and time.monotonic() >= deadline:
                 return
-            for pipe in ready:
-                answer = busy[pipe].answer()
-                free.append(busy.pop(pipe))
-                yield answer
+            for pipe, (worker, job, hangs) in list(busy.items()):
+                if pipe in ready:
+                    answer = _answer(worker)
+                elif time.monotonic() >= hangs:
+                    text = f"did not end within {seconds:g} s"
+                    answer = Lost("hung", text, TimeoutError(text))
+                else:
+                    continue
+                del busy[pipe]
+                if isinstance(answer, Lost):
+                    worker.kill()  # and another takes its place: what it holds may be half changed
+                else:
+                    idle.append(worker)
+                yield job, answer
     finally:
-        for worker in (*free, *busy.values()):
+        for worker in (*idle, *(worker for worker, _, _ in busy.values())):
             worker.kill()
+
+
+def _answer(worker: Worker) -> Any:
+    try:
+        return worker.answer()
+    except Exception as error:
+        return Lost("died", f"{type(error).__name__}: {error}", error)
 
 
 def _serve(pipe: Connection, work: Callable[[Any], Any]) -> None:

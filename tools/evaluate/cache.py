@@ -12,27 +12,28 @@ from servoid.hw.config import ConfigError
 from servoid.tools.common.output import to_json
 
 
-def key(spec: Mapping[str, Any]) -> str:
-    """A name for everything that the episodes of a run depend on."""
-    return hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()[:20]
+def key(dependencies: Mapping[str, Any]) -> str:
+    """A name for everything that episodes depend on."""
+    return hashlib.sha256(json.dumps(dependencies, sort_keys=True).encode()).hexdigest()[:20]
 
 
 class EpisodeCache:
-    """Records of episodes of one run, one JSON line each, in `folder/KEY.jsonl`; its first line is the spec.
+    """Records of an experiment's episodes, one JSON line each, in `folder/KEY.jsonl`. Its first line is what they
+    depend on.
 
     A line that a killed program left half written is dropped.
     """
 
-    def __init__(self, folder: Path, spec: Mapping[str, Any], fresh: bool = False) -> None:
+    def __init__(self, folder: Path, dependencies: Mapping[str, Any], fresh: bool = False) -> None:
         """`fresh` forgets what is there. Raises ConfigError where the folder cannot be written."""
-        self.path = folder / f"{key(spec)}.jsonl"
+        self.path = folder / f"{key(dependencies)}.jsonl"
         self.records: dict[int, dict[str, Any]] = {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
             text = "" if fresh or not self.path.exists() else self.path.read_text(encoding="utf-8")
             whole = text[: text.rfind("\n") + 1]
             if not whole:
-                whole = to_json(dict(spec)) + "\n"
+                whole = to_json(dict(dependencies)) + "\n"
             if whole != text:
                 self.path.write_text(whole, encoding="utf-8")
         except OSError as error:

@@ -51,6 +51,8 @@ def record_clips(folder: Path, robot: str, number: int) -> list[Path]:
             place.mkdir(parents=True, exist_ok=True)
             part.unlink(missing_ok=True)
             result = run(RunSettings("walk", policy="expert", robot=robot, seconds=SECONDS, seed=seed, record=part))
+            if result.interrupted:  # a Ctrl-C that the run took for itself
+                raise KeyboardInterrupt
             if result.outcome not in ("succeeded", "timed_out"):
                 part.unlink()
                 fallen.touch()

@@ -25,7 +25,10 @@ def code() -> str:
 
 
 def digest(root: Path) -> str:
-    """Hash of the names and bytes of the Python files of the packages, all of configs/, and what judges a run."""
+    """Hash of the names and bytes of the packages' Python files, of configs/, and of what judges a run.
+
+    Evaluations are left out: of what they say, episodes depend on their experiments alone, which are hashed apart.
+    """
     total = hashlib.sha256()
     for path in sorted(_files(root)):
         content = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -39,19 +42,15 @@ def read_anew(robot: str) -> tuple[Any, ...]:
     Nothing is cached. Code is among it because workers and virtual rigs import what they need when they need it. Raises
     ConfigError where the robot's file is no good.
     """
-    from servoid.hw.config import CONFIGS
     from servoid.hw.robot.description import load_robot
-    from servoid.stack.log.provenance import fingerprint, sha256
+    from servoid.stack.log.provenance import fingerprint
 
-    return digest(ROOT), [(str(path), sha256(path)) for path in _settings(CONFIGS)], fingerprint(load_robot(robot))
-
-
-def _settings(folder: Path) -> Iterator[Path]:
-    yield from (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return digest(ROOT), fingerprint(load_robot(robot))
 
 
 def _files(root: Path) -> Iterator[Path]:
     for package in PACKAGES:
         yield from (root / package).rglob("*.py")
-    yield from _settings(root / "configs")
+    configs = root / "configs"
+    yield from (path for path in configs.rglob("*") if path.is_file() and configs / "evaluation" not in path.parents)
     yield from (root / name for name in JUDGES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 import traceback
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -21,21 +22,22 @@ _STREAM = 20_250_417  # any number but 0: the episodes are not those of `servoid
 
 
 @dataclass(frozen=True)
-class Job:
-    """An episode to be done, by the numbers of its run and of itself."""
+class EpisodeJob:
+    """An episode to be done, by the numbers of its experiment and of itself."""
 
-    run: int
+    experiment: int
     episode: int
     settings: RunSettings
 
 
 @dataclass(frozen=True)
-class Done:
-    """An episode's record, or why the run cannot be done."""
+class EpisodeResult:
+    """An episode's record, or why the experiment cannot be done."""
 
-    job: Job
+    job: EpisodeJob
     record: dict[str, Any]
     refused: str | None = None
+    wall_seconds: float = 0.0
 
 
 def episode_seed(seed: int, episode: int) -> int:
@@ -43,14 +45,15 @@ def episode_seed(seed: int, episode: int) -> int:
     return int(np.random.SeedSequence([seed, episode, _STREAM]).generate_state(1)[0])
 
 
-def do(job: Job) -> Done:
-    """Do an episode. A run that cannot be done, for whatever reason, is an answer too: the other rows go on."""
+def do_episode(job: EpisodeJob) -> EpisodeResult:
+    """Do an episode. One that cannot be done, for whatever reason, is an answer too: the other rows go on."""
+    begun = time.monotonic()
     try:
-        return Done(job, record(job.settings))
+        return EpisodeResult(job, record(job.settings), wall_seconds=time.monotonic() - begun)
     except Exception as error:
         if os.environ.get("SERVOID_DEBUG") == "1":
             traceback.print_exc()
-        return Done(job, {}, explain(error))
+        return EpisodeResult(job, {}, explain(error))
 
 
 def record(settings: RunSettings) -> dict[str, Any]:

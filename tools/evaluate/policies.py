@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -15,12 +16,11 @@ import yaml
 from servoid.hw.config import ConfigError
 from servoid.tools.evaluate.cache import key
 from servoid.tools.evaluate.code_hash import code
-from servoid.tools.evaluate.spec import Network, Run
+from servoid.tools.evaluate.spec import Experiment, OwnNetwork
 
 if TYPE_CHECKING:
     from servoid.policy.diffusion.settings import DiffusionSettings
 
-EXPERT = "expert"
 _DATA = "runs/walks"  # the dataset that the README shows how to record
 _LAST = "last.safetensors"  # the newest network of a training run, beside its best
 _WHATEVER = (
@@ -32,8 +32,8 @@ _WHATEVER = (
 )  # of training: what does not make another kind of network
 
 
-class Pilots:
-    """Makes the policies that runs name. Settings of the planner become files in `folder`/policies, as they are now."""
+class Policies:
+    """Makes the policies of experiments. Settings of the planner become files in `folder`/policies, as they are now."""
 
     def __init__(self, policy: str, folder: Path) -> None:
         """`policy` is the evaluated one, named as in `servoid run`. Raises ConfigError for an unknown one."""
@@ -43,18 +43,22 @@ class Pilots:
         self._policy, self._folder = policy, folder
         self._settings = _diffusion_settings(policy)
 
-    def network(self, run: Run) -> Path | None:
-        """Where the network of its own that a run needs is looked for."""
-        return None if run.network is None else self._folder / "networks" / run.network.name / "best.safetensors"
+    def network(self, experiment: Experiment) -> Path | None:
+        """Where the network of its own that an experiment needs is looked for."""
+        return (
+            None
+            if experiment.network is None
+            else self._folder / "networks" / experiment.network.name / "best.safetensors"
+        )
 
-    def training(self, run: Run) -> str | None:
-        """How the network that a run lacks is trained; None where nothing is lacking. Raises ConfigError."""
-        path = self.network(run)
-        if run.network is None or path is None or path.is_file():
+    def training(self, experiment: Experiment) -> str | None:
+        """How the network that an experiment lacks is trained; None where nothing is lacking. Raises ConfigError."""
+        path = self.network(experiment)
+        if experiment.network is None or path is None or path.is_file():
             return None
-        return self._command(run.network, path)
+        return self._command(experiment.network, path)
 
-    def _command(self, network: Network, path: Path) -> str:
+    def _command(self, network: OwnNetwork, path: Path) -> str:
         """What trains a network and, before it, its latents; given again, it goes on with what was begun."""
         options, before = network.train + _anew(path), ""
         if network.latents:
@@ -64,13 +68,14 @@ class Pilots:
                 before = f"`servoid train latent --data {_DATA} --out {latents.parent}{_anew(latents)}`, then "
         return f"{before}`servoid train diffusion --data {_DATA} --out {path.parent} {options}`"
 
-    def name(self, run: Run) -> str:
-        """The policy of a run, as `servoid run --policy` takes it. Raises ConfigError for settings that do not fit."""
-        settings = self.settings(run)
+    def name(self, experiment: Experiment) -> str:
+        """An experiment's policy, as `servoid run --policy` takes it. Raises ConfigError where settings do not fit."""
+        settings = self.settings(experiment)
         if settings is None:
-            return EXPERT if run.policy == EXPERT else self._policy
+            return experiment.policy or self._policy
         values = asdict(settings)
-        path = self._folder / "policies" / f"{run.task}-{key(values)}.yaml"
+        task = re.sub(r"\W+", "-", experiment.task)  # which may be a class in a file
+        path = self._folder / "policies" / f"{task}-{key(values)}.yaml"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
@@ -80,24 +85,25 @@ class Pilots:
             ) from None
         return str(path)
 
-    def settings(self, run: Run) -> DiffusionSettings | None:
-        """Settings of the planner of a run; None for another policy. Raises ConfigError for a variant of that."""
+    def settings(self, experiment: Experiment) -> DiffusionSettings | None:
+        """Settings of an experiment's planner; None for another policy. Raises ConfigError for a variant of that."""
         from servoid.hw.overrides import override
 
-        if run.policy == EXPERT:
+        own = experiment.policy
+        base, path = self._settings if own is None else _diffusion_settings(own), self.network(experiment)
+        if base is None:
+            if experiment.plan or experiment.network is not None:
+                raise ConfigError(
+                    f"policy '{own or self._policy}' has no such settings: this row is for diffusion models"
+                )
             return None
-        if self._settings is None:
-            if run.plan or run.network is not None:
-                raise ConfigError(f"policy '{self._policy}' has no such settings: this row is for diffusion models")
-            return None
-        base, path = self._settings, self.network(run)
-        if run.network is not None and path is not None:
-            _check_training(path, run.network)
-            self._check_whole(path, run.network)
+        if experiment.network is not None and path is not None:
+            _check_training(path, experiment.network)
+            self._check_whole(path, experiment.network)
             base = replace(base, checkpoint=str(path.resolve()))
-        return override(base, dict(run.plan), "planner setting")
+        return override(base, dict(experiment.plan), "planner setting")
 
-    def _check_whole(self, path: Path, network: Network) -> None:
+    def _check_whole(self, path: Path, network: OwnNetwork) -> None:
         """Raise ConfigError for a network whose training was not finished: the best so far is there from early on."""
         share, last = _share(path), path.with_name(_LAST)
         if share is None:
@@ -107,21 +113,19 @@ class Pilots:
         if share < 1.0:
             raise ConfigError(f"{last}: {share:.1%} of its training are done: go on: {self._command(network, path)}")
 
-    def fingerprint(self, run: Run) -> dict[str, Any]:
-        """Everything about the policy of a run that its episodes depend on: checkpoints by their hash."""
+    def fingerprint(self, experiment: Experiment) -> dict[str, Any]:
+        """Everything about the policy of an experiment that its episodes depend on: checkpoints by their hash."""
         from servoid.policy.checkpoint import resolve
-        from servoid.policy.references.gait import load_gait
         from servoid.stack.control.policies import policy_fingerprint
         from servoid.stack.log.provenance import sha256
 
-        settings = self.settings(run)
-        odometry = {"odometry": sha256(resolve("odometry"))}
+        settings = self.settings(experiment)
         if settings is None:
-            name = EXPERT if run.policy == EXPERT else self._policy
-            known = policy_fingerprint(name)
-            return {**odometry, "checkpoint": known["checkpoint_sha256"], "gait": asdict(load_gait())}
+            known = policy_fingerprint(experiment.policy or self._policy)
+            return {name: value for name, value in known.items() if name != "name" or not known["checkpoint_sha256"]}
         values = asdict(settings)
-        return {**odometry, "settings": values | {"checkpoint": sha256(resolve(values["checkpoint"]))}}
+        checkpoint = {"checkpoint": sha256(resolve(values["checkpoint"]))}
+        return {"odometry": sha256(resolve("odometry")), "settings": values | checkpoint}
 
 
 def _share(path: Path) -> float | None:
@@ -139,7 +143,7 @@ def _anew(path: Path) -> str:
 
 
 @cache
-def _check_training(path: Path, network: Network) -> None:
+def _check_training(path: Path, network: OwnNetwork) -> None:
     """Raise ConfigError for a network that was trained with other options than its row says."""
     from servoid.policy.checkpoint import read_header
     from servoid.tools.learn.flags import plain, read_settings
@@ -175,22 +179,22 @@ def _diffusion_settings(policy: str) -> DiffusionSettings | None:
     return replace(settings, checkpoint=str(resolve(settings.checkpoint).resolve()))
 
 
-def spec(
-    run: Run, pilots: Pilots, robot: str, seed: int, seconds: float | None, clips: str | None
+def dependencies(
+    experiment: Experiment, policies: Policies, robot: str, seed: int, seconds: float | None, clips: str | None
 ) -> Mapping[str, Any]:
-    """What the episodes of a run depend on: the same spec, the same episodes. Raises ConfigError."""
+    """What the episodes of an experiment depend on: the same dependencies, the same episodes. Raises ConfigError."""
     from servoid.hw.robot.description import load_robot
     from servoid.stack.log.provenance import described, fingerprint, versions
     from servoid.stack.tasks import load_settings
 
     return {
-        "task": run.task,
-        "settings": described(load_settings(run.task, dict(run.set))),
+        "task": experiment.task,
+        "settings": described(load_settings(experiment.task, dict(experiment.set))),
         "seconds": seconds,
-        "policy": pilots.fingerprint(run),
+        "policy": policies.fingerprint(experiment),
         "robot": fingerprint(load_robot(robot)),
-        "backend": run.backend,
-        "randomise": run.randomise,
+        "backend": experiment.backend,
+        "randomise": experiment.randomise,
         "seed": seed,
         "clips": clips,
         "code": code(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,13 +14,17 @@ from servoid.tools.common.exit_codes import explain
 from servoid.tools.common.worker_pool import each
 from servoid.tools.evaluate.cache import EpisodeCache, key
 from servoid.tools.evaluate.code_hash import read_anew
-from servoid.tools.evaluate.episode import Job, do, episode_seed
-from servoid.tools.evaluate.policies import Pilots, spec
-from servoid.tools.evaluate.spec import Row, Run
-from servoid.tools.evaluate.summary import Measured
+from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult, do_episode, episode_seed
+from servoid.tools.evaluate.policies import Policies, dependencies
+from servoid.tools.evaluate.progress import EpisodeBar, Forecast
+from servoid.tools.evaluate.report import Measured
+from servoid.tools.evaluate.spec import Experiment, Row
 
 if TYPE_CHECKING:
     from servoid.stack.runtime.run import RunSettings
+
+Work = Callable[[EpisodeJob], EpisodeResult]
+Pool = Callable[[Work, Iterable[EpisodeJob], int, float | None], Iterator[EpisodeResult]]
 
 
 @dataclass(frozen=True)
@@ -39,13 +43,22 @@ class Options:
     fresh: bool = False  # do again what was done
 
 
-@dataclass
-class _Work:
-    """A run of one or more rows, with what was done of it."""
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C while episodes ran: `measured` is what was done until then."""
 
-    run: Run
+    def __init__(self, measured: Mapping[str, Measured]) -> None:
+        super().__init__("interrupted: what was done is kept; the same command goes on")
+        self.measured = measured
+
+
+@dataclass
+class _Prepared:
+    """An experiment of one or more rows, with what was done of it."""
+
+    experiment: Experiment
     settings: RunSettings
-    pilot: tuple[Mapping[str, Any], str | None]  # fingerprint of the policy, and the hash of its file of settings
+    policy: tuple[Mapping[str, Any], str | None]  # its fingerprint, and the hash of its file of settings
+    limit: float  # s that an episode lasts at most
     episodes: int
     cache: EpisodeCache
     rows: list[str] = field(default_factory=list)
@@ -55,109 +68,136 @@ class _Work:
         return [self.cache.records[i] for i in range(self.episodes) if i in self.cache.records]
 
 
-def evaluate(rows: Sequence[Row], options: Options, say: Any = print) -> dict[str, Measured]:
+def evaluate(
+    rows: Sequence[Row],
+    options: Options,
+    say: Callable[[str], None] = print,
+    work: Work = do_episode,
+    pool: Pool = each,
+) -> dict[str, Measured]:
     """Do the episodes that `rows` lack, and return what was measured by the rows' names.
 
-    Episode i has the same seed in every row. Every run gets its first episode before any gets its second, so that an
-    evaluation that is stopped has a bit of everything. A row that cannot be done says why; the others go on. Raises
-    ConfigError for a robot or policy that there is not, or where nothing can be written.
+    Episode i has the same seed in every row. Every experiment gets its first episode before any gets its second, so
+    that an evaluation that is stopped has a bit of everything. A row that cannot be done says why; the others go on.
+    Raises ConfigError for a robot or policy that there is not, or where nothing can be written, and Interrupted.
     """
     from servoid.policy.checkpoint import git_commit
 
     begun = time.monotonic()
     read = read_anew(options.robot)
-    pilots = Pilots(options.policy, options.out)
-    works: dict[str, _Work] = {}
-    measured: dict[str, Measured] = {}
-    prepared: dict[str, str | Exception] = {}  # key of the work of a run, or why there is none
-    for row in rows:
-        if repr(row.run) not in prepared:
-            try:
-                training = pilots.training(row.run)
-                if training is not None:
-                    measured[row.name] = Measured(training=training)
-                    continue
-                work = _prepare(row.run, pilots, options)
-                prepared[repr(row.run)] = work.cache.path.name
-                works.setdefault(work.cache.path.name, work)
-            except Exception as error:  # clips are recorded there: whatever ends that does not end the other rows
-                prepared[repr(row.run)] = error
-        found = prepared[repr(row.run)]
-        if isinstance(found, Exception):
-            measured[row.name] = Measured(refused=explain(found))
-        else:
-            works[found].rows.append(row.name)
-    runs, commit = list(works.values()), git_commit()
-    jobs = list(_jobs(runs, options.seed))
-    cached = sum(len(work.records()) for work in runs)
+    policies = Policies(options.policy, options.out)
+    measured, prepared = _prepare_all(rows, policies, options)
+    jobs, commit = list(_jobs(prepared, options.seed)), git_commit()
+    cached = sum(len(one.records()) for one in prepared)
     ahead = "" if options.minutes == 0 else f", {len(jobs)} are to be done"
-    say(f"{len(rows)} rows, {len(runs)} runs: {cached} episodes are there{ahead}")
+    say(f"{len(rows)} rows, {len(prepared)} experiments: {cached} episodes are there{ahead}")
     deadline = None if options.minutes is None else begun + 60.0 * options.minutes
     # With no time at all there is nothing to start processes for.
     workers = 1 if options.minutes == 0 else max(min(options.workers or os.cpu_count() or 1, len(jobs)), 1)
-    for done in _progress(each(do, _jobs(runs, options.seed), workers, deadline), len(jobs)):
-        work = runs[done.job.run]
-        if done.refused is not None:
-            work.refused = done.refused
-        else:
-            if _pilot(pilots, work.run, work.settings.policy) != work.pilot or read_anew(options.robot) != read:
+    left = [sum(job.experiment == number for job in jobs) for number in range(len(prepared))]
+    bar = EpisodeBar(Forecast([one.limit for one in prepared], left), workers, deadline)
+    interrupted = False
+    try:
+        for result in pool(work, _jobs(prepared, options.seed), workers, deadline):
+            one = prepared[result.job.experiment]
+            if result.refused is not None:
+                one.refused = result.refused
+                bar.refused(result.job.experiment)
+                continue
+            if (
+                _made_of(policies, one.experiment, one.settings.policy) != one.policy
+                or read_anew(options.robot) != read
+            ):
                 raise ConfigError(
-                    f"the policy of {', '.join(work.rows)}, the robot, the code or a file in configs/ changed while"
+                    f"the policy of {', '.join(one.rows)}, the robot, the code or a file in configs/ changed while"
                     " episodes ran: what was done is kept; give the same command again when the files stay as they are"
                 )
-            work.cache.add(done.job.episode, {**done.record, "commit": commit})
-    for work in runs:
-        result = Measured(work.records(), refused=work.refused)
-        measured.update(dict.fromkeys(work.rows, result))
+            one.cache.add(result.job.episode, {**result.record, "commit": commit})
+            bar.done(result.job.experiment, result.wall_seconds)
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        bar.close()
+    for one in prepared:
+        measured.update(dict.fromkeys(one.rows, Measured(one.records(), refused=one.refused)))
+    if interrupted:
+        raise Interrupted(measured)
     return measured
 
 
-def _prepare(run: Run, pilots: Pilots, options: Options) -> _Work:
-    """Raises ConfigError where the run cannot be done."""
+def _prepare_all(
+    rows: Sequence[Row], policies: Policies, options: Options
+) -> tuple[dict[str, Measured], list[_Prepared]]:
+    """Why rows cannot be done, by their names, and the experiments of the others."""
+    measured: dict[str, Measured] = {}
+    prepared: dict[str, _Prepared] = {}  # by the names of their caches: others may come to the same episodes
+    known: dict[str, str | Measured] = {}  # what an experiment came to
+    for row in rows:
+        if repr(row.experiment) not in known:
+            try:
+                training = policies.training(row.experiment)
+                if training is None:
+                    one = _prepare(row.experiment, policies, options)
+                    prepared.setdefault(one.cache.path.name, one)
+                    known[repr(row.experiment)] = one.cache.path.name
+                else:
+                    known[repr(row.experiment)] = Measured(training=training)
+            except Exception as error:  # clips are recorded there: whatever ends that does not end the other rows
+                known[repr(row.experiment)] = Measured(refused=explain(error))
+        found = known[repr(row.experiment)]
+        if isinstance(found, Measured):
+            measured[row.name] = found
+        else:
+            prepared[found].rows.append(row.name)
+    return measured, list(prepared.values())
+
+
+def _prepare(experiment: Experiment, policies: Policies, options: Options) -> _Prepared:
+    """Raises ConfigError where the experiment cannot be done."""
     from servoid.stack.runtime.run import RunSettings
     from servoid.stack.tasks import load_settings
     from servoid.tools.evaluate import clips
 
-    chosen, recipe = dict(run.set), None
-    if run.clips:
-        recipe = key(clips.recipe(options.robot) | {"number": run.clips})
-        recorded = [] if options.minutes == 0 else clips.record_clips(options.out / "clips", options.robot, run.clips)
+    chosen, recipe = dict(experiment.set), None
+    if experiment.clips:
+        number = experiment.clips
+        recipe = key(clips.recipe(options.robot) | {"number": number})
+        recorded = [] if options.minutes == 0 else clips.record_clips(options.out / "clips", options.robot, number)
         chosen["clips"] = ":".join(map(str, recorded))
-    own = load_settings(run.task, dict(run.set)).seconds
-    limits = [own, options.seconds, run.quick_seconds if options.quick else None]
+    own = load_settings(experiment.task, dict(experiment.set)).seconds
+    limits = [own, options.seconds, experiment.quick_seconds if options.quick else None]
     shortest = min(limit for limit in limits if limit is not None)
     seconds = None if shortest == own else shortest
-    kept = spec(run, pilots, options.robot, options.seed, seconds, recipe)
+    kept = dependencies(experiment, policies, options.robot, options.seed, seconds, recipe)
     settings = RunSettings(
-        task=run.task,
-        backend=run.backend,
+        task=experiment.task,
+        backend=experiment.backend,
         robot=options.robot,
-        policy=pilots.name(run),
-        randomise=run.randomise,
+        policy=policies.name(experiment),
+        randomise=experiment.randomise,
         seconds=seconds,
         set=chosen,
     )
-    cache = EpisodeCache(options.out / "episodes", kept, options.fresh)
-    pilot = _pilot(pilots, run, settings.policy)
-    return _Work(run, settings, pilot, options.episodes or run.episodes, cache)
+    return _Prepared(
+        experiment=experiment,
+        settings=settings,
+        policy=_made_of(policies, experiment, settings.policy),
+        limit=shortest,
+        episodes=options.episodes or experiment.episodes,
+        cache=EpisodeCache(options.out / "episodes", kept, options.fresh),
+    )
 
 
-def _pilot(pilots: Pilots, run: Run, policy: str) -> tuple[Mapping[str, Any], str | None]:
-    """What the policy of a run is made of, to be compared."""
+def _made_of(policies: Policies, experiment: Experiment, policy: str) -> tuple[Mapping[str, Any], str | None]:
+    """What the policy of an experiment is made of, to be compared."""
     from servoid.stack.log.provenance import sha256
 
-    return pilots.fingerprint(run), sha256(Path(policy))
+    return policies.fingerprint(experiment), sha256(Path(policy))
 
 
-def _jobs(runs: Sequence[_Work], seed: int) -> Iterator[Job]:
-    """Episodes that are to be done, in turns; those of a run that refuses are left out from then on."""
-    for episode in range(max((work.episodes for work in runs), default=0)):
-        for number, work in enumerate(runs):
-            if episode < work.episodes and episode not in work.cache.records and work.refused is None:
-                yield Job(number, episode, replace(work.settings, seed=episode_seed(seed, episode)))
-
-
-def _progress(done: Iterator[Any], total: int) -> Iterator[Any]:
-    from tqdm import tqdm
-
-    yield from tqdm(done, total=total, unit="episode", mininterval=2.0, disable=total == 0)
+def _jobs(prepared: Sequence[_Prepared], seed: int) -> Iterator[EpisodeJob]:
+    """Episodes that are to be done, in turns; those of an experiment that refuses are left out from then on."""
+    for episode in range(max((one.episodes for one in prepared), default=0)):
+        for number, one in enumerate(prepared):
+            if episode < one.episodes and episode not in one.cache.records and one.refused is None:
+                yield EpisodeJob(number, episode, replace(one.settings, seed=episode_seed(seed, episode)))

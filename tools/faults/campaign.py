@@ -68,15 +68,15 @@ def campaign(report: Report, kinds: tuple[str, ...], seeds: range, args: argpars
     from tqdm import tqdm
 
     from servoid.hw.robot.description import load_robot
+    from servoid.tools.common.worker_pool import Lost, each_or_lost
     from servoid.tools.faults.trial import Trial, Verdict, run_trial
-    from servoid.tools.faults.workers import Lost, work_all
 
     load_robot(args.robot)
     trials = [Trial(kind, seed, args.robot) for seed in seeds for kind in kinds]
     verdicts: list[Verdict] = []
-    done = work_all(run_trial, trials, args.workers or os.cpu_count() or 1, args.deadline)
-    for number, result in tqdm(done, total=len(trials), unit="trial", mininterval=5.0):
-        verdict = lost(trials[number], result) if isinstance(result, Lost) else result
+    done = each_or_lost(run_trial, trials, args.workers or os.cpu_count() or 1, args.deadline)
+    for trial, result in tqdm(done, total=len(trials), unit="trial", mininterval=5.0):
+        verdict = lost(trial, result) if isinstance(result, Lost) else result
         verdicts.append(verdict)
         for problem in verdict.problems:
             report.line(f"{verdict.kind} --first {verdict.seed}: {problem}")

@@ -42,7 +42,7 @@ class Target(Protocol):
     def take(self, pieces: Sequence[bytes]) -> None: ...
 
 
-class Codec:
+class CodecTarget:
     """The parser of packets, and the ways through whole answers."""
 
     name = "codec"
@@ -64,7 +64,7 @@ class Codec:
         codec.whole_sync(data, self._heads, WIDTH)
 
 
-class Imus:
+class ImuTarget:
     """The parsers of IMUs on a serial port of their own."""
 
     name = "imu"
@@ -83,7 +83,7 @@ class Imus:
                         raise ValueError(f"a sample that is infinite: {sample}")
 
 
-class Servos:
+class ServoTarget:
     """The virtual servos and the board, moved by physics."""
 
     name = "servos"
@@ -119,7 +119,7 @@ class Servos:
                 raise ValueError("the body is no longer anywhere")
 
 
-class Driver:
+class DriverTarget:
     """The driver's bus, whose servos answer with the stream."""
 
     name = "bus"

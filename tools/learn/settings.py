@@ -206,12 +206,11 @@ class TrackingSettings:
 
     episode_seconds: Annotated[float, "longest episode [s]"] = 20.0
     randomised: Annotated[float, "share of episodes on a robot drawn at random; the others are nominal"] = 0.8
-    push: Annotated[float, "largest push [m/s], reached over the first fifth of the training"] = 0.45
+    hardest_push: Annotated[
+        float, "of the robot's top speed, grown to over the first fifth of the training; pushes are uniform from zero"
+    ] = 0.9
     push_every: Annotated[Range, "time between pushes [s]"] = (0.6, 2.0)
     command_every: Annotated[Range, "time between commands [s]"] = (2.0, 5.0)
-    vx: Annotated[Range, "commanded speed forward [m/s]"] = (-0.15, 0.5)
-    vy: Annotated[Range, "commanded speed to the left [m/s]"] = (-0.13, 0.13)
-    yaw_rate: Annotated[Range, "commanded turn to the left [rad/s]"] = (-1.0, 1.0)
     stand: Annotated[float, "share of commands that are zero"] = 0.1
     forward: Annotated[float, "share of commands straight ahead, half of them in the upper third of the speeds"] = 0.2
     single: Annotated[float, "share of commands that are backward, sideways or a turn alone"] = 0.2

@@ -10,33 +10,33 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction
 from servoid.hw.robot.description import Robot
 from servoid.policy.mlp import Mlp
 from servoid.tools.learn.progress import counted
 
 if TYPE_CHECKING:
-    from servoid.stack.control.fleet import Fleet
-    from servoid.tools.learn.collect.episode_cutter import Driver
+    from servoid.hw.contracts.control import Policy
 
-    MakeDriver = Callable[[Fleet], Driver]
+    MakePolicy = Callable[..., Policy]  # takes a shape
 
 
-def driver(robot: Robot, name: str) -> MakeDriver:
-    """What makes a fleet walk, by the policy's name or a checkpoint's file. Raises ConfigError."""
+def maker(robot: Robot, name: str) -> MakePolicy:
+    """What makes a policy for worlds of a `shape`, by the policy's name or a checkpoint's file. Raises ConfigError."""
     from servoid.policy.checkpoint import read_header, resolve
-    from servoid.tools.learn.envs.walker import Walker, load_tracker
+    from servoid.stack.control.gait import GaitPolicy
+    from servoid.stack.control.tracker import ExpertPolicy
 
     if name == "gait":
-        return partial(Walker, tracker=None)
+        return partial(GaitPolicy, robot)
     if read_header(resolve(name))["kind"] == "tracker":
-        return partial(Walker, tracker=load_tracker(robot, name))
-    from servoid.policy.diffusion.runtime import load_runtime
+        return partial(ExpertPolicy, robot, name)
     from servoid.policy.diffusion.settings import load_settings
+    from servoid.stack.control.diffusion import diffusion_policy
     from servoid.stack.tasks import load_task
-    from servoid.tools.learn.envs.planned import PlannedWalker
 
     settings = replace(load_settings(), checkpoint=name)
-    return partial(PlannedWalker, runtime=load_runtime(robot, settings, load_task("walk", {}, robot.dt).cost))
+    return partial(diffusion_policy, robot, settings, load_task("walk", {}, robot.dt).cost)
 
 
 def mixed(a: dict[str, Array], b: dict[str, Array], seed: int) -> dict[str, Array]:
@@ -46,20 +46,20 @@ def mixed(a: dict[str, Array], b: dict[str, Array], seed: int) -> dict[str, Arra
 
 
 def record(
-    robot: Robot, drive: MakeDriver, worlds: int, seconds: float, seed: int, odometry: Mlp | None = None
+    robot: Robot, make: MakePolicy, worlds: int, seconds: float, seed: int, odometry: Mlp | None = None
 ) -> dict[str, Array]:
     """Walk randomised worlds; returns rows `(n, ticks, features)`, starts `(n, ticks)` and errors `(n, ticks, 3)`."""
     from servoid.stack.control.fleet import Fleet
 
     fleet = Fleet(robot, worlds, odometry, randomise=0.7, seed=seed + 1000)
-    walker = drive(fleet)
+    policy = make(shape=(fleet.n,))
     ticks = round(seconds * robot.rate)
     rows = np.zeros((worlds, ticks, fleet.estimator.features.size), np.float32)
     errors = np.zeros((worlds, ticks, 3), np.float32)
     starts = np.zeros((worlds, ticks), np.int32)
     everything = np.ones(worlds, bool)
     fleet.reset(everything)
-    walker.reset(everything)
+    policy.reset(None, fleet.seeds)
     rng = np.random.default_rng(seed)
     command, start = np.zeros((worlds, 3)), np.zeros(worlds, np.int32)
     noise = rng.uniform(0.0, 0.1, (worlds, 1))
@@ -74,12 +74,12 @@ def record(
         kicked = rng.random(worlds) < 1 / 100
         angle, size = rng.uniform(-np.pi, np.pi, worlds), rng.uniform(0, 0.3, worlds) * kicked
         fleet.worlds.push(np.stack([size * np.cos(angle), size * np.sin(angle)], -1))
-        target = walker.act(command)
+        target = policy.act(fleet.state, fleet.applied, Instruction(command))
         fleet.step(target, noise * rng.standard_normal(target.shape))
         fallen = fleet.truth.fallen
         if fallen.any():
             fleet.reset(fallen)
-            walker.reset(fallen)
+            policy.reset(fallen, fleet.seeds)
             start[fallen] = k + 1
     return {"rows": rows, "starts": starts, "errors": errors}
 
@@ -96,7 +96,7 @@ class Drift:
 
 def drift(
     robot: Robot,
-    drive: MakeDriver,
+    make: MakePolicy,
     odometry: Mlp | None,
     *,
     walks: int,
@@ -113,10 +113,10 @@ def drift(
     from servoid.stack.control.fleet import Fleet
 
     fleet = Fleet(robot, walks, odometry, randomise=randomise, seed=seed)
-    walker = drive(fleet)
+    policy = make(shape=(fleet.n,))
     everything = np.ones(walks, bool)
     fleet.reset(everything)
-    walker.reset(everything)
+    policy.reset(None, fleet.seeds)
     alive, path, command = everything.copy(), np.zeros(walks), np.zeros((walks, 3))
     turned, start = np.zeros(walks), fleet.truth.position[:, :2].copy()
     last, heading, state = start, fleet.truth.yaw.copy(), fleet.observe()
@@ -125,7 +125,7 @@ def drift(
         if k % (5 * robot.rate) == 0:
             low, high = [-0.1, -0.1, -0.8], [0.3, 0.1, 0.8]
             command = np.array([rng.uniform(low, high) for rng in fleet.rngs])
-        fleet.step(walker.act(command))
+        fleet.step(policy.act(state, fleet.applied, Instruction(command)))
         state = fleet.observe()
         truth = fleet.truth
         if (k + 1) % cycle == 0 or k == ticks - 1:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from servoid.hw.config import CONFIGS, ConfigError
-from servoid.hw.robot.description import load_robot, load_servo, save_robot
+from servoid.hw.robot.description import Walking, load_robot, load_servo, save_robot
 
 PI = np.pi
 
@@ -121,6 +121,7 @@ ROLL = "{name: l_sho_roll, servo: xm430-w350, id: 4, direction: 1, zero: 0.0, ra
         ("axis: [0, 0, -1]", "axis: [0, 0, -2]", "must be a unit vector"),
         ("rate: 50 ", "rate: 0 ", "rate: must be positive, not 0"),
         ("joint_speed: 4.5", "joint_speed: -4.5", "limits.joint_speed: must be positive"),
+        ("forward: 0.5", "forward: -0.5", "walking.forward: must be positive, not -0.5"),
         ("tilt: 1.047", "tilt: 60", "limits.tilt: 60 is more than a turn"),
         ("joint_speed: 4.5 ", "joint_speed: 4.5rad/s ", "without the unit 'rad/s'"),
         ("derate_temperature: 60", "derate_temperature: 75", "75 is not between 0 and limits.temperature (70)"),
@@ -238,3 +239,33 @@ def test_a_saved_robot_finds_its_own_servo_file(tmp_path: Path) -> None:
     robot = load_robot(tmp_path / "design" / "robot.yaml")
     save_robot(robot, tmp_path / "saved.yaml")
     assert load_robot(tmp_path / "saved.yaml").servos == robot.servos
+
+
+def test_what_a_robot_may_be_asked_is_derived_from_its_height(tmp_path: Path) -> None:
+    """Alike robots walk alike: the OP3's figures come out for its height, and twice its speed for four times that."""
+    text = (CONFIGS / "robots" / "op3.yaml").read_text()
+    section = re.search(r"^walking:.*\n(  .*\n)+", text, re.MULTILINE)
+    assert section
+
+    def loaded(walking: str, height: float) -> Walking:
+        path = tmp_path / "own.yaml"
+        path.write_text(
+            text.replace(section[0], walking).replace("standing_height: 0.259", f"standing_height: {height}")
+        )
+        return load_robot(path).walking
+
+    op3, derived, small = load_robot().walking, loaded("", 0.25), loaded("", 0.0625)
+    np.testing.assert_allclose(derived.upper, op3.upper, rtol=0.02)
+    np.testing.assert_allclose(derived.lower, op3.lower, rtol=0.02)
+    assert derived.height == 0.25
+    assert derived.forward == pytest.approx(2 * small.forward)
+    assert derived.turning == pytest.approx(0.5 * small.turning)
+    part = loaded("walking: {forward: 0.4, sideways: 0.2}\n", 0.25)
+    assert part.upper == pytest.approx([0.4, 0.2, 0.8])
+    assert part.backward == pytest.approx(0.12)
+
+
+def test_a_robot_that_is_saved_keeps_what_was_derived(tmp_path: Path) -> None:
+    robot = replace(load_robot(), walking=Walking().derived(0.3))
+    save_robot(robot, tmp_path / "robot.yaml")
+    assert load_robot(tmp_path / "robot.yaml").walking == robot.walking

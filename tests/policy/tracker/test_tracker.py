@@ -167,6 +167,8 @@ def step(**changes: Any) -> Step:
         "reference_joints": joints,
         "reference_contact": feet + 1.0,
         "fallen": np.zeros(2, bool),
+        "walking": ROBOT.walking,
+        "weight": 30.0,
     }
     return Step(**(values | changes))
 
@@ -218,6 +220,22 @@ def test_the_nearer_to_the_reference_the_better() -> None:
         assert (np.diff(values) < -1e-3).all()
         assert values[0] == pytest.approx(1.0)
         assert values[-1] > 1e-3
+
+
+def test_what_is_far_and_fast_goes_by_the_robots_size() -> None:
+    """A robot of twice the speed, height and weight is paid alike for twice the error, step and force."""
+    walking = replace(ROBOT.walking, forward=1.0, turning=2.0, height=0.5)
+    for name, changes in {
+        "velocity": {"velocity": 0.04 * np.ones((2, 2))},
+        "yaw_rate": {"yaw_rate": 0.3 * np.ones(2)},
+        "progress": {"velocity": 0.02 * np.ones((2, 2)), "reference_velocity": 0.03 * np.ones((2, 2))},
+        "clearance": {"foot_height": 0.01 * np.ones((2, 2)), "reference_contact": np.zeros((2, 2))},
+        "impact": {"foot_force": 80.0 * np.ones((2, 2))},
+        "contact": {"foot_force": 0.9 * np.ones((2, 2))},
+    }.items():
+        doubled = {key: value if key == "reference_contact" else 2 * value for key, value in changes.items()}
+        larger = step(**doubled, walking=walking, weight=60.0)
+        np.testing.assert_allclose(TERMS[name](larger), TERMS[name](step(**changes)), err_msg=name)
 
 
 def test_a_steady_motion_of_targets_is_not_acceleration() -> None:

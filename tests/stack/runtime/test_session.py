@@ -36,7 +36,7 @@ class Still(BasePolicy):
 
     closed = False
 
-    def reset(self, seed):
+    def reset(self, where, seeds):
         self.calls = 0
 
     def act(self, state, applied, instruction):
@@ -303,8 +303,8 @@ class Planning(Still):
     def repeat(self, plans):
         self.only = plans
 
-    def reset(self, seed):
-        super().reset(seed)
+    def reset(self, where, seeds):
+        super().reset(where, seeds)
         self.latest_plan, self.notes = None, []
 
     def target(self, call):

@@ -41,7 +41,7 @@ def planner(engine: str) -> Runtime:
 
 
 def actions(runtime: Runtime, requests: Sequence[PlanRequest], seed: int = 7) -> Array:
-    return np.array([runtime.plan(request, seed).actions for request in requests])
+    return np.array([runtime.plan(replace(request, seeds=np.array(seed))).actions for request in requests])
 
 
 @pytest.mark.parametrize(("engine", "most"), [("onnx", 1e-4), ("onnx-int8", 0.05)])

@@ -25,8 +25,8 @@ from servoid.stack.control.diffusion import DiffusionPolicy, diffusion_policy
 from servoid.stack.runtime.run import RunSettings, prepare, run
 from servoid.stack.tasks import load_task
 from servoid.tools.common.ground_truth import GroundTruth
-from servoid.tools.evaluate.policies import Pilots
-from servoid.tools.evaluate.table import ROWS
+from servoid.tools.evaluate.policies import Policies
+from servoid.tools.evaluate.spec import load_evaluation
 
 SHIPPED = load_settings()
 UNGUIDED = replace(SHIPPED, guidance=replace(SHIPPED.guidance, weight=0.0))
@@ -48,7 +48,9 @@ def planner(settings: DiffusionSettings) -> Runtime:
 def actions(runtime: Runtime, requests: Sequence[PlanRequest], velocity: Sequence[float]) -> Array:
     """Planned actions `(requests, seeds, ticks, joints)` rad, without those that were committed."""
     asked = Instruction(np.array(velocity), text=AHEAD)
-    plans = [[runtime.plan(replace(one, instruction=asked), seed) for seed in SEEDS] for one in requests]
+    plans = [
+        [runtime.plan(replace(one, instruction=asked, seeds=np.array(seed))) for seed in SEEDS] for one in requests
+    ]
     return np.array([[plan.actions[SHIPPED.delay :] for plan in row] for row in plans])
 
 
@@ -78,8 +80,8 @@ class Told(BasePolicy):
     def __init__(self, policy: DiffusionPolicy) -> None:
         self._policy = policy
 
-    def reset(self, seed: int) -> None:
-        self._policy.reset(seed)
+    def reset(self, where: Array | None, seeds: Array) -> None:
+        self._policy.reset(where, seeds)
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         return self._policy.act(state, applied, replace(instruction, text=AHEAD))
@@ -116,8 +118,8 @@ def test_a_robot_that_is_told_the_same_goes_where_the_cost_asks() -> None:
 
 def by_its_row(tmp_path: Path, name: str, chosen: Mapping[str, str], ticks: int = 101) -> Driven:
     """A run of a row of the papers' tables, guided as the papers guide."""
-    (row,) = (row.run for row in ROWS if row.name == name)
-    policy = Pilots("diffusion", tmp_path).name(row)
+    (row,) = (row.experiment for row in load_evaluation("papers").rows if row.name == name)
+    policy = Policies("diffusion", tmp_path).name(row)
     driven = walked(drive(row.task, {**row.set, **chosen}, policy=policy), ticks)
     runtime = driven.planner.runtime
     assert runtime.settings.guidance.gradient == "network"

@@ -14,10 +14,11 @@ from task_bodies import moves, state
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
+from servoid.hw.robot.description import load_robot
 from servoid.policy.text.captions import MOTIONS
 from servoid.stack.navigation.potential_field import Field, FieldSettings
 from servoid.stack.tasks import load_settings, load_task
-from servoid.tools.learn.collect.skills import SKILLS
+from servoid.tools.learn.collect.skills import skills_of
 
 DT = 0.02
 NOTHING = Percept(source="task", age=0.0)
@@ -160,7 +161,7 @@ def test_obstacle_rolls_toward_the_robot_and_is_told_with_its_velocity() -> None
 
 
 def test_demonstrations_are_asked_for_all_velocities_of_the_task() -> None:
-    fastest = max(box.forward[1] for skill in SKILLS for box in skill.boxes)
+    fastest = max(box.forward[1] for skill in skills_of(load_robot()) for box in skill.boxes)
     assert load_settings("velocity").speed[1] <= fastest
 
 

@@ -17,17 +17,17 @@ from servoid.tools.common.flightpath import plans
 
 def test_what_a_policy_is_made_of_is_in_the_log_and_changes_are_named(tmp_path: Path) -> None:
     mine = tmp_path / "mine.yaml"
-    mine.write_text("replan: 6\ndelay: 2\n")
+    mine.write_text("execution_horizon: 6\ndelay: 2\n")
     chosen = RunSettings(
         "walk", policy=str(mine), seconds=0.4, set={"vx": "0.1", "gain": "0.9"}, record=tmp_path / "a.mcap"
     )
     run(chosen)
     log = read_log(tmp_path / "a.mcap")
     assert changes(log) == []
-    assert log.header["policy"]["planner"]["replan"] == 6
-    mine.write_text("replan: 7\ndelay: 2\n")
+    assert log.header["policy"]["planner"]["execution_horizon"] == 6
+    mine.write_text("execution_horizon: 7\ndelay: 2\n")
     assert changes(log) == ["the planner's settings"]
-    mine.write_text("replan: 6\ndelay: 2\n")
+    mine.write_text("execution_horizon: 6\ndelay: 2\n")
     for text, change in (
         ("the task's settings", {"task": log.header["task"] | {"every": 4.0}}),
         ("the source", {"git_commit": "another"}),
@@ -38,6 +38,9 @@ def test_what_a_policy_is_made_of_is_in_the_log_and_changes_are_named(tmp_path: 
         log.header.update(change)
         assert changes(log) == [text]
         log.header.update(before)
+    planner = log.header["policy"]["planner"]
+    planner["replan"] = planner.pop("execution_horizon")  # as an older program named it
+    assert changes(log) == []
     del log.header["policy"]["planner"], log.header["policy"]["odometry_sha256"]  # of an older program
     assert changes(log) == []
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from servoid.hw.config import ConfigError
-from servoid.tools.common.worker_pool import each
+from servoid.tools.common.worker_pool import Lost, Worker, each, each_or_lost
 
 
 def pid(job: int) -> int:
@@ -49,10 +49,8 @@ def test_every_job_is_answered_on_processes_of_their_own() -> None:
 
 
 def test_at_the_deadline_what_runs_is_given_up_however_stubborn() -> None:
-    begun = time.monotonic()
-    assert list(each(stubborn, range(3), 2, begun + 3.0)) == []
-    assert time.monotonic() - begun < 60.0
-    assert list(each(abs, range(3), 1, begun)) == []
+    assert list(each(stubborn, range(3), 2, time.monotonic() + 3.0)) == []
+    assert list(each(abs, range(3), 1, time.monotonic())) == []
 
 
 def test_jobs_are_asked_for_when_they_can_be_done() -> None:
@@ -89,3 +87,44 @@ def test_a_worker_calculates_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> N
     assert {"OMP_NUM_THREADS=1", "OPENBLAS_NUM_THREADS=1"} <= set(environment.split("\0"))
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "OPENBLAS_NUM_THREADS" not in os.environ
+
+
+def nap(seconds: float) -> float:
+    time.sleep(seconds)
+    return seconds
+
+
+def fail(job: int) -> int:
+    if job == 1:
+        os._exit(3)
+    if job == 2:
+        raise ValueError("no such thing")
+    return job
+
+
+def test_what_hangs_is_counted_and_the_rest_is_done() -> None:
+    done = dict(each_or_lost(nap, [0.01, 600.0, 0.02], 1, 2.0))
+    assert done == {0.01: 0.01, 600.0: Lost("hung", "did not end within 2 s", TimeoutError()), 0.02: 0.02}
+
+
+def test_what_dies_says_so_and_does_not_count_as_hung() -> None:
+    done = dict(each_or_lost(fail, [0, 1, 2, 3], 1, 60.0))
+    assert (done[0], done[3]) == (0, 3)
+    crashed, raised = done[1], done[2]
+    assert isinstance(crashed, Lost)
+    assert isinstance(raised, Lost)
+    assert crashed.how == raised.how == "died"
+    assert "exit code 3" in crashed.text
+    assert raised.text == "ValueError: no such thing"
+
+
+def test_a_worker_that_died_between_two_jobs_is_noticed() -> None:
+    """Memory ran out while it waited, say: the next job must not end in an error of the pipe."""
+    worker = Worker(die)
+    worker.give(1)
+    with pytest.raises(RuntimeError, match="exit code -9"):
+        worker.answer()
+    worker.give(2)
+    with pytest.raises(RuntimeError, match="exit code -9"):
+        worker.answer()
+    worker.kill()

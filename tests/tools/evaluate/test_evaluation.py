@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,34 +16,41 @@ from servoid.policy.checkpoint import resolve
 from servoid.stack.runtime.run import RunSettings
 from servoid.tools.cli import main
 from servoid.tools.commands import rollout
-from servoid.tools.evaluate import clips
-from servoid.tools.evaluate import code_hash as code
-from servoid.tools.evaluate import runner as session
-from servoid.tools.evaluate.cache import EpisodeCache, key
-from servoid.tools.evaluate.code_hash import digest
-from servoid.tools.evaluate.episode import Done, Job
-from servoid.tools.evaluate.policies import Pilots, spec
-from servoid.tools.evaluate.runner import Options, evaluate
-from servoid.tools.evaluate.spec import Metric, Row, Run
+from servoid.tools.evaluate import code_hash
+from servoid.tools.evaluate.cache import EpisodeCache
+from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult, do_episode
+from servoid.tools.evaluate.metrics import METRICS
+from servoid.tools.evaluate.report import Measured
+from servoid.tools.evaluate.runner import Interrupted, Options
+from servoid.tools.evaluate.runner import evaluate as evaluate_with
+from servoid.tools.evaluate.spec import Experiment, Row
 
-NEAR = Row("t/near", "T", "Near", Run("goal-near", episodes=4), Metric("success", share=True))
-FALLS = Row("t/falls", "T", "Falls", Run("goal-near", episodes=4), Metric("fell", share=True))
-FAR = Row("t/far", "T", "Far", Run("goal-far", episodes=2), Metric("success", share=True))
+SUCCESS = METRICS["success"]
+NEAR = Row("t/near", "Near", Experiment("goal-near", episodes=4), SUCCESS)
+FALLS = Row("t/falls", "Falls", Experiment("goal-near", episodes=4), METRICS["falls"])
+FAR = Row("t/far", "Far", Experiment("goal-far", episodes=2), SUCCESS)
+
+
+class Episodes:
+    """Does episodes as they are asked for, but runs none of them really."""
+
+    def __init__(self) -> None:
+        self.jobs: list[EpisodeJob] = []
+
+    def __call__(self, job: EpisodeJob) -> EpisodeResult:
+        self.jobs.append(job)
+        if job.settings.task == "stand":
+            return EpisodeResult(job, {}, "the floor is missing")
+        return EpisodeResult(job, {"success": True, "fell": False, "outcome": "succeeded", "seed": job.settings.seed})
+
+
+def evaluate(rows: Sequence[Row], options: Options, work: Callable[[EpisodeJob], EpisodeResult]) -> dict[str, Measured]:
+    return evaluate_with(rows, options, quiet, work)
 
 
 @pytest.fixture
-def done(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
-    """Episodes that were done, in order; none of them is really run."""
-    jobs: list[Job] = []
-
-    def do(job: Job) -> Done:
-        jobs.append(job)
-        if job.settings.task == "stand":
-            return Done(job, {}, "the floor is missing")
-        return Done(job, {"success": True, "fell": False, "outcome": "succeeded", "seed": job.settings.seed})
-
-    monkeypatch.setattr(session, "do", do)
-    return jobs
+def done() -> Episodes:
+    return Episodes()
 
 
 def options(out: Path, **more: Any) -> Options:
@@ -53,9 +61,9 @@ def quiet(text: str) -> None:
     """Say nothing."""
 
 
-def test_episodes_are_done_in_turns_once_for_all_rows_that_share_them(tmp_path: Path, done: list[Job]) -> None:
-    measured = evaluate([NEAR, FALLS, FAR], options(tmp_path), quiet)
-    order = [(job.settings.task, job.episode) for job in done]
+def test_episodes_are_done_in_turns_once_for_all_rows_that_share_them(tmp_path: Path, done: Episodes) -> None:
+    measured = evaluate([NEAR, FALLS, FAR], options(tmp_path), done)
+    order = [(job.settings.task, job.episode) for job in done.jobs]
     assert order == [
         ("goal-near", 0),
         ("goal-far", 0),
@@ -65,93 +73,52 @@ def test_episodes_are_done_in_turns_once_for_all_rows_that_share_them(tmp_path: 
         ("goal-near", 3),
     ]
     assert measured["t/near"].records == measured["t/falls"].records
-    assert len({job.settings.seed for job in done if job.settings.task == "goal-near"}) == 4
+    assert len({job.settings.seed for job in done.jobs if job.settings.task == "goal-near"}) == 4
 
 
-def test_what_was_done_is_not_done_again(tmp_path: Path, done: list[Job]) -> None:
-    evaluate([NEAR], options(tmp_path, episodes=2), quiet)
-    assert len(done) == 2
-    first = evaluate([NEAR], options(tmp_path), quiet)
-    assert [job.episode for job in done] == [0, 1, 2, 3]
-    assert evaluate([NEAR], options(tmp_path), quiet) == first
-    assert len(done) == 4
-    evaluate([NEAR], options(tmp_path, fresh=True), quiet)
-    assert len(done) == 8
+def test_what_was_done_is_not_done_again(tmp_path: Path, done: Episodes) -> None:
+    evaluate([NEAR], options(tmp_path, episodes=2), done)
+    assert len(done.jobs) == 2
+    first = evaluate([NEAR], options(tmp_path), done)
+    assert [job.episode for job in done.jobs] == [0, 1, 2, 3]
+    assert evaluate([NEAR], options(tmp_path), done) == first
+    assert len(done.jobs) == 4
+    evaluate([NEAR], options(tmp_path, fresh=True), done)
+    assert len(done.jobs) == 8
 
 
-def test_a_half_written_line_is_done_again_and_the_file_stays_whole(tmp_path: Path, done: list[Job]) -> None:
-    evaluate([NEAR], options(tmp_path), quiet)
+def test_a_half_written_line_is_done_again_and_the_file_stays_whole(tmp_path: Path, done: Episodes) -> None:
+    evaluate([NEAR], options(tmp_path), done)
     (path,) = (tmp_path / "episodes").glob("*.jsonl")
     path.write_text(path.read_text()[:-20])  # as a kill in the middle of a write leaves it
-    evaluate([NEAR], options(tmp_path), quiet)
-    assert [job.episode for job in done] == [0, 1, 2, 3, 3]
+    evaluate([NEAR], options(tmp_path), done)
+    assert [job.episode for job in done.jobs] == [0, 1, 2, 3, 3]
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert [line["episode"] for line in lines[1:]] == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("change", [{"seed": 1}, {"seconds": 5.0}])
-def test_other_settings_are_other_episodes(tmp_path: Path, done: list[Job], change: dict[str, Any]) -> None:
-    evaluate([NEAR], options(tmp_path), quiet)
-    evaluate([NEAR], options(tmp_path, **change), quiet)
-    assert len(done) == 8
+def test_other_settings_are_other_episodes(tmp_path: Path, done: Episodes, change: dict[str, Any]) -> None:
+    evaluate([NEAR], options(tmp_path), done)
+    evaluate([NEAR], options(tmp_path, **change), done)
+    assert len(done.jobs) == 8
 
 
 def test_quick_cuts_the_longest_episodes_and_does_not_mistake_them_for_whole_ones(
-    tmp_path: Path, done: list[Job]
+    tmp_path: Path, done: Episodes
 ) -> None:
-    run = Run("velocity", episodes=1, quick_seconds=61.0)
-    row = Row("t/velocity", "T", "Velocity", run, Metric("success", share=True))
-    evaluate([row], options(tmp_path, quick=True), quiet)
-    evaluate([row], options(tmp_path), quiet)
-    evaluate([row], options(tmp_path, quick=True, seconds=5.0), quiet)
-    assert [job.settings.seconds for job in done] == [61.0, None, 5.0]
+    row = Row("t/velocity", "Velocity", Experiment("velocity", episodes=1, quick_seconds=61.0), SUCCESS)
+    evaluate([row], options(tmp_path, quick=True), done)
+    evaluate([row], options(tmp_path), done)
+    evaluate([row], options(tmp_path, quick=True, seconds=5.0), done)
+    assert [job.settings.seconds for job in done.jobs] == [61.0, None, 5.0]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "hw/robot/legs.py",
-        "sim/rig/servo/virtual_servo.py",
-        "policy/diffusion/sampler.py",
-        "stack/control/trim.py",
-        "configs/servos/xm430-w350.yaml",
-        "tools/common/ground_truth.py",
-        "tools/common/motion_quality.py",
-        "tools/commands/rollout.py",
-        "tools/evaluate/episode.py",
-    ],
-)
-def test_the_hash_of_the_code_changes_with_all_that_makes_or_judges_a_run(tmp_path: Path, name: str) -> None:
-    """Else an evaluation after a change goes on with episodes from before it."""
-    root = Path(__file__).resolve().parents[3]
-    for part in ("hw", "sim", "policy", "stack", "configs", "tools"):
-        shutil.copytree(root / part, tmp_path / part, ignore=shutil.ignore_patterns("__pycache__", "*.safetensors"))
-    before = digest(tmp_path)
-    assert before == digest(tmp_path)
-    (tmp_path / "tools" / "plot.py").write_text("# how pictures look\n")
-    (tmp_path / "policy" / "checkpoints" / "other.safetensors").parent.mkdir(exist_ok=True)
-    (tmp_path / "policy" / "checkpoints" / "other.safetensors").write_bytes(b"one that no row uses")
-    assert digest(tmp_path) == before
-    with (tmp_path / name).open("a") as file:
-        file.write("# changed\n")
-    assert digest(tmp_path) != before
-
-
-def test_changed_code_changes_what_episodes_and_clips_depend_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def keys() -> tuple[str, str]:
-        return key(spec(Run("goal-near"), Pilots("gait", tmp_path), "op3", 0, None, None)), key(clips.recipe("op3"))
-
-    before = keys()
-    monkeypatch.setattr("servoid.tools.evaluate.policies.code", lambda: "other")
-    monkeypatch.setattr("servoid.tools.evaluate.clips.code", lambda: "other")
-    assert not set(before) & set(keys())
-
-
-def test_episodes_are_not_those_that_settings_are_tried_on(tmp_path: Path, done: list[Job]) -> None:
-    evaluate([NEAR, FAR], options(tmp_path), quiet)
-    seeds = {run: [job.settings.seed for job in done if job.settings.task == run] for run in ("goal-near", "goal-far")}
+def test_episodes_are_not_those_that_settings_are_tried_on(tmp_path: Path, done: Episodes) -> None:
+    evaluate([NEAR, FAR], options(tmp_path), done)
+    seeds = {
+        run: [job.settings.seed for job in done.jobs if job.settings.task == run] for run in ("goal-near", "goal-far")
+    }
     assert seeds["goal-near"][:2] == seeds["goal-far"]  # the same for every row
     assert not set(seeds["goal-near"]) & {rollout.episode_seed(0, episode) for episode in range(100)}
 
@@ -163,12 +130,12 @@ def test_what_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch:
     shutil.copytree(CONFIGS, tmp_path / "configs")
     shutil.copytree(CONFIGS / "robots", tmp_path / "robots")
     shutil.copy(CONFIGS / "robots" / "op3.yaml", robot)
-    code.code()  # that of this program, once and for all
+    code_hash.code()  # that of this program, once and for all
     module = tmp_path / "hw" / "module.py"
-    for path in (module, *(tmp_path / judge for judge in code.JUDGES)):
+    for path in (module, *(tmp_path / judge for judge in code_hash.JUDGES)):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
-    monkeypatch.setattr(code, "ROOT", tmp_path)
+    monkeypatch.setattr(code_hash, "ROOT", tmp_path)
     changes = [
         lambda job: checkpoint.write_bytes(checkpoint.read_bytes()[:-4] + b"\0\0\0\1"),
         lambda job: robot.write_text(robot.read_text().replace("name: op3", "name: mine")),
@@ -176,43 +143,40 @@ def test_what_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch:
         lambda job: Path(job.settings.policy).write_text("steps: 3\n"),
         lambda job: module.write_text("edited = True\n"),
     ]
-    monkeypatch.setattr("servoid.hw.config.CONFIGS", tmp_path / "configs")
     for number, change in enumerate(changes):
 
-        def do(job: Job, change: Any = change) -> Done:
+        def do(job: EpisodeJob, change: Any = change) -> EpisodeResult:
             change(job)
-            return Done(job, {"success": True})
+            return EpisodeResult(job, {"success": True})
 
-        monkeypatch.setattr(session, "do", do)
         out = tmp_path / str(number)
         with pytest.raises(ConfigError, match="changed while"):
-            evaluate([NEAR], Options(out, policy=str(checkpoint), robot=str(robot), workers=1), quiet)
+            evaluate([NEAR], Options(out, policy=str(checkpoint), robot=str(robot), workers=1), do)
         assert not any('"episode"' in path.read_text() for path in (out / "episodes").glob("*.jsonl"))
 
 
-def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path) -> None:
     from servoid.policy.diffusion.settings import load_settings
 
     mine = tmp_path / "mine.yaml"
     mine.write_text("checkpoint: diffusion\nreplan: 6\n")
     ran = []
 
-    def do(job: Job) -> Done:
-        ran.append(load_settings(job.settings.policy).replan)
+    def do(job: EpisodeJob) -> EpisodeResult:
+        ran.append(load_settings(job.settings.policy).execution_horizon)
         mine.write_text("checkpoint: diffusion\nreplan: 8\n")
-        return Done(job, {"success": True})
+        return EpisodeResult(job, {"success": True})
 
-    monkeypatch.setattr(session, "do", do)
-    evaluate([NEAR], Options(tmp_path, policy=str(mine), workers=1), quiet)
+    evaluate([NEAR], Options(tmp_path, policy=str(mine), workers=1), do)
     assert ran == [6, 6, 6, 6]
 
 
-def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done: list[Job]) -> None:
-    stand = Row("t/stand", "T", "Stand", Run("stand", episodes=3), Metric("success", share=True))
-    variant = Row("t/variant", "T", "Variant", Run("goal-near", plan={"replan": "8"}), Metric("success", share=True))
-    measured = evaluate([stand, variant, FAR], options(tmp_path), quiet)
+def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done: Episodes) -> None:
+    stand = Row("t/stand", "Stand", Experiment("stand", episodes=3), SUCCESS)
+    variant = Row("t/variant", "Variant", Experiment("goal-near", plan={"execution_horizon": "8"}), SUCCESS)
+    measured = evaluate([stand, variant, FAR], options(tmp_path), done)
     assert measured["t/stand"].refused == "the floor is missing"
-    assert sum(job.settings.task == "stand" for job in done) == 1
+    assert sum(job.settings.task == "stand" for job in done.jobs) == 1
     assert "for diffusion models" in (measured["t/variant"].refused or "")
     assert len(measured["t/far"].records) == 2
 
@@ -227,16 +191,16 @@ def test_an_error_of_one_run_does_not_stop_the_others(
         return {"success": True}
 
     monkeypatch.setattr("servoid.tools.evaluate.episode.record", record)
-    measured = evaluate([FAR, NEAR], options(tmp_path), quiet)
+    measured = evaluate([FAR, NEAR], options(tmp_path), do_episode)
     assert str(error) in (measured["t/far"].refused or "")
     assert len(measured["t/near"].records) == 4
 
 
-def test_no_time_at_all_tells_what_was_done(tmp_path: Path, done: list[Job]) -> None:
-    evaluate([NEAR], options(tmp_path, episodes=1), quiet)
-    measured = evaluate([NEAR, FAR], options(tmp_path, minutes=0), quiet)
+def test_no_time_at_all_tells_what_was_done(tmp_path: Path, done: Episodes) -> None:
+    evaluate([NEAR], options(tmp_path, episodes=1), done)
+    measured = evaluate([NEAR, FAR], options(tmp_path, minutes=0), done)
     assert [len(measured[row.name].records) for row in (NEAR, FAR)] == [1, 0]
-    assert len(done) == 1
+    assert len(done.jobs) == 1
 
 
 def test_no_time_at_all_records_no_clips_and_forgets_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -269,8 +233,56 @@ def test_an_episode_that_ctrl_c_ended_is_not_kept(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr("servoid.tools.commands.rollout.judge", judge)
     with pytest.raises(KeyboardInterrupt):
-        evaluate([NEAR], options(tmp_path), quiet)
+        evaluate([NEAR], options(tmp_path), do_episode)
     assert not any('"episode"' in path.read_text() for path in (tmp_path / "episodes").glob("*.jsonl"))
+
+
+def test_after_ctrl_c_the_figures_are_of_what_was_done(
+    tmp_path: Path, done: Episodes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def until_the_third(job: EpisodeJob) -> EpisodeResult:
+        if len(done.jobs) == 3:
+            raise KeyboardInterrupt
+        return done(job)
+
+    with pytest.raises(Interrupted, match="the same command goes on") as caught:
+        evaluate([NEAR, FAR], options(tmp_path), until_the_third)
+    assert {name: len(one.records) for name, one in caught.value.measured.items()} == {"t/near": 2, "t/far": 1}
+    assert len(evaluate([NEAR, FAR], options(tmp_path), done)["t/near"].records) == 4
+    assert len(done.jobs) == 6
+
+
+def test_the_command_prints_and_writes_what_was_done_until_ctrl_c(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    judged = rollout.judge
+    seen = []
+
+    def judge(settings: RunSettings) -> rollout.Judged:
+        if seen:
+            raise KeyboardInterrupt
+        seen.append(settings)
+        return judged(settings)
+
+    monkeypatch.setattr(rollout, "judge", judge)
+    words = [
+        "evaluate",
+        "papers",
+        "--policy",
+        "gait",
+        "--rows",
+        "uniphys/goal-near",
+        "--seconds",
+        "1",
+        "--workers",
+        "1",
+    ]
+    assert main([*words, "--episodes", "2", "--out", str(tmp_path), "--json"]) == 130
+    captured = capfd.readouterr()
+    answer = json.loads(captured.out)
+    assert (answer["exit_code"], answer["rows"][0]["episodes"]) == (130, 1)
+    assert "the same command goes on" in answer["error"]
+    assert "| 1 |" in (tmp_path / "papers.md").read_text()
 
 
 def test_a_cache_that_cannot_be_written_says_so(tmp_path: Path) -> None:
@@ -279,6 +291,7 @@ def test_a_cache_that_cannot_be_written_says_so(tmp_path: Path) -> None:
         EpisodeCache(tmp_path / "file", {"a": 1})
 
 
+@pytest.mark.slow
 def test_the_command_from_episodes_to_pictures(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """A real one, two seconds long, with a pillar or two; and again, from what was kept."""
     words = [
@@ -335,7 +348,7 @@ def test_bad_choices_are_refused(words: list[str], named: str, tmp_path: Path, c
 
 def test_the_text_encoder_is_measured_apart() -> None:
     from servoid.policy.text.captions import MOTIONS
-    from servoid.tools.evaluate.papers import encoder_accuracy
+    from servoid.tools.commands.evaluate import encoder_accuracy
 
     result = encoder_accuracy()
     assert result["phrasings"] == sum(len(motion.held_out) for motion in MOTIONS)

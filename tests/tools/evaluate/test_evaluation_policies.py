@@ -11,8 +11,8 @@ import pytest
 from servoid.hw.config import ConfigError
 from servoid.policy.checkpoint import read, resolve, write
 from servoid.tools.evaluate.cache import key
-from servoid.tools.evaluate.policies import Pilots, spec
-from servoid.tools.evaluate.spec import Network, Run
+from servoid.tools.evaluate.policies import Policies, dependencies
+from servoid.tools.evaluate.spec import Experiment, OwnNetwork
 
 
 def newest(folder: Path, share: float | None) -> None:
@@ -26,69 +26,74 @@ def test_a_changed_checkpoint_setting_or_task_changes_what_episodes_depend_on(tm
     checkpoint = tmp_path / "mine.safetensors"
     shutil.copy(resolve("diffusion"), checkpoint)
 
-    def made_of(run: Run) -> str:
-        return key(spec(run, Pilots(str(checkpoint), tmp_path), "op3", 0, None, None))
+    def made_of(experiment: Experiment) -> str:
+        return key(dependencies(experiment, Policies(str(checkpoint), tmp_path), "op3", 0, None, None))
 
-    run = Run("goal-near")
-    before = made_of(run)
-    assert made_of(Run("goal-near", episodes=7)) == before  # more of the same
+    experiment = Experiment("goal-near")
+    before = made_of(experiment)
+    assert made_of(Experiment("goal-near", episodes=7)) == before  # more of the same
     others = [
-        made_of(Run("goal-near", set={"radius": "0.09"})),
-        made_of(Run("goal-near", plan={"replan": "8"})),
-        made_of(Run("goal-near", randomise=True)),
-        made_of(Run("goal-near", backend="virtual")),
-        made_of(Run("goal-near", policy="expert")),
-        made_of(Run("goal-far")),
+        made_of(Experiment("goal-near", set={"radius": "0.09"})),
+        made_of(Experiment("goal-near", plan={"execution_horizon": "8"})),
+        made_of(Experiment("goal-near", randomise=True)),
+        made_of(Experiment("goal-near", backend="virtual")),
+        made_of(Experiment("goal-near", policy="expert")),
+        made_of(Experiment("goal-far")),
     ]
     elsewhere = tmp_path / "elsewhere" / "other.safetensors"
     elsewhere.parent.mkdir()
     shutil.copy(checkpoint, elsewhere)
-    assert key(spec(run, Pilots(str(elsewhere), tmp_path), "op3", 0, None, None)) == before  # the same bytes
+    assert (
+        key(dependencies(experiment, Policies(str(elsewhere), tmp_path), "op3", 0, None, None)) == before
+    )  # the same bytes
     checkpoint.write_bytes(checkpoint.read_bytes()[:-4] + b"\0\0\0\1")
-    assert len({before, *others, made_of(run)}) == 8
+    assert len({before, *others, made_of(experiment)}) == 8
 
 
 def test_a_network_of_latents_wants_the_latents_first(tmp_path: Path) -> None:
-    run, pilots = Run("survive", network=Network("z", "--mask causal", latents=True)), Pilots("diffusion", tmp_path)
-    latents, command = tmp_path / "networks" / "latents" / "latent.safetensors", pilots.training(run)
+    experiment, policies = (
+        Experiment("survive", network=OwnNetwork("z", "--mask causal", latents=True)),
+        Policies("diffusion", tmp_path),
+    )
+    latents, command = tmp_path / "networks" / "latents" / "latent.safetensors", policies.training(experiment)
     last = f"`servoid train diffusion --data runs/walks --out {tmp_path}/networks/z --mask causal --latent {latents}`"
     first = f"servoid train latent --data runs/walks --out {latents.parent}"
     assert command == f"`{first}`, then {last}"
     newest(latents.parent, 0.5)
     latents.touch()  # the best so far, of a training that goes on
-    assert pilots.training(run) == f"`{first}`, then {last}"
+    assert policies.training(experiment) == f"`{first}`, then {last}"
     newest(latents.parent, None)
-    assert pilots.training(run) == f"`{first} --no-resume`, then {last}"
+    assert policies.training(experiment) == f"`{first} --no-resume`, then {last}"
     newest(latents.parent, 1.0)
-    assert pilots.training(run) == last
+    assert policies.training(experiment) == last
 
 
 def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path) -> None:
-    pilots = Pilots("diffusion", tmp_path)
-    run = Run("goal-near", network=Network("full", "--width 128 --horizon 24"))
+    policies = Policies("diffusion", tmp_path)
+    experiment = Experiment("goal-near", network=OwnNetwork("full", "--width 128 --horizon 24"))
     train = f"servoid train diffusion --data runs/walks --out {tmp_path}/networks/full --width 128 --horizon 24"
-    assert pilots.training(run) == f"`{train}`"
+    assert policies.training(experiment) == f"`{train}`"
     path = tmp_path / "networks" / "full" / "best.safetensors"
     newest(path.parent, 1.0)
     shutil.copy(resolve("diffusion"), path)
-    assert pilots.training(run) is None
-    assert str(path.resolve()) in Path(pilots.name(run)).read_text()
-    other = replace(run, network=Network("full", "--width 128 --horizon 24 --near-actions 16"))
+    assert policies.training(experiment) is None
+    assert str(path.resolve()) in Path(policies.name(experiment)).read_text()
+    other = replace(experiment, network=OwnNetwork("full", "--width 128 --horizon 24 --near-actions 16"))
     with pytest.raises(ConfigError, match="trained with --near-actions 8, and this row is of 16"):
-        pilots.name(other)
+        policies.name(other)
 
 
 def test_of_a_network_that_was_trained_by_steps_the_minutes_do_not_matter(tmp_path: Path) -> None:
-    run = Run("goal-near", network=Network("full", "--width 128 --horizon 24 --steps 9"))
+    experiment = Experiment("goal-near", network=OwnNetwork("full", "--width 128 --horizon 24 --steps 9"))
     head, tensors = read(resolve("diffusion"))
     for steps in (9, 8):
         folder = tmp_path / str(steps) / "networks" / "full"
         newest(folder, 1.0)
         training = {**head["training"], "steps": steps, "minutes": 5.0}
         write(folder / "best.safetensors", tensors, {**head, "training": training})
-    assert Pilots("diffusion", tmp_path / "9").name(run)
+    assert Policies("diffusion", tmp_path / "9").name(experiment)
     with pytest.raises(ConfigError, match="trained with --steps 8, and this row is of 9"):
-        Pilots("diffusion", tmp_path / "8").name(run)
+        Policies("diffusion", tmp_path / "8").name(experiment)
 
 
 @pytest.mark.parametrize(
@@ -100,26 +105,26 @@ def test_of_a_network_that_was_trained_by_steps_the_minutes_do_not_matter(tmp_pa
 )
 def test_a_half_trained_network_fills_no_row(tmp_path: Path, share: float | None, told: str) -> None:
     """Its best so far is there from the first evaluation."""
-    run = Run("goal-near", network=Network("full", "--width 128 --horizon 24"))
+    experiment = Experiment("goal-near", network=OwnNetwork("full", "--width 128 --horizon 24"))
     newest(tmp_path / "networks" / "full", share)
     shutil.copy(resolve("diffusion"), tmp_path / "networks" / "full" / "best.safetensors")
-    pilots = Pilots("diffusion", tmp_path)
+    policies = Policies("diffusion", tmp_path)
     with pytest.raises(ConfigError, match=told):
-        pilots.name(run)
+        policies.name(experiment)
     if share is None:
         (tmp_path / "networks" / "full" / "last.safetensors").unlink()
         with pytest.raises(ConfigError, match=told):
-            pilots.fingerprint(run)
+            policies.fingerprint(experiment)
 
 
 def test_variants_of_the_planner_are_files_that_the_policy_is_made_from(tmp_path: Path) -> None:
     from servoid.policy.diffusion.settings import load_settings
 
-    pilots = Pilots("diffusion", tmp_path)
-    assert load_settings(pilots.name(Run("goal"))).replan == load_settings().replan
-    assert pilots.name(Run("goal", policy="expert")) == "expert"
-    written = load_settings(pilots.name(Run("goal", plan={"replan": "8", "guidance.clip": "3"})))
-    assert (written.replan, written.guidance.clip) == (8, 3.0)
+    policies = Policies("diffusion", tmp_path)
+    assert load_settings(policies.name(Experiment("goal"))).execution_horizon == load_settings().execution_horizon
+    assert policies.name(Experiment("goal", policy="expert")) == "expert"
+    written = load_settings(policies.name(Experiment("goal", plan={"execution_horizon": "8", "guidance.clip": "3"})))
+    assert (written.execution_horizon, written.guidance.clip) == (8, 3.0)
     assert written.steps == load_settings().steps
     with pytest.raises(ConfigError, match="replann"):
-        pilots.name(Run("goal", plan={"replann": "8"}))
+        policies.name(Experiment("goal", plan={"replann": "8"}))

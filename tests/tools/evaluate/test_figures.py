@@ -12,9 +12,9 @@ import pytest
 
 from servoid.policy.diffusion.settings import load_settings as load_policy
 from servoid.stack.tasks import load_settings
-from servoid.tools.evaluate.spec import Row
-from servoid.tools.evaluate.table import ROWS
+from servoid.tools.evaluate.spec import Row, load_evaluation
 
+ROWS = load_evaluation("papers").rows
 LENGTH, TIME = 0.275, 0.524
 BY_NAME: dict[str, Row] = {row.name: row for row in ROWS}
 
@@ -140,8 +140,8 @@ def test_shares_of_the_papers_are_shares_here_and_lengths_are_ticks() -> None:
         assert metric.share == (name not in ("uniphys/length", "uniphys/velocity")), name
         assert not metric.share or 0.0 <= published <= 1.0
     assert BY_NAME["uniphys/length"].metric.unit == "ticks"
-    assert BY_NAME["uniphys/obstacle"].run.episodes == 50  # section 5.4
-    assert all(BY_NAME[name].run.episodes == 100 for name in MAIN if name != "uniphys/obstacle")
+    assert BY_NAME["uniphys/obstacle"].experiment.episodes == 50  # section 5.4
+    assert all(BY_NAME[name].experiment.episodes == 100 for name in MAIN if name != "uniphys/obstacle")
 
 
 # Settings of the tasks' files: the value there, and what the paper says.
@@ -188,14 +188,14 @@ def test_pushes_and_velocities_are_those_that_this_robot_was_given() -> None:
 def test_rows_are_measured_by_the_settings_of_the_files() -> None:
     """An easier goal in a row's own settings would be another task than the one that is named."""
     for name in MAIN:
-        assert not BY_NAME[name].run.set, name
-        assert not BY_NAME[name].run.randomise
-        assert BY_NAME[name].run.backend == "sim"
+        assert not BY_NAME[name].experiment.set, name
+        assert not BY_NAME[name].experiment.randomise
+        assert BY_NAME[name].experiment.backend == "sim"
 
 
 def test_plans_are_sampled_as_the_papers_say() -> None:
     uniphys, cloc = load_policy("uniphys"), load_policy("diffuse_cloc")
-    assert (uniphys.schedule, uniphys.steps) == ("gradual", 5)  # UniPhys, table 1 and section A
+    assert (uniphys.schedule, uniphys.steps) == ("pyramid", 5)  # UniPhys, table 1 and section A
     assert (uniphys.guidance.samples, uniphys.guidance.choose) == (3, "mean")  # table A.1, eq. 4
     assert (cloc.schedule, cloc.rolling.state_level, cloc.rolling.action_level) == ("rolling", 14, 4)  # section 5.2
-    assert cloc.replan == 1  # table 1
+    assert cloc.execution_horizon == 1  # table 1

@@ -10,16 +10,17 @@ import pytest
 
 from servoid.hw.config import ConfigError
 from servoid.tools.common.parser import Parser
-from servoid.tools.evaluate.spec import Beside, Metric, Row, Run, select
-from servoid.tools.evaluate.summary import Measured, table
-from servoid.tools.evaluate.table import ROWS
-from servoid.tools.evaluate.write import as_csv, cells, markdown, number
+from servoid.tools.evaluate.metrics import METRICS, Metric
+from servoid.tools.evaluate.report import Measured, as_csv, cells, markdown, number, table
+from servoid.tools.evaluate.spec import Beside, Experiment, Row, load_evaluation, select
 
-SHARE = Row("a/share", "A", "Share", Run("goal"), Metric("success", share=True), 0.95, figure=0.9)
-FALLS = Row("a/falls", "A", "Falls", Run("goal"), Metric("fell", share=True, lower=True), 0.16, figure=0.16)
-ERROR = Row("a/error", "A", "Error", Run("goal"), Metric("metrics.error_m", "m", lower=True), 0.1, figure=0.05)
-TWICE = Row("a/twice", "A", "Twice", Run("goal"), Metric("ticks", lower=True), figure=Beside("a/expert", 1.2))
-EXPERT = Row("a/expert", "A", "Expert", Run("goal", policy="expert"), Metric("ticks", lower=True))
+ROWS = load_evaluation("papers").rows
+GOAL, LOWEST = Experiment("goal"), Metric("ticks", lower=True)
+SHARE = Row("a/share", "Share", GOAL, METRICS["success"], "A", 0.95, figure=0.9)
+FALLS = Row("a/falls", "Falls", GOAL, METRICS["falls"], "A", 0.16, figure=0.16)
+ERROR = Row("a/error", "Error", GOAL, Metric("error_m", "m", lower=True), "A", 0.1, figure=0.05)
+TWICE = Row("a/twice", "Twice", GOAL, LOWEST, "A", figure=Beside("a/expert", 1.2))
+EXPERT = Row("a/expert", "Expert", Experiment("goal", policy="expert"), LOWEST, "A")
 
 
 def records(n: int, good: int) -> list[dict]:
@@ -50,7 +51,7 @@ def test_a_robot_that_cannot_go_on_has_not_stayed_up() -> None:
     """Else a guard that stops every run, or a robot that never comes up, would be one that never falls."""
     some = [{**record, "fell": False, "outcome": "stopped"} for record in records(10, 0)]
     for row in ROWS:
-        if row.metric.of == "fell":
+        if row.metric.of == "fell_or_broken_off":
             line = one(row, Measured(some))
             assert (line["value"], line["reached"] is True) == (1.0, False), row.name
             assert "broken off" in row.title
@@ -93,13 +94,25 @@ def test_times_of_those_that_succeeded_say_how_many_did_not() -> None:
     )
 
 
+def test_a_time_that_no_episode_came_to_was_not_reached() -> None:
+    (row,) = (row for row in ROWS if row.name == "cloc/forest-seconds")
+    line = one(row, Measured(records(5, 0)))
+    assert (line["value"], line["reached"]) == (None, False)
+
+
+def test_a_metric_that_the_task_does_not_have_is_not_taken_for_episodes_that_ended_early() -> None:
+    line = one(replace(ERROR, metric=Metric("eror_m")), Measured(records(5, 5)))
+    assert "the task measures no 'eror_m', but error_m, fell_or_broken_off" in line["note"]
+    assert "had ended" not in line["note"]
+
+
 def test_a_figure_may_be_another_rows_value() -> None:
     lines = table([TWICE, EXPERT], {"a/twice": Measured(records(3, 3)), "a/expert": Measured(records(1, 1))})
     assert lines[0]["figure"] == pytest.approx(120.0)
     assert lines[0]["reached"] is True
     assert lines[1]["reached"] is None  # no figure was set
     lines = table([TWICE, EXPERT], {"a/twice": Measured(records(3, 3)), "a/expert": Measured()})
-    assert (lines[0]["figure"], lines[0]["reached"]) == (None, False)
+    assert (lines[0]["figure"], lines[0]["reached"]) == (None, None)
 
 
 @pytest.mark.parametrize(
@@ -114,9 +127,9 @@ def test_a_figure_may_be_another_rows_value() -> None:
     ],
 )
 def test_what_was_not_measured_has_no_value_and_says_why(measured: Measured, told: str) -> None:
-    assert one(replace(SHARE, figure=None), measured)["reached"] is None
+    """Nor that its figure was not reached, which nobody knows."""
     line = one(SHARE, measured)
-    assert (line["value"], line["ci95"], line["episodes"], line["reached"]) == (None, None, 0, False)
+    assert (line["value"], line["ci95"], line["episodes"], line["reached"]) == (None, None, 0, None)
     assert told in line["note"]
     assert "none" in cells(line)
 
@@ -128,7 +141,7 @@ def test_an_episode_that_the_guard_broke_off_is_told() -> None:
 
 
 def test_a_mean_without_an_interval_says_why() -> None:
-    lengths = Row("a/length", "A", "Length", Run("goal"), Metric("ticks"))
+    lengths = Row("a/length", "Length", GOAL, Metric("ticks"))
     assert "no interval: fewer than 4 episodes" in one(lengths, Measured(records(3, 3)))["note"]
     same = one(lengths, Measured([{**record, "ticks": 3000} for record in records(6, 6)]))
     assert (same["value"], same["ci95"]) == (3000.0, None)
@@ -156,8 +169,10 @@ def test_numbers_keep_all_digits_before_the_point() -> None:
 
 def test_what_is_finer_than_the_resolution_is_not_compared() -> None:
     """A robot that always has a foot on the ground floats by nothing: 2e-7 mm against 0 is no shortfall."""
-    metric = Metric("x", "mm", lower=True, resolution=0.001)
-    assert metric.values([{"x": 2.4e-7}, {"x": 0.0}, {"x": 0.0312}]) == pytest.approx([0.0, 0.0, 0.031])
+    metric = Metric("x_mm", "mm", lower=True, resolution=0.001)
+    assert metric.values([{"metrics": {"x_mm": value}} for value in (2.4e-7, 0.0, 0.0312)]) == pytest.approx(
+        [0.0, 0.0, 0.031]
+    )
 
 
 def test_rows_are_chosen_by_pattern_and_bring_what_they_are_held_against() -> None:
@@ -173,8 +188,8 @@ def test_every_row_can_be_told_apart_and_is_of_a_task_that_there_is() -> None:
 
     assert len({row.name for row in ROWS}) == len(ROWS)
     for row in ROWS:
-        load_settings(row.run.task, dict(row.run.set))
-        assert row.run.episodes >= 50
+        load_settings(row.experiment.task, dict(row.experiment.set))
+        assert row.experiment.episodes >= 50
     for row in ROWS:
         if isinstance(row.figure, Beside):
             assert row.figure.row in {other.name for other in ROWS}
@@ -183,19 +198,21 @@ def test_every_row_can_be_told_apart_and_is_of_a_task_that_there_is() -> None:
 def test_the_main_rows_are_repeated_on_the_randomised_robot_and_four_on_the_virtual_one() -> None:
     randomised = [row for row in ROWS if row.name.endswith("@randomised")]
     assert len(randomised) == 8
-    assert all(row.run.randomise for row in randomised)
-    assert sum(row.run.backend == "virtual" for row in ROWS) == 4
+    assert all(row.experiment.randomise for row in randomised)
+    assert sum(row.experiment.backend == "virtual" for row in ROWS) == 4
     quick = select(ROWS, [], quick=True)
-    assert not any(row.run.randomise or row.run.backend != "sim" or row.run.network for row in quick)
+    assert not any(
+        row.experiment.randomise or row.experiment.backend != "sim" or row.experiment.network for row in quick
+    )
     undelayed = [row for row in ROWS if row.name.endswith("@no-delay")]
     assert len(undelayed) == 8
-    assert all(row.run.plan["delay"] == "0" for row in undelayed)
+    assert all(row.experiment.plan["delay"] == "0" for row in undelayed)
     assert not any(row.name.startswith("calls/") or row in undelayed for row in quick)
 
 
 def test_networks_are_named_apart() -> None:
     """Two networks in one folder would be measured as one."""
-    trained = [row.run.network for row in ROWS if row.run.network is not None]
+    trained = [row.experiment.network for row in ROWS if row.experiment.network is not None]
     assert len({network.name for network in trained}) == len(set(trained))
 
 
@@ -208,8 +225,8 @@ def test_commands_that_train_networks_can_be_typed() -> None:
     parser = Parser()
     diffusion.add_arguments(parser)
     for row in ROWS:
-        if row.run.network is not None:
-            words = shlex.split(f"--data runs/walks --out runs/x {row.run.network.train}")
+        if row.experiment.network is not None:
+            words = shlex.split(f"--data runs/walks --out runs/x {row.experiment.network.train}")
             asked = read_settings(parser.parse_args(words), DiffusionTraining())
             assert asked.mask in MASKS, row.name
             assert (asked.steps, asked.width) == (15_000, 128)  # equal ones, whatever the load of the machine was
@@ -223,14 +240,18 @@ def test_stabilisation_is_about_as_noisy_as_the_papers() -> None:
     from servoid.policy.diffusion.settings import load_settings
 
     theirs = np.sqrt(1.0 - cosine_signal(50)[3])
-    stable = [int(row.run.plan["stabilise"]) for row in ROWS if row.run.plan.get("stabilise", "0") != "0"]
-    for level in {load_settings("uniphys").stabilise, *stable}:
+    stable = [
+        int(row.experiment.plan["stabilization_level"])
+        for row in ROWS
+        if row.experiment.plan.get("stabilization_level", "0") != "0"
+    ]
+    for level in {load_settings("uniphys").stabilization_level, *stable}:
         assert np.sqrt(1.0 - cosine_signal(20)[level]) == pytest.approx(theirs, rel=0.2)
 
 
 def test_rows_of_the_forest_that_are_compared_differ_in_their_network_alone() -> None:
-    forest = [row for row in ROWS if row.run.task == "forest" and row.metric.share]
-    trained = {row.name: row.run for row in forest if row.run.network is not None}
+    forest = [row for row in ROWS if row.experiment.task == "forest" and row.metric.share]
+    trained = {row.name: row.experiment for row in forest if row.experiment.network is not None}
     assert {"cloc/reference", "cloc/horizon-16", "cloc/horizon-64", "cloc/actions-1"} <= trained.keys()
     assert {run.plan["schedule"] for run in trained.values()} == {"rolling"}  # those of the paper's table roll
     assert len({repr(run.plan) for run in trained.values()}) == 1
@@ -243,11 +264,11 @@ def test_rows_of_the_forest_that_are_compared_differ_in_their_network_alone() ->
 
 def test_each_network_of_the_forest_is_pushed_too() -> None:
     rows = {row.name: row for row in ROWS}
-    forest = [row for row in ROWS if row.run.task == "forest" and row.run.network is not None]
+    forest = [row for row in ROWS if row.experiment.task == "forest" and row.experiment.network is not None]
     for row in (row for row in forest if row.metric.share):
         timed, pushed = rows[f"{row.name}-seconds"], rows[f"{row.name}-perturb"]
-        assert (timed.run, timed.published_unit) == (row.run, "s of a human")
-        assert pushed.run == replace(row.run, task="perturb", randomise=True)
+        assert (timed.experiment, timed.published_unit) == (row.experiment, "s of a human")
+        assert pushed.experiment == replace(row.experiment, task="perturb", randomise=True)
         assert (pushed.metric, pushed.published) == (rows["cloc/perturb"].metric, None)
         assert pushed.note.startswith("not in the paper's table")
 
@@ -255,10 +276,10 @@ def test_each_network_of_the_forest_is_pushed_too() -> None:
 def test_without_rolling_nothing_goes_over_from_plan_to_plan() -> None:
     rows = {row.name: row for row in ROWS}
     none, both = rows["cloc/rolling-none"], rows["cloc/rolling-both"]
-    assert none.run.plan["schedule"] == "full_sequence"  # `rolling` from any level keeps the noise of each frame
+    assert none.experiment.plan["schedule"] == "full_sequence"  # `rolling` from any level keeps the noise of each frame
     assert "noise of its own" in none.note
-    for key in ("replan", "delay"):
-        assert none.run.plan[key] == both.run.plan[key]
+    for key in ("execution_horizon", "delay"):
+        assert none.experiment.plan[key] == both.experiment.plan[key]
 
 
 def test_motion_is_measured_on_episodes_that_are_done_anyway_and_beside_the_expert() -> None:
@@ -267,8 +288,8 @@ def test_motion_is_measured_on_episodes_that_are_done_anyway_and_beside_the_expe
     for name, main in (("goal-far", "uniphys/goal-far"), ("velocity", "uniphys/velocity")):
         for kind in ("floating", "jerk", "foot-slip"):
             row, expert = rows[f"motion/{kind}-{name}"], rows[f"motion/{kind}-{name}-expert"]
-            assert row.run == rows[main].run
-            assert expert.run.policy == "expert"
+            assert row.experiment == rows[main].experiment
+            assert expert.experiment.policy == "expert"
             assert (row.metric, expert.published) == (expert.metric, None)
             assert row.published == table3.get(kind, {}).get(name)
             assert row.figure == Beside(expert.name, 1.2)
@@ -279,5 +300,5 @@ def test_settings_of_the_planner_are_those_that_there_are() -> None:
     from servoid.policy.diffusion.settings import DiffusionSettings
 
     for row in ROWS:
-        override(DiffusionSettings(), dict(row.run.plan))
-    assert sum(bool(row.run.plan) for row in ROWS) > 10
+        override(DiffusionSettings(), dict(row.experiment.plan))
+    assert sum(bool(row.experiment.plan) for row in ROWS) > 10

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import time
 
 import pytest
 
@@ -12,9 +10,9 @@ from servoid.hw.robot.description import load_robot
 from servoid.sim.rig.faults import EXPECTED
 from servoid.stack.safety.guard import LOWER_SECONDS, REST_SECONDS
 from servoid.tools.cli import main
+from servoid.tools.common.worker_pool import Lost
 from servoid.tools.faults.campaign import QUICK, lost, summarise
 from servoid.tools.faults.trial import Trial, Verdict, unsafe_goals
-from servoid.tools.faults.workers import Lost, work_all
 
 ROBOT = load_robot()
 KNEE = ROBOT.names.index("l_knee")
@@ -58,40 +56,12 @@ def test_goals_are_judged_by_range_and_by_speed() -> None:
     assert unsafe_goals(ROBOT, [ON, off, goal(4, 0.5), goal(5, 1.5)]) == [], "it drives nothing"
 
 
-def nap(seconds: float) -> float:
-    time.sleep(seconds)
-    return seconds
-
-
-def fail(job: int) -> int:
-    if job == 1:
-        os._exit(3)
-    if job == 2:
-        raise ValueError("no such thing")
-    return job
-
-
-def test_what_hangs_is_counted_and_the_rest_is_done() -> None:
-    began = time.monotonic()
-    done = dict(work_all(nap, [0.01, 600.0, 0.02], 2, 2.0, start_seconds=30.0))
-    assert done == {0: 0.01, 1: Lost("hung", "did not end within 2 s"), 2: 0.02}
-    assert time.monotonic() - began < 120.0
-
-
-def test_what_dies_says_so_and_does_not_count_as_hung() -> None:
-    done = dict(work_all(fail, [0, 1, 2, 3], 1, 60.0))
-    assert (done[0], done[3]) == (0, 3)
-    assert done[1].how == done[2].how == "died"
-    assert "exit code 3" in done[1].text
-    assert done[2].text == "ValueError: no such thing"
-
-
 def test_the_summary_counts_what_was_not_named_what_hung_and_what_died() -> None:
     late = Verdict("dead", 1, "fatal", named=True, detection_ticks=11, ended="damped", problems=["late"])
     good = Verdict("dead", 2, "fatal", named=True, detection_ticks=3, ended="damped", off_seconds=0.4)
     calm = Verdict("drop", 1, "absorbed")
-    stuck = lost(Trial("drop", 2), Lost("hung", "did not end within 1 s"))
-    gone = lost(Trial("dead", 3), Lost("died", "exit code -11"))
+    stuck = lost(Trial("drop", 2), Lost("hung", "did not end within 1 s", TimeoutError()))
+    gone = lost(Trial("dead", 3), Lost("died", "exit code -11", RuntimeError()))
     result = summarise([late, good, calm, stuck, gone])
     assert (result["unnamed_faults"], result["ended_running"], result["ended_damped"]) == (1, 1, 2)
     assert (result["hangs"], result["deaths"]) == (1, 1)

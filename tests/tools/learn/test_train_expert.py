@@ -150,8 +150,10 @@ def test_a_folder_of_another_run_is_not_gone_on_with(trained: tuple[Path, Expert
     out, _ = trained
     with pytest.raises(ConfigError, match=r"did not begin with .*--no-resume"):
         trainer(out, init=out / "expert.safetensors")
-    with pytest.raises(ConfigError, match=r"hidden was \(32, 16\), is \(16, 16\); push was 0.45, is 0.5.*--no-resume"):
-        trainer(out, hidden=(16, 16), push=0.5)
+    with pytest.raises(
+        ConfigError, match=r"hidden was \(32, 16\), is \(16, 16\); hardest_push was 0.9, is 0.5.*--no-resume"
+    ):
+        trainer(out, hidden=(16, 16), hardest_push=0.5)
     (tmp_path / "state.pt").write_bytes(b"")
     with pytest.raises(ConfigError, match=r"state\.pt: a run of an older program.*--no-resume.*--init"):
         trainer(tmp_path)
@@ -176,12 +178,12 @@ def test_an_interrupted_run_leaves_its_newest_network(tmp_path: Path) -> None:
 def test_commands_of_training_are_spread_over_what_is_asked() -> None:
     """Backward while turning is where the tracker fell most, and top speed what it lacked: both must be seen often."""
     rng = np.random.default_rng(0)
-    commands = np.array([_draw(rng, SETTINGS) for _ in range(4000)])
-    assert (commands[:, 0] >= SETTINGS.vx[0]).all()
-    assert (commands[:, 0] <= SETTINGS.vx[1]).all()
+    commands = np.array([_draw(rng, SETTINGS, ROBOT.walking) for _ in range(4000)])
+    assert (commands >= ROBOT.walking.lower).all()
+    assert (commands <= ROBOT.walking.upper).all()
     still = (commands == 0).all(1)
     mixed_back = (commands[:, 0] < 0) & (commands[:, 1:] != 0).all(1)
-    fast = commands[:, 0] > 0.35
+    fast = commands[:, 0] > 0.7 * ROBOT.walking.forward
     assert still.mean() == pytest.approx(SETTINGS.stand, abs=0.02)
     assert mixed_back.mean() > SETTINGS.backward
     assert fast.mean() > 0.08

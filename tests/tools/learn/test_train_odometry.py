@@ -18,14 +18,14 @@ from servoid.stack.estimation.odometry import OFFSETS, OdometryFeatures, load_od
 from servoid.tools.learn.settings import OdometryTraining
 from servoid.tools.learn.trainers import odometry
 from servoid.tools.learn.trainers.odometry import OdometryTrainer
-from servoid.tools.learn.walks import drift, driver, record
+from servoid.tools.learn.walks import drift, maker, record
 
 ROBOT = load_robot()
 
 
 @pytest.fixture(scope="module")
 def recorded() -> dict[str, np.ndarray]:
-    return record(ROBOT, driver(ROBOT, "gait"), 6, 4.0, seed=0)
+    return record(ROBOT, maker(ROBOT, "gait"), 6, 4.0, seed=0)
 
 
 def test_a_recording_is_what_the_network_will_see(recorded: dict[str, np.ndarray]) -> None:
@@ -113,6 +113,6 @@ def test_an_odometry_is_measured_and_nothing_is_trained(tmp_path: Path, capsys: 
 
 def test_walks_that_cover_no_metre_do_not_count() -> None:
     """Sway is no path: two seconds of walking sway a metre, and cover none."""
-    result = drift(ROBOT, driver(ROBOT, "gait"), None, walks=4, seconds=2.0, seed=1)
+    result = drift(ROBOT, maker(ROBOT, "gait"), None, walks=4, seconds=2.0, seed=1)
     assert result.walks == 0
     assert np.isnan(result.p90)

@@ -69,8 +69,8 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
     settings = read(DiffusionTraining(), "--config", str(file), "--width", "32", "--steps", "5")
     assert settings == replace(DiffusionTraining(), width=32, horizon=8, monotone=0.1, steps=5)
     assert read(LatentTraining(), "--beta", "0.1", "0.2") == replace(LatentTraining(), beta=(0.1, 0.2))
-    assert read(ExpertTraining(), "--vx", "-0.1", "0.4", "--plain-odometry", "--hidden", "32", "16") == replace(
-        ExpertTraining(), vx=(-0.1, 0.4), plain_odometry=True, hidden=(32, 16)
+    assert read(ExpertTraining(), "--noise", "0.3", "0.1", "--plain-odometry", "--hidden", "32", "16") == replace(
+        ExpertTraining(), noise=(0.3, 0.1), plain_odometry=True, hidden=(32, 16)
     )
     changed = read(ExpertTraining(), "--rewards", "slip=-1", "fall=-3")
     assert isinstance(changed, ExpertTraining)

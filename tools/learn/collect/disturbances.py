@@ -15,7 +15,7 @@ from servoid.hw.robot.description import Robot
 
 @dataclass(frozen=True)
 class DisturbanceSettings:
-    """Angles rad (standard deviations), speeds m/s, times s; `*_share` are shares of episodes."""
+    """Angles rad (standard deviations), times s; `*_share` are shares of episodes."""
 
     noisy_share: float = 0.75
     slow_share: float = 0.25  # of the noisy ones: with noise that lasts as well
@@ -27,7 +27,7 @@ class DisturbanceSettings:
     scale: tuple[float, float] = (0.2, 0.6)  # of an episode's noise
     slow_seconds: float = 0.25  # correlation time of the noise that lasts
     slow_size: float = 0.5  # of it, beside the white noise
-    push_speed: tuple[float, float] = (0.0, 0.45)
+    push_speed: tuple[float, float] = (0.0, 0.9)  # of the robot's top speed
     push_seconds: tuple[float, float] = (1.0, 3.0)  # between pushes
 
 
@@ -49,6 +49,7 @@ class Disturbances:
 
     def __init__(self, robot: Robot, n: int, settings: DisturbanceSettings) -> None:
         self.settings, self._rate = settings, robot.rate
+        self._speeds = robot.walking.forward * np.array(settings.push_speed)
         self._sizes = joint_noise(robot, settings)
         self._keep = float(np.exp(-robot.dt / settings.slow_seconds))
         self.scale = np.zeros(n)  # of the white noise; 0: a quiet episode
@@ -85,7 +86,7 @@ class Disturbances:
         out = np.zeros((len(self.scale), 2))
         self._left -= self.pushed
         for i in np.flatnonzero(self.pushed & (self._left <= 0)):
-            speed, angle = rngs[i].uniform(*self.settings.push_speed), rngs[i].uniform(-np.pi, np.pi)
+            speed, angle = rngs[i].uniform(*self._speeds), rngs[i].uniform(-np.pi, np.pi)
             out[i] = speed * np.cos(angle), speed * np.sin(angle)
             self._left[i] = self._pause(rngs[i])
         return out

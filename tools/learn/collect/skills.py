@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot, Walking
 
 Range = tuple[float, float]
 
@@ -18,6 +19,12 @@ class Box:
     forward: Range = (0.0, 0.0)
     left: Range = (0.0, 0.0)
     turn: Range = (0.0, 0.0)
+
+    def of(self, walking: Walking) -> Box:
+        """A box of shares of the robot's top speeds, in m/s and rad/s, as far as the robot goes."""
+        shares = np.array([self.forward, self.left, self.turn])
+        asked = np.clip(shares.T * walking.scale, walking.lower, walking.upper).T
+        return Box(*((float(low), float(high)) for low, high in asked))
 
 
 @dataclass(frozen=True)
@@ -37,32 +44,37 @@ class Skill:
         return rng.uniform(low, high)
 
 
-# Their numbers are the dataset's task indices. Turning and walking mixed weigh more: they are most of what steering
-# to a goal asks for, and so does straight ahead, up to more than the expert can. Creeping covers the slow end, where a
-# robot arrives.
+# Boxes are shares: of the top speed forward, whatever the direction, and of that of turning. The skills' numbers are
+# the dataset's task indices. Turning and walking mixed weigh more: they are most of what steering to a goal asks for,
+# and so does straight ahead, up to more than the expert can. Creeping covers the slow end, where a robot arrives.
 SKILLS: tuple[Skill, ...] = (
     Skill("stand", "stand still", (Box(),), 2.5, (1.0, 3.0)),
-    Skill("forward", "walk forward", (Box(forward=(0.05, 0.5)),), 2.5),
-    Skill("slow", "walk forward slowly", (Box(forward=(0.03, 0.12)),)),
-    Skill("backward", "walk backward", (Box(forward=(-0.12, -0.03)),)),
-    Skill("side", "step sideways", (Box(left=(0.04, 0.12)), Box(left=(-0.12, -0.04)))),
+    Skill("forward", "walk forward", (Box(forward=(0.1, 1.0)),), 2.5),
+    Skill("slow", "walk forward slowly", (Box(forward=(0.06, 0.24)),)),
+    Skill("backward", "walk backward", (Box(forward=(-0.24, -0.06)),)),
+    Skill("side", "step sideways", (Box(left=(0.08, 0.24)), Box(left=(-0.24, -0.08)))),
     Skill("turn", "turn on the spot", (Box(turn=(0.2, 1.0)), Box(turn=(-1.0, -0.2))), 1.5),
-    Skill("arc", "walk along an arc", (Box(forward=(0.05, 0.4), turn=(-0.8, 0.8)),), 2.0),
-    Skill("diagonal", "walk diagonally", (Box((0.05, 0.15), (0.04, 0.1)), Box((0.05, 0.15), (-0.1, -0.04))), 0.8),
-    Skill("reverse", "walk backward along an arc", (Box((-0.12, -0.04), turn=(-0.6, 0.6)),), 0.6),
-    Skill("any", "walk and turn in any direction", (Box((-0.12, 0.3), (-0.1, 0.1), (-0.8, 0.8)),), 2.0),
-    Skill("creep", "creep slowly in any direction", (Box((-0.06, 0.06), (-0.06, 0.06), (-0.2, 0.2)),)),
+    Skill("arc", "walk along an arc", (Box(forward=(0.1, 0.8), turn=(-0.8, 0.8)),), 2.0),
+    Skill("diagonal", "walk diagonally", (Box((0.1, 0.3), (0.08, 0.2)), Box((0.1, 0.3), (-0.2, -0.08))), 0.8),
+    Skill("reverse", "walk backward along an arc", (Box((-0.24, -0.08), turn=(-0.6, 0.6)),), 0.6),
+    Skill("any", "walk and turn in any direction", (Box((-0.24, 0.6), (-0.2, 0.2), (-0.8, 0.8)),), 2.0),
+    Skill("creep", "creep slowly in any direction", (Box((-0.12, 0.12), (-0.12, 0.12), (-0.2, 0.2)),)),
 )
 FIRST_SECONDS: Range = (0.1, 0.6)  # of standing that an episode begins with: a run starts from rest
 
 _SHARES = np.cumsum([skill.weight for skill in SKILLS]) / sum(skill.weight for skill in SKILLS)
 
 
+def skills_of(robot: Robot) -> tuple[Skill, ...]:
+    """The skills with what this robot is asked, in m/s and rad/s."""
+    return tuple(replace(skill, boxes=tuple(box.of(robot.walking) for box in skill.boxes)) for skill in SKILLS)
+
+
 class Commands:
     """The present command of each of `n` worlds, changed every few seconds, drawn from the worlds' own streams."""
 
-    def __init__(self, n: int, rate: int) -> None:
-        self._rate = rate
+    def __init__(self, robot: Robot, n: int) -> None:
+        self._rate, self._skills = robot.rate, skills_of(robot)
         self.velocity = np.zeros((n, 3))  # what is asked: m/s forward, m/s left, rad/s
         self.skill = np.zeros(n, int)  # number in SKILLS
         self._left = np.zeros(n, int)  # ticks until the next change
@@ -77,7 +89,7 @@ class Commands:
         for i in np.flatnonzero(self._left == 0):
             rng = rngs[i]
             self.skill[i] = 0 if self._first[i] else int(np.searchsorted(_SHARES, rng.random(), side="right"))
-            skill = SKILLS[self.skill[i]]
+            skill = self._skills[self.skill[i]]
             self.velocity[i] = skill.draw(rng)
             self._left[i] = round(rng.uniform(*(FIRST_SECONDS if self._first[i] else skill.seconds)) * self._rate)
             self._first[i] = False

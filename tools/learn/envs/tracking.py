@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.robot.description import Robot
+from servoid.hw.robot.description import Robot, Walking
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.mlp import Mlp
 from servoid.policy.references.gait import Gait
@@ -15,8 +15,7 @@ from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.settings import TrackingSettings
 from servoid.tools.learn.terms import Terms
 
-_MIXED_SPEED = 0.35  # m/s
-_CYCLE = 24  # ticks of a gait cycle, over which velocity is judged: within one, a walk sways
+_MIXED_SPEED = 0.7  # of the top speed forward
 
 
 class Tracking:
@@ -36,13 +35,15 @@ class Tracking:
         self.mirrors = {"action": joints, "actor": self.observation.mirror, "critic": critic}
         self.action_size = len(robot.joints)
         self.ticks = np.zeros(n, int)
+        self._weight = robot.weight or self.fleet.worlds.weight
         self.limit = round(settings.episode_seconds / robot.dt)
         self.push_scale = 1.0
         self.reward = Terms(settings.rewards, TERMS)
         self.terms: dict[str, float] = {}
         self._next_command, self._next_push = np.zeros(n, int), np.zeros(n, int)
-        # Of the last cycle, newest at `ticks % _CYCLE`: velocity and yaw rate, measured and asked.
-        self._twists = np.zeros((_CYCLE, n, 6))
+        # Of the last cycle, newest at `ticks % cycle`: velocity and yaw rate, measured and asked.
+        self._cycle = self.gait.cycle_ticks  # over which velocity is judged: within one, a walk sways
+        self._twists = np.zeros((self._cycle, n, 6))
         self._twist = np.zeros((n, 6))
         self._targets = np.zeros((3, n, len(robot.joints)))
         self.observations: dict[str, Array] = {}
@@ -81,11 +82,17 @@ class Tracking:
         bodies = worlds.bodies
         privileged = np.concatenate(
             [
-                truth.velocity * 2.0,
-                truth.foot_force * 0.03,
+                truth.velocity / self.robot.walking.forward,
+                truth.foot_force * (0.9 / self._weight),
                 truth.foot_velocity.reshape(self.n, -1),
                 self._twist,
-                np.array([[b.stiffness * 0.1, b.voltage - 12, b.friction, b.command_delay * 50] for b in bodies if b]),
+                np.array(
+                    [
+                        [b.stiffness * 0.1, b.voltage - self.robot.servos[0].voltage, b.friction, b.command_delay * 50]
+                        for b in bodies
+                        if b
+                    ]
+                ),
                 np.array([b.zero for b in bodies if b]) * 30,
             ],
             -1,
@@ -98,13 +105,16 @@ class Tracking:
         command = self.gait.target.copy()
         for i in np.flatnonzero(self.ticks >= self._next_command):
             rng = self.fleet.rngs[i]
-            command[i] = _draw(rng, s)
+            command[i] = _draw(rng, s, self.robot.walking)
             self._next_command[i] = self.ticks[i] + round(rng.uniform(*s.command_every) * rate)
         self.gait.command(command)
         push = np.zeros((self.n, 2))
         for i in np.flatnonzero(self.ticks >= self._next_push):
             rng = self.fleet.rngs[i]
-            size, angle = rng.uniform(0, s.push * self.push_scale), rng.uniform(-np.pi, np.pi)
+            size, angle = (
+                rng.uniform(0, s.hardest_push * self.push_scale * self.robot.walking.forward),
+                rng.uniform(-np.pi, np.pi),
+            )
             push[i] = size * np.cos(angle), size * np.sin(angle)
             self._next_push[i] = self.ticks[i] + round(rng.uniform(*s.push_every) * rate)
         self.fleet.worlds.push(push)
@@ -121,8 +131,8 @@ class Tracking:
             ],
             -1,
         )
-        row, worlds = self.ticks % _CYCLE, np.arange(self.n)
-        self._twist += (now - self._twists[row, worlds]) / _CYCLE
+        row, worlds = self.ticks % self._cycle, np.arange(self.n)
+        self._twist += (now - self._twists[row, worlds]) / self._cycle
         self._twists[row, worlds] = now
 
     def step(self, action: Array) -> tuple[Array, Array, Array]:
@@ -157,6 +167,8 @@ class Tracking:
             reference_joints=reference,
             reference_contact=contact,
             fallen=fallen,
+            walking=self.robot.walking,
+            weight=self._weight,
         )
         reward, self.terms = self.reward(step)
         late = (self.ticks >= self.limit) & ~fallen
@@ -169,21 +181,22 @@ class Tracking:
         return reward * self.robot.dt, done, late
 
 
-def _draw(rng: np.random.Generator, s: TrackingSettings) -> Array:
+def _draw(rng: np.random.Generator, s: TrackingSettings, walking: Walking) -> Array:
     """A command `(3,)`: standing, straight ahead, along one other axis, backward, or any mixture."""
-    command = rng.uniform([s.vx[0], s.vy[0], s.yaw_rate[0]], [s.vx[1], s.vy[1], s.yaw_rate[1]])
+    command = rng.uniform(walking.lower, walking.upper)
+    slowest, fastest = -walking.backward, walking.forward
     kind = rng.random()
     shares = np.cumsum([s.stand, s.forward, s.single, s.backward])
     if kind < shares[0]:
         return np.zeros(3)
     if kind < shares[1]:
-        fast = rng.uniform(s.vx[1] - (s.vx[1] - s.vx[0]) / 3, s.vx[1])
+        fast = rng.uniform(fastest - (fastest - slowest) / 3, fastest)
         return np.array([fast if rng.random() < 0.5 else command[0], 0.0, 0.0])
     if kind < shares[2]:
-        command[0] = rng.uniform(s.vx[0], 0.0)
+        command[0] = rng.uniform(slowest, 0.0)
         return np.where(np.arange(3) == rng.integers(3), command, 0.0)
     if kind < shares[3]:
-        command[0] = rng.uniform(s.vx[0], 0.0)
-    elif command[0] > _MIXED_SPEED:  # no fast walking while turning or side-stepping
-        command[0] -= _MIXED_SPEED
+        command[0] = rng.uniform(slowest, 0.0)
+    elif command[0] > _MIXED_SPEED * fastest:  # no fast walking while turning or side-stepping
+        command[0] -= _MIXED_SPEED * fastest
     return command

@@ -23,13 +23,13 @@ from servoid.policy.mlp import Mlp
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.settings import OdometryTraining
 from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments
-from servoid.tools.learn.walks import drift, driver, mixed, record
+from servoid.tools.learn.walks import drift, maker, mixed, record
 
 if TYPE_CHECKING:
     import torch
 
     from servoid.hw.robot.description import Robot
-    from servoid.tools.learn.walks import MakeDriver
+    from servoid.tools.learn.walks import MakePolicy
 
 SHIPPED = "odometry"
 _MEASURING = ("policy", "seed", "walks", "walk_seconds")  # settings that --measure goes by
@@ -59,15 +59,15 @@ def main(args: argparse.Namespace) -> int:
 
     settings, robot = read_settings(args, OdometryTraining()), load_robot(args.robot)
     names = ["gait", *(name for name in settings.policy if name != "gait")]
-    drivers = {name: driver(robot, name) for name in names}
+    makers = {name: maker(robot, name) for name in names}
     if args.measure is not None:
         _refuse_unused(args)
-        measure(robot, drivers, load_odometry(robot, args.measure), settings)
+        measure(robot, makers, load_odometry(robot, args.measure), settings)
         return 0
     trainer = OdometryTrainer(
-        robot, names, partial(walked, robot, drivers, settings), settings, args.out, _source(names), args.threads
+        robot, names, partial(walked, robot, makers, settings), settings, args.out, _source(names), args.threads
     )
-    trainer.judge = lambda path: measure(robot, drivers, load_odometry(robot, path), settings)
+    trainer.judge = lambda path: measure(robot, makers, load_odometry(robot, path), settings)
     trainer.start(args.resume)
     trainer.run()
     return 0
@@ -84,15 +84,15 @@ def _refuse_unused(args: argparse.Namespace) -> None:
 
 
 def measure(
-    robot: Robot, drivers: Mapping[str, MakeDriver], network: Mlp, settings: OdometryTraining
+    robot: Robot, makers: Mapping[str, MakePolicy], network: Mlp, settings: OdometryTraining
 ) -> dict[str, float]:
     """Print the drift of each way of walking, by legs alone and corrected; returns the 90th percentiles."""
     results = {}
-    for name, drive in drivers.items():
+    for name, make in makers.items():
         for title, odometry in (("legs alone", None), ("corrected", network)):
             walks, seconds = settings.walks, settings.walk_seconds
             print(f"{name}, {title}: {walks} walks of {seconds:g} s ...", file=sys.stderr)
-            result = drift(robot, drive, odometry, walks=walks, seconds=seconds, seed=settings.seed + 1)
+            result = drift(robot, make, odometry, walks=walks, seconds=seconds, seed=settings.seed + 1)
             key = f"drift_p90_{name}" + ("_legs_alone" if odometry is None else "")
             results[key] = round(result.p90, 4)
             print(
@@ -103,14 +103,14 @@ def measure(
     return results
 
 
-def walked(robot: Robot, drivers: Mapping[str, MakeDriver], settings: OdometryTraining) -> dict[str, Array]:
+def walked(robot: Robot, makers: Mapping[str, MakePolicy], settings: OdometryTraining) -> dict[str, Array]:
     """Record walks of every kind, for every way of walking slips in its own: see `record`."""
     known = _shipped(robot)
     data: dict[str, Array] = {}
-    for i, (name, drive) in enumerate(drivers.items()):
-        worlds = settings.worlds // len(drivers)
+    for i, (name, make) in enumerate(makers.items()):
+        worlds = settings.worlds // len(makers)
         print(f"recording {name}: {worlds} robots, {settings.seconds:g} s ...", file=sys.stderr)
-        part = record(robot, drive, worlds, settings.seconds, settings.seed + i, known)
+        part = record(robot, make, worlds, settings.seconds, settings.seed + i, known)
         data = mixed(data, part, settings.seed) if data else part
     return data
 
