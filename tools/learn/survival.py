@@ -39,7 +39,7 @@ def closed_loop_survival(
     robot, head = load_robot(robot_name), read_header(checkpoint)
     settings = planning(check_fit(checkpoint, head, robot), head["training"])
     settings = replace(settings, checkpoint=str(checkpoint))
-    policy = diffusion_policy(robot, settings, load_task("walk", {}, robot.dt).cost, shape=(worlds,))
+    policy = diffusion_policy(robot, settings, load_task("walk", {}, robot.dt).objective, shape=(worlds,))
     return survival_of(policy, measured_fleet(robot, worlds, seed), seconds)
 
 

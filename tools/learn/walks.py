@@ -36,7 +36,7 @@ def maker(robot: Robot, name: str) -> MakePolicy:
     from servoid.stack.tasks import load_task
 
     settings = replace(load_settings(), checkpoint=name)
-    return partial(diffusion_policy, robot, settings, load_task("walk", {}, robot.dt).cost)
+    return partial(diffusion_policy, robot, settings, load_task("walk", {}, robot.dt).objective)
 
 
 def mixed(a: dict[str, Array], b: dict[str, Array], seed: int) -> dict[str, Array]:
