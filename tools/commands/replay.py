@@ -106,6 +106,7 @@ def changes(log: FlightLog) -> list[str]:
 
     settings = _settings(log)
     policy, recorded = policy_fingerprint(settings.policy), dict(log.header["policy"])
+    policy["name"] = log.header["settings"]["policy"]  # as it was typed
     if recorded.get("planner"):
         recorded["planner"] = with_new_names(recorded["planner"])
     header = {**log.header, **_part("policy", recorded)}
@@ -139,7 +140,7 @@ def _task(settings: RunSettings) -> dict[str, Any]:
     from servoid.stack.log.provenance import described, files
     from servoid.stack.tasks import find, load_settings, source
 
-    chosen = {key: value for key, value in settings.set.items() if key != "gain"}  # which is the servos'
+    chosen = dict(settings.set)
     if settings.seconds is not None:
         chosen["seconds"] = repr(settings.seconds)
     task = load_settings(settings.task, chosen)
