@@ -8,6 +8,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from types import FrameType
 
 _AGAIN_SECONDS = 0.02
@@ -17,11 +18,10 @@ def raise_interrupts() -> None:
     """Let Ctrl-C raise KeyboardInterrupt as Python does, but once the import that it falls into is through.
 
     A compiled module makes an ImportError of it, and what is half imported may swallow it. So may a destructor, whose
-    exceptions Python does no more than print. Where a program around this one ignores Ctrl-C, so does this one.
+    exceptions Python does no more than print.
     """
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _raise)
-        sys.unraisablehook = _unraisable
+    signal.signal(signal.SIGINT, _raise)
+    sys.unraisablehook = _unraisable
 
 
 def ignore_interrupts() -> None:
@@ -44,6 +44,7 @@ def held_back(*numbers: signal.Signals) -> Iterator[None]:
     """Processes that are started meanwhile never get these signals, from their first instruction on; in this process
     they wait until the end. A terminal sends Ctrl-C to all of a program's processes, and one that is still starting
     would answer with a traceback."""
+    resource_tracker.ensure_running()  # multiprocessing starts it with the first process, and lets SIGINT in again then
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
