@@ -88,7 +88,7 @@ def test_each_of_a_batch_is_told_the_name_of_its_own_motion() -> None:
 
     both = actions(np.stack([ahead, turning]))
     for one, velocity in zip(both, (ahead, turning), strict=True):
-        np.testing.assert_allclose(one, actions(velocity, caption(velocity))[0], atol=1e-6)
+        np.testing.assert_allclose(one, actions(velocity, caption(velocity, ROBOT.walking.scale))[0], atol=1e-6)
     assert not np.allclose(both[0], both[1], atol=1e-3)
 
 

@@ -377,8 +377,8 @@ def test_survival_sets_a_robot_in_motion_and_then_tells_a_planner_nothing() -> N
     task = load_task("survive", {}, DT)
     task.reset(np.random.default_rng(0))
     begun = task.instruct(0, state(), NOTHING)
-    assert begun.text == caption(begun.velocity)
-    assert begun.text != caption(np.zeros(3))
+    assert begun.text == caption(begun.velocity, load_robot().walking.scale)
+    assert begun.text != caption(np.zeros(3), load_robot().walking.scale)
     assert task.instruct(149, state(), NOTHING).text == begun.text
     asked = task.instruct(150, state(), NOTHING)
     assert asked.text == ""
