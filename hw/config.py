@@ -13,7 +13,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -73,12 +73,15 @@ def resolve(kind: str, name: str | Path) -> Path:
     return CONFIGS / kind / f"{name}.yaml"
 
 
-def load_yaml(path: Path, cls: type[T]) -> T:
-    """Load `path` as an instance of the dataclass `cls`. Raises ConfigError naming file, line and key."""
-    return load_marked(path, cls)[0]
+def load_yaml(path: Path, cls: type[T], renamed: Mapping[str, str] | None = None) -> T:
+    """Load `path` as an instance of the dataclass `cls`. Raises ConfigError naming file, line and key.
+
+    An error about a key that was `renamed` says what it is called now.
+    """
+    return load_marked(path, cls, renamed)[0]
 
 
-def load_marked(path: Path, cls: type[T]) -> tuple[T, Marks]:
+def load_marked(path: Path, cls: type[T], renamed: Mapping[str, str] | None = None) -> tuple[T, Marks]:
     """Like `load_yaml`, with the lines of the keys, for checks that need more than types. Raises ConfigError."""
     marks = Marks(path)
     try:
@@ -97,7 +100,7 @@ def load_marked(path: Path, cls: type[T]) -> tuple[T, Marks]:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     if node is None:
         raise ConfigError(f"{path}:1: the file is empty; it needs {', '.join(_required(cls))}")
-    return _Reader(marks).read(node, cls, ""), marks
+    return _Reader(marks, renamed or {}).read(node, cls, ""), marks
 
 
 def parse_number(text: str, hint: type[int] | type[float]) -> int | float:
@@ -122,8 +125,8 @@ def _required(cls: Any) -> list[str]:
 class _Reader:
     """Builds values of the asked type from nodes, noting the line of every key."""
 
-    def __init__(self, marks: Marks) -> None:
-        self.marks = marks
+    def __init__(self, marks: Marks, renamed: Mapping[str, str]) -> None:
+        self.marks, self._renamed = marks, renamed
 
     def fail(self, key: str, message: str) -> NoReturn:
         raise self.marks.error(key, message)
@@ -150,7 +153,9 @@ class _Reader:
         hints = {f.name: known[f.name] for f in fields(cls) if f.init}
         for name in items:
             if name not in hints:
-                self.fail(_join(key, name), f"unknown key; {nearest(name, hints)}")
+                new = self._renamed.get(name)
+                what = f"this key is called '{new}' now" if new else f"unknown key; {nearest(name, hints)}"
+                self.fail(_join(key, name), what)
         missing = [name for name in _required(cls) if name not in items]
         if missing:
             self.fail(key, f"missing key '{missing[0]}' (this part needs {', '.join(_required(cls))})")

@@ -14,6 +14,7 @@ from importlib import metadata
 from types import ModuleType
 
 from servoid.tools.common import exit_codes
+from servoid.tools.common.output import say
 from servoid.tools.common.parser import Parser, suggestion
 
 
@@ -45,6 +46,17 @@ VERBS: dict[str, Verb] = {
             "watch": Verb("watch temperatures, voltages, loads and the bus", "servoid.tools.bringup.watch"),
         },
     ),
+    "motions": Verb(
+        "clips: import, list, play, check, mirror and blend them",
+        verbs={
+            "import": Verb("make a clip from a file", "servoid.tools.motions.verbs.import_clip"),
+            "list": Verb("list the clips of a library", "servoid.tools.motions.verbs.list_clips"),
+            "play": Verb("play a clip open loop in physics", "servoid.tools.motions.verbs.play"),
+            "check": Verb("check joint ranges, speeds and the feet of clips", "servoid.tools.motions.verbs.check"),
+            "mirror": Verb("swap left and right", "servoid.tools.motions.verbs.mirror"),
+            "blend": Verb("join two clips", "servoid.tools.motions.verbs.blend"),
+        },
+    ),
     "collect": Verb("record demonstrations of the expert as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
         "train a network",
@@ -67,6 +79,7 @@ VERBS: dict[str, Verb] = {
             "kill": Verb("what becomes of the servos when the controller is killed", "servoid.tools.faults.kill"),
             "interrupt": Verb("whether torque is off after Ctrl-C at any instant", "servoid.tools.faults.interrupt"),
             "bus": Verb("time of a control cycle on the servo bus", "servoid.tools.bench.bus"),
+            "clients": Verb("what other people's clients do, against the virtual rig", "servoid.tools.bench.clients"),
             "faults": Verb("what faults of the rig do to a walking robot", "servoid.tools.faults.campaign"),
             "soak": Verb("long walk over a line that loses packets", "servoid.tools.faults.soak"),
             "fuzz": Verb("random bytes into everything that reads bytes", "servoid.tools.faults.fuzz"),
@@ -92,8 +105,8 @@ def main(argv: list[str] | None = None) -> int:
         if debug:
             traceback.print_exc()
         for note in getattr(error, "__notes__", ()):  # a table, say: what the message is about
-            print(note, file=sys.stderr)
-        print(f"servoid: {exit_codes.explain(error)}", file=sys.stderr)
+            say(note, sys.stderr)
+        say(f"servoid: {exit_codes.explain(error)}", sys.stderr)
         return exit_codes.exit_code(error)
 
 

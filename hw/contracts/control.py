@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
+
+import numpy as np
 
 from servoid.hw.contracts.body import Array
 
@@ -92,13 +94,18 @@ class Instruction:
 
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
-    """What a planner is asked at `tick`: the newest `history` of features and the actions that run meanwhile."""
+    """What a planner is asked at `tick`: the newest `history` of features and the actions that run meanwhile.
+
+    All that the plan depends on is in it: a plan draws its noise from the episode's seed and age.
+    """
 
     tick: int
-    states: Array  # (history, state features), oldest first, the last one being now
-    actions: Array  # (history - 1 + delay, action size) of each past state's tick, then those yet to run; as in a Plan
+    states: Array  # (..., history, state features), oldest first, the last one being now
+    actions: Array  # (..., history - 1 + delay, action size) of past states' ticks, then those yet to run; as in a Plan
     instruction: Instruction
     previous: Plan | None = None  # the plan that runs, for planners that go on from it
+    seeds: Array = field(default_factory=lambda: np.zeros((), int))  # (...,) int of the episodes
+    ages: Array | None = None  # (...,) int, ticks that the episodes have lasted; None: `tick`
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +117,9 @@ class Plan:
     """
 
     tick: int
-    actions: Array  # (horizon, action size), action size: n_joints, or that of a latent
-    states: Array  # (horizon, state features)
-    path: Array  # (horizon, 2) m: predicted displacement in the heading frame of `tick`, to be drawn and logged
+    actions: Array  # (..., horizon, action size), action size: n_joints, or that of a latent
+    states: Array  # (..., horizon, state features)
+    path: Array  # (..., horizon, 2) m: predicted displacement in the heading frame of `tick`, to be drawn and logged
     seconds: float  # how long planning took
     error: str = ""  # why there is no plan, where there is none: its arrays are NaN then
 
@@ -130,8 +137,11 @@ class Policy(Protocol):
     """A controller. `stack.control.base.BasePolicy` answers all but `act` for one that neither plans nor holds
     anything."""
 
-    def reset(self, seed: int) -> None:
-        """Begin an episode, whose random numbers all come from `seed`."""
+    def reset(self, where: Array | None, seeds: Array) -> None:
+        """Begin an episode in the worlds `where` `(...,)` bool, None being all; one robot is a world of shape `()`.
+
+        Their random numbers all come from `seeds` `(...,)` int.
+        """
         ...
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:

@@ -12,14 +12,14 @@ from contextlib import ExitStack
 from servoid.hw.clock import WallClock
 from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import BackendError, Clock
-from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY, Bus, Counters
 from servoid.hw.dynamixel.guardian_client import Lifeline
-from servoid.hw.dynamixel.motors import DynamixelMotors
-from servoid.hw.dynamixel.port import Port, SerialPort
-from servoid.hw.dynamixel.register_check import Difference, as_table, compare, correct, find_board, find_servos
+from servoid.hw.dynamixel.motors import DynamixelMotors, TorqueUnproven
+from servoid.hw.dynamixel.protocol.units import Units
 from servoid.hw.dynamixel.sensors import DynamixelSensors, present
-from servoid.hw.dynamixel.servo_monitor import ServoMonitor
-from servoid.hw.dynamixel.units import Units
+from servoid.hw.dynamixel.servos.register_check import Difference, as_table, compare, correct, find_board, find_servos
+from servoid.hw.dynamixel.servos.servo_monitor import ServoMonitor
+from servoid.hw.dynamixel.transport.bus import LONGEST_RETURN_DELAY, Bus, Counters
+from servoid.hw.dynamixel.transport.port import Port, SerialPort
 from servoid.hw.imu.serial_imu import SerialImu
 from servoid.hw.robot.description import Robot
 
@@ -107,12 +107,19 @@ class DynamixelBackend:
         guardian has tried, too, by then."""
         port, motors, lifeline, imu = self._port, self._motors, self._lifeline, self._imu
         self._port = self._motors = self._lifeline = self._imu = None
+        failure: TorqueUnproven | None = None
         with ExitStack() as stack:  # each step, whatever the one before it raises
             if imu is not None:
                 stack.callback(imu.close)
             if port is not None:
                 stack.callback(port.close)
-            if lifeline is not None:
-                stack.callback(lifeline.close)
-            if motors is not None and motors.on:
-                motors.off()
+            try:
+                if motors is not None and motors.on:
+                    motors.off()
+            except TorqueUnproven as error:
+                failure = error
+            finally:
+                if lifeline is not None and lifeline.close() and motors is not None:
+                    motors.proven("acknowledged to the guardian")
+            if failure is not None and motors is not None and motors.on:
+                raise failure

@@ -12,10 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from servoid.hw.contracts.body import BackendError
-from servoid.hw.dynamixel import codec, guardian
-from servoid.hw.dynamixel.codec import ALERT, OVERHEAD
-from servoid.hw.dynamixel.port import SerialPort
-from servoid.hw.dynamixel.tables import ControlTable
+from servoid.hw.dynamixel import guardian
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import ALERT, OVERHEAD
+from servoid.hw.dynamixel.protocol.tables import ControlTable
+from servoid.hw.dynamixel.transport.port import SerialPort
 
 READY_SECONDS = 5.0  # that a busy machine may take to start it; torque waits for that
 CLOSE_SECONDS = guardian.GIVE_UP_SECONDS + 1.0
@@ -72,8 +73,9 @@ class Lifeline:
             self._process = process
             self._say(b"+" if self._on else b"-")
 
-    def close(self) -> None:
-        """End the guardian; when torque may still be on, after it has done its work."""
+    def close(self) -> bool:
+        """End the guardian; when torque may still be on, after it has done its work. Returns whether it had to, and
+        every servo has told it that its torque is off."""
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):  # nobody reads it any more
             self._process.stdin.close()
@@ -83,6 +85,7 @@ class Lifeline:
             self._process.kill()
             self._process.wait()
         self._forget()
+        return self._on and self._process.returncode == 0
 
     def _start(self) -> subprocess.Popen[bytes]:
         self._starts += 1

@@ -8,14 +8,15 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from servoid.hw.contracts.body import Array, BackendError, Command, Mode
-from servoid.hw.dynamixel import arming, codec
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.codec import SyncWriter
-from servoid.hw.dynamixel.group_read import GroupRead
 from servoid.hw.dynamixel.guardian_client import Lifeline
-from servoid.hw.dynamixel.register_check import Found
-from servoid.hw.dynamixel.servo_monitor import ServoMonitor
-from servoid.hw.dynamixel.units import Units
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import SyncWriter
+from servoid.hw.dynamixel.protocol.units import Units
+from servoid.hw.dynamixel.servos import arming
+from servoid.hw.dynamixel.servos.register_check import Found
+from servoid.hw.dynamixel.servos.servo_monitor import ServoMonitor
+from servoid.hw.dynamixel.transport.bus import Bus
+from servoid.hw.dynamixel.transport.group_read import GroupRead
 from servoid.hw.faults import describe
 
 WATCHDOG = 4  # of 20 ms: a servo that hears nothing for so long stops by itself
@@ -24,6 +25,18 @@ OFF_SECONDS, ON_SECONDS = 0.25, 0.1  # and for how long: a host or an adapter ma
 OUTSIDE = 12  # ticks (1 degree) that a joint may be beyond its servo's limits when torque comes on
 AWAY = 68  # ticks (6 degrees) that a joint may have moved since it was read, for its first goal is gone to at once
 _GAINS = struct.Struct("<HHH")  # D, I, P in the order of their registers
+
+
+class TorqueUnproven(BackendError):
+    """Servos did not say in time that their torque is off. They may say it later, before a person reads of it."""
+
+    def __init__(self, names: str) -> None:
+        super().__init__(f"{names} did not say that torque is off: hold the robot and switch its power off")
+        self._names = names
+
+    def settle(self, how: str) -> None:
+        """They did."""
+        self.args = (f"{self._names} were late to say that torque is off: it is off now, {how}",)
 
 
 class DynamixelMotors:
@@ -50,6 +63,7 @@ class DynamixelMotors:
         self._goals = SyncWriter(self._ids, self._goal.address, self._goal.width, signed=True)
         self._default_d = [servo.table.item("position_d_gain").default or 0 for servo in found]
         self._default_i = [servo.table.item("position_i_gain").default or 0 for servo in found]
+        self._unproven: list[TorqueUnproven] = []
         self._gain: Array | None = None  # P gains that were sent last
         self.on = any(servo.get("torque_enable") for servo in found)  # torque may be on
         if self.on and lifeline is not None:
@@ -86,14 +100,20 @@ class DynamixelMotors:
             self._write(self._torque.address, left, [b"\0"] * len(left))
             left = self._unconfirmed(left, b"\0")
             if not left:
-                self.on, self._gain = False, None
+                self.proven("acknowledged")
+                self._gain = None
                 self._monitor.expect(False)
                 if self._lifeline is not None:
                     self._lifeline.let_go()
                 return
-        raise BackendError(
-            f"{self._names(left)} did not say that torque is off: hold the robot and switch its power off"
-        )
+        self._unproven.append(TorqueUnproven(self._names(left)))
+        raise self._unproven[-1]
+
+    def proven(self, how: str) -> None:
+        """Every servo has said that its torque is off, and errors that were raised before must not say otherwise."""
+        self.on = False
+        while self._unproven:
+            self._unproven.pop().settle(how)
 
     def _arm(self, gain: Array, wanted: Array) -> None:
         """Torque on without a jump: goal at the present position, then gains, all checked before torque.
@@ -155,7 +175,7 @@ class DynamixelMotors:
     def _differing(self, values: Sequence[arming.Values], place: tuple[int, int]) -> list[list[str]]:
         """Of each joint, the registers that do not read back; `place` is the address and length of what is read."""
         group = GroupRead([(id, *place) for id in self._ids])
-        self._bus.read_group(group)
+        self._bus.sync_read(group)
         return [
             arming.differing(servo, wanted, data, place[0])
             for servo, wanted, data in zip(self._found, values, group.data, strict=True)
@@ -173,7 +193,7 @@ class DynamixelMotors:
     def _goals_here(self) -> Array:
         """Goal ticks `(n_joints,)` at the position of now, within a turn and the servo's own limits."""
         for _ in self._attempts(ON_SECONDS):
-            self._bus.read_group(self._present)
+            self._bus.sync_read(self._present)
             if all(self._present.fresh):
                 break
         if lost := [i for i, fresh in enumerate(self._present.fresh) if not fresh]:
@@ -204,7 +224,7 @@ class DynamixelMotors:
         start = self._torque.address
         end = self._watchdog.end if watchdog else self._torque.end
         group = GroupRead([(self._ids[i], start, end - start) for i in joints])
-        self._bus.read_group(group)
+        self._bus.sync_read(group)
         return [
             i
             for i, data in zip(joints, group.data, strict=True)

@@ -14,6 +14,7 @@ import yaml
 from servoid.hw.config import ConfigError, load_marked, resolve
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.checks import check_robot, check_servo
+from servoid.hw.robot.plausible import check_plausible
 
 _GRAVITY = 9.81  # m/s2
 
@@ -251,7 +252,7 @@ def load_robot(name: str | Path = "op3") -> Robot:
     )
     walking = robot.walking.derived(robot.standing_height)
     robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints, walking=walking)
-    _ = robot.servos  # a servo's file that cannot be used is found now, not when the robot stands
+    check_plausible(robot, marks)  # loads the servos' files: one that cannot be used is found now
     return robot
 
 

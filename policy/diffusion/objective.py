@@ -23,7 +23,7 @@ class Objective:
     far_actions: float = 0.2  # weight of those beyond; 0 cuts them, as Diffuse-CLoC does
     min_snr: float = 0.0  # clip of the signal-to-noise ratio that weights tokens; 0: all levels weigh the same
     action_rate: float = 0.0  # weight of the error of the change from one action to the next
-    monotone: float = 0.0  # share of windows whose levels rise along the window, as in gradual and rolling schedules
+    monotone: float = 0.0  # share of windows whose levels rise along the window, as in pyramid and rolling schedules
     forcing: float = 0.25  # share of windows with independent levels everywhere, the past too: Diffusion Forcing
 
     def __post_init__(self) -> None:
@@ -73,7 +73,7 @@ def draw_levels(
 
 
 def rising_levels(config: DenoiserConfig, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Levels that rise along the frames of a window: from a gentle slope (gradual, rolling) to a step (autoregressive).
+    """Levels that rise along the frames of a window: from a gentle slope (pyramid, rolling) to a step (autoregressive).
 
     In half of the windows actions are ahead of the states of their frame, or behind them, by some levels: when rolling,
     or with a lead, they are not denoised together.

@@ -72,21 +72,31 @@ class Runtime:
         self._used = tuple(torch.from_numpy(mask) for mask in settings.used(config))
         self._state_mask = torch.from_numpy(config.state_ticks <= 0) & self._used[0]
 
-    def plan(self, request: PlanRequest, seed: int) -> Plan:
-        """The plan of one request. Raises ValueError when it does not fit the model, and Diverged."""
-        start = time.perf_counter()
+    def plan(self, request: PlanRequest) -> Plan:
+        """The plan of one robot's request, or of many at once. Raises ValueError when it does not fit, and Diverged."""
+        start, lead = time.perf_counter(), request.states.shape[:-2]
+
+        def rows(x: Array) -> Array:
+            return x.reshape(-1, *x.shape[len(lead) :])
+
+        ages = request.tick if request.ages is None else request.ages
+        seeds, ticks = (np.broadcast_to(x, lead).ravel() for x in (request.seeds, ages))
         last = request.previous
-        previous = Previous(request.tick - last.tick, last.states[None], last.actions[None]) if last else None
-        actions, states = self.plan_batch(
-            request.states[None], request.actions[None], request.instruction, [(seed, request.tick)], previous
+        previous = Previous(request.tick - last.tick, rows(last.states), rows(last.actions)) if last else None
+        states = rows(request.states)
+        actions, predicted = self.plan_batch(
+            states,
+            rows(request.actions),
+            request.instruction,
+            [(int(seed), int(tick)) for seed, tick in zip(seeds, ticks, strict=True)],
+            previous,
         )
-        origin = request.states[-1:].astype(np.float32)
-        tokens = to_tokens(states[0], origin[0], self._joints)
+        tokens = to_tokens(predicted, states[:, -1].astype(np.float32), self._joints)
         return Plan(
             tick=request.tick,
-            actions=actions[0],
-            states=states[0],
-            path=tokens[:, :2].astype(float),
+            actions=actions.reshape(*lead, *actions.shape[1:]),
+            states=predicted.reshape(*lead, *predicted.shape[1:]),
+            path=tokens[..., :2].astype(float).reshape(*lead, self.horizon, 2),
             seconds=time.perf_counter() - start,
         )
 
@@ -123,7 +133,7 @@ class Runtime:
                 None if text is None else text.repeat_interleave(n, 0),
                 self.settings.text_weight,
             )
-            sampler = Sampler(predict, self._signal, self.settings.eta, self.settings.stabilise)
+            sampler = Sampler(predict, self._signal, self.settings.eta, self.settings.stabilization_level)
             guidance = self._guidance(_repeat(instruction, n))
             clean = sampler.sample(matrix, known, [seeded(*key) for key in keys], guidance, start)
             clean_states, clean_actions = (x[:, used] for x, used in zip(clean, self._used, strict=True))

@@ -53,16 +53,16 @@ class DenoisingStep:
 class Sampler:
     """Walks a denoising matrix with a predictor of clean windows."""
 
-    def __init__(self, predict: Predictor, signal: Array, eta: float = 0.0, stabilise: int = 0) -> None:
+    def __init__(self, predict: Predictor, signal: Array, eta: float = 0.0, stabilization_level: int = 0) -> None:
         """`signal` is the cumulative signal of each level (`schedule.cosine_signal`).
 
         `eta` 0 is DDIM and 1 is DDPM. Tokens that are clean, the past among them, are shown to the network as if they
-        were at level `stabilise`, with their values untouched (UniPhys, algorithm 1, line 5).
+        were at level `stabilization_level`, with their values untouched (UniPhys, algorithm 1, line 5).
         """
         self._predict = predict
         self._signal = torch.as_tensor(signal, dtype=torch.float32)
         self._eta = eta
-        self._stabilise = stabilise
+        self._stabilization_level = stabilization_level
 
     def sample(
         self,
@@ -84,7 +84,7 @@ class Sampler:
         states = torch.where(known.state_mask[:, None], known.states, start[0])
         actions = torch.where(known.action_mask[:, None], known.actions, start[1])
         state_steps, action_steps = self._steps(state_rows), self._steps(action_rows)
-        shown = [rows.masked_fill(rows == 0, self._stabilise) for rows in (state_rows, action_rows)]
+        shown = [rows.masked_fill(rows == 0, self._stabilization_level) for rows in (state_rows, action_rows)]
         for call, (of_states, of_actions) in enumerate(zip(state_steps, action_steps, strict=True)):
             # Once all states are finished, guidance has nothing to move.
             steering = guidance if of_states.moving.any() else None

@@ -102,7 +102,7 @@ def autoregressive(
     return _staggered(levels, levels, states, actions + lead, steps)
 
 
-def gradual(
+def pyramid(
     levels: int,
     steps: int,
     state_frames: Array,
@@ -117,9 +117,9 @@ def gradual(
     a window whose far end is known as well, by a keyframe say. Frames are those of `autoregressive`.
     """
     if spread < 0:
-        raise ValueError(f"the spread of a gradual schedule must not be negative, not {spread}")
+        raise ValueError(f"the spread of a pyramid schedule must not be negative, not {spread}")
     if shape not in (PYRAMID, TRAPEZOID):
-        raise ValueError(f"a gradual schedule is '{PYRAMID}' or '{TRAPEZOID}', not '{shape}'")
+        raise ValueError(f"a pyramid schedule is '{PYRAMID}' or '{TRAPEZOID}', not '{shape}'")
     last = max(state_frames.max(), action_frames.max())
 
     def delays(frames: Array) -> Array:

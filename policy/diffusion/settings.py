@@ -20,12 +20,14 @@ from servoid.policy.diffusion.schedule import (
     autoregressive,
     ddim_levels,
     full_sequence,
-    gradual,
+    pyramid,
     rolling,
 )
 
-SCHEDULES = ("full_sequence", "autoregressive", "gradual", "rolling")
+SCHEDULES = ("full_sequence", "autoregressive", "pyramid", "rolling")
 SHAPES = (PYRAMID, TRAPEZOID)
+# Keys, and a value of `schedule`, as they were called, and what they are called now.
+RENAMED = {"replan": "execution_horizon", "stabilise": "stabilization_level", "gradual": "pyramid"}
 
 
 @dataclass(frozen=True)
@@ -65,8 +67,8 @@ class Autoregressive:
 
 
 @dataclass(frozen=True)
-class Gradual:
-    """See `servoid.policy.diffusion.schedule.gradual`."""
+class Pyramid:
+    """See `servoid.policy.diffusion.schedule.pyramid`."""
 
     spread: int = 5  # calls by which the last frame is later than the first
     shape: str = PYRAMID
@@ -98,27 +100,29 @@ class DiffusionSettings:
     checkpoint: str = "diffusion"  # a shipped one, or the path of a .safetensors file
     steps: int = 2  # network calls that take a token from noise to clean
     lead: int = 1  # extra calls by which the states are finished before the actions
-    replan: int = 2  # ticks between requests: the actions executed of a plan
+    execution_horizon: int = 2  # ticks between requests: the actions executed of a plan
     delay: int = 1  # ticks from a request to the adoption of its plan
     trim: float = 1.0  # 1/s at which what is asked is corrected by what comes of it; 0: not
     history: int | None = None  # states that a plan is made from; None: as many as the network has
     horizon: int | None = None  # ticks that are planned; None: as many as the network has
     schedule: str = "full_sequence"
     autoregressive: Autoregressive = field(default_factory=Autoregressive)
-    gradual: Gradual = field(default_factory=Gradual)
+    pyramid: Pyramid = field(default_factory=Pyramid)
     rolling: Rolling = field(default_factory=Rolling)
     eta: float = 0.0  # 0: DDIM, deterministic; 1: DDPM
-    stabilise: int = 0  # noise level that clean tokens are shown with
+    stabilization_level: int = 0  # noise level that clean tokens are shown with
     text_weight: float = 1.0  # classifier-free guidance by the instruction; 0: unread, 1: as trained
     text_nearest: bool = True  # a sentence is read as the nearest one of the training; False: by its own code
     engine: str = REFERENCE  # what runs the network: see `servoid.policy.diffusion.engines`
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.lead < 0 or self.replan < 1:
-            raise ValueError("steps and replan must be at least 1, and lead must not be negative")
-        if not 0 <= self.delay <= self.replan:
-            raise ValueError(f"delay must be 0 to replan ({self.replan} ticks), not {self.delay}")
+        if self.steps < 1 or self.lead < 0 or self.execution_horizon < 1:
+            raise ValueError("steps and execution_horizon must be at least 1, and lead must not be negative")
+        if not 0 <= self.delay <= self.execution_horizon:
+            raise ValueError(f"delay must be 0 to execution_horizon ({self.execution_horizon} ticks), not {self.delay}")
+        if self.schedule in RENAMED:
+            raise ValueError(f"the schedule '{self.schedule}' is called '{RENAMED[self.schedule]}' now")
         if self.schedule not in SCHEDULES:
             raise ValueError(f"no schedule is called '{self.schedule}': {nearest(self.schedule, SCHEDULES)}")
         if self.engine not in ENGINES:
@@ -130,8 +134,8 @@ class DiffusionSettings:
             )
         if not 0.0 <= self.eta <= 1.0:
             raise ValueError(f"eta must be 0 (DDIM) to 1 (DDPM), not {self.eta}")
-        if self.stabilise < 0:
-            raise ValueError(f"stabilise must not be negative, not {self.stabilise}")
+        if self.stabilization_level < 0:
+            raise ValueError(f"stabilization_level must not be negative, not {self.stabilization_level}")
 
     def check(self, network: DenoiserConfig, training: Mapping[str, Any] | None = None) -> None:
         """Raise ConfigError where this network cannot serve, or the engine is not installed.
@@ -146,25 +150,25 @@ class DiffusionSettings:
                     f"diffusion policy: {name} {ours} is asked for, and this checkpoint has 1 to {most} ticks; "
                     f"lower it, or train a model with --{name} {ours}"
                 )
-        training, needed = training or {}, self.replan + self.delay
+        training, needed = training or {}, self.execution_horizon + self.delay
         if needed > (horizon := min(self.horizon or network.horizon, network.action_horizon)):
             raise ConfigError(
-                f"diffusion policy: a plan must last replan + delay = {needed} ticks, "
-                f"and this one has actions for {horizon}; lower replan or delay"
+                f"diffusion policy: a plan must last execution_horizon + delay = {needed} ticks, "
+                f"and this one has actions for {horizon}; lower execution_horizon or delay"
             )
         if needed > (near := _near_alone(training, needed)):
             raise ConfigError(
-                f"diffusion policy: a plan must last replan + delay = {needed} ticks, and this checkpoint learned the "
-                f"actions of the next {near} only; lower replan or delay"
+                f"diffusion policy: a plan must last execution_horizon + delay = {needed} ticks, and this checkpoint "
+                f"learned the actions of the next {near} only; lower execution_horizon or delay"
             )
-        if self.delay > (committed := training.get("committed", self.delay)):
+        if self.delay > (longest := _longest_delay(training, self.delay)):
             raise ConfigError(
                 f"diffusion policy: delay {self.delay} is asked for, and this checkpoint was trained for at most "
-                f"{committed} ticks: lower it, or train with --committed {self.delay}"
+                f"{longest} ticks: lower it, or train with --committed {self.delay}"
             )
-        if self.stabilise > network.levels:
+        if self.stabilization_level > network.levels:
             raise ConfigError(
-                f"diffusion policy: stabilise must be at most {network.levels}, the network's noise levels"
+                f"diffusion policy: stabilization_level must be at most {network.levels}, the network's noise levels"
             )
         try:
             ddim_levels(network.levels, self.steps)
@@ -177,9 +181,9 @@ class DiffusionSettings:
         """The same with fewer steps, less delay and shorter chunks, where this network could not serve otherwise."""
         horizon = min(self.horizon or network.horizon, network.action_horizon)
         actions = _near_alone(training, horizon)
-        delay = min(self.delay, training.get("committed", self.delay), actions // 2)  # no longer than what is executed
-        replan = min(self.replan, actions - delay)
-        return replace(self, steps=min(self.steps, network.levels), delay=delay, replan=replan)
+        delay = min(self.delay, _longest_delay(training, self.delay), actions // 2)  # no longer than what is executed
+        execution_horizon = min(self.execution_horizon, actions - delay)
+        return replace(self, steps=min(self.steps, network.levels), delay=delay, execution_horizon=execution_horizon)
 
     def matrix(self, network: DenoiserConfig, fresh: int | None = None) -> DenoisingMatrix:
         """The denoising matrix of a plan, with what `history` and `horizon` leave out as pure noise.
@@ -195,8 +199,8 @@ class DiffusionSettings:
         levels, lead = network.levels, self.lead
         if self.schedule == "autoregressive":
             matrix = autoregressive(levels, self.steps, *frames, self.autoregressive.block, lead)
-        elif self.schedule == "gradual":
-            matrix = gradual(levels, self.steps, *frames, self.gradual.spread, self.gradual.shape, lead)
+        elif self.schedule == "pyramid":
+            matrix = pyramid(levels, self.steps, *frames, self.pyramid.spread, self.pyramid.shape, lead)
         elif self.schedule == "rolling" and fresh is not None:
             roll = self.rolling
             start = roll.state_level, roll.action_level
@@ -213,11 +217,23 @@ class DiffusionSettings:
         return (states >= first) & (states <= horizon), (actions >= first) & (actions < horizon)
 
 
+def _longest_delay(training: Mapping[str, Any], otherwise: int) -> int:
+    """The longest delay that was trained for; headers of before it had this name call it `committed`."""
+    longest: int = training.get("inference_delay", training.get("committed", otherwise))
+    return longest
+
+
 def _near_alone(training: Mapping[str, Any], ticks: int) -> int:
     """How many of the next `ticks` have actions that were learned: all, unless far ones had no weight in training."""
     return ticks if training.get("far_actions", 1.0) else min(ticks, training["near_actions"])
 
 
+def with_new_names(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as an older program wrote them into a log, by the names of today."""
+    values = {RENAMED.get(key, key): value for key, value in settings.items()}
+    return values | {"schedule": RENAMED.get(values["schedule"], values["schedule"])}
+
+
 def load_settings(name: str = "diffusion") -> DiffusionSettings:
     """Settings by name or file. Raises ConfigError."""
-    return load_yaml(resolve("policies", name), DiffusionSettings)
+    return load_yaml(resolve("policies", name), DiffusionSettings, RENAMED)

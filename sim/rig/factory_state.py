@@ -8,17 +8,15 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
-import numpy as np
-
 from servoid.hw.config import ConfigError, nearest
-from servoid.hw.dynamixel.tables import ControlTable, table
+from servoid.hw.dynamixel.protocol.tables import ControlTable, table
 from servoid.hw.robot.description import Robot
+from servoid.hw.seeds import Stream, generator
 
 Assembly = Literal["file", "random"]
 ASSEMBLIES: tuple[str, ...] = get_args(Assembly)
 _OFF = 0.2  # rad that a horn may sit off the file's zero: under one tooth and a half of an XM430's spline
 _REVERSED = 0.3  # share of servos mounted the other way round
-_STREAM = 11  # distinguishes its random numbers from others of the same seed
 
 
 @dataclass(frozen=True)
@@ -26,16 +24,28 @@ class FactoryState:
     """`fresh` servos are as the factory sends them (ID 1, 57600 bit/s); those not in `only`, if given, are unplugged.
 
     With `assembly` "random" zeros and directions are not those of the robot's file: calibration has to find them.
+    Without a `board` the servos are on an adapter such as a U2D2 and always have power; with one they have it when the
+    board is told to give it, or are `powered` already. `baud` [bit/s] is another than the file's.
     """
 
     fresh: tuple[str, ...] = ()
     only: tuple[str, ...] = ()
     assembly: Assembly = "file"
+    board: bool = True
+    powered: bool = False
+    baud: int | None = None
+
+    def bus_baud(self, robot: Robot) -> int:
+        """What servos that were set up, and the board, listen at [bit/s]."""
+        return robot.bus.baud if self.baud is None else self.baud
 
     def arguments(self) -> list[str]:
         """The same on a command line."""
         named = [(option, name) for option, names in (("--fresh", self.fresh), ("--only", self.only)) for name in names]
-        return [word for pair in named for word in pair] + ["--assembly", self.assembly]
+        words = [word for pair in named for word in pair] + ["--assembly", self.assembly]
+        words += [] if self.board else ["--no-board"]
+        words += ["--powered"] if self.powered else []
+        return words if self.baud is None else [*words, "--baud", str(self.baud)]
 
     def check(self, robot: Robot) -> None:
         """Raise ConfigError for a joint that the robot has not, and for a baud or ticks that its servos have not."""
@@ -44,9 +54,10 @@ class FactoryState:
                 raise ConfigError(f"{robot.name} has no joint '{name}'; {nearest(name, robot.names)}")
         for servo in robot.servos:
             items = table(servo.model_number)
-            if robot.bus.baud not in items.bauds:
-                known = ", ".join(map(str, items.bauds))
-                raise ConfigError(f"{robot.name}: bus.baud: servos have no {robot.bus.baud} bit/s; they have {known}")
+            for what, baud in ((f"{robot.name}: bus.baud", robot.bus.baud), ("--baud", self.bus_baud(robot))):
+                if baud not in items.bauds:
+                    known = ", ".join(map(str, items.bauds))
+                    raise ConfigError(f"{what}: servos have no {baud} bit/s; they have {known}")
             turn = ticks_per_turn(items)
             if (servo.ticks_per_turn, servo.center_tick) != (turn, turn // 2):
                 raise ConfigError(
@@ -58,7 +69,7 @@ class FactoryState:
         """The robot with the zeros and directions of this rig."""
         if self.assembly == "file":
             return robot
-        rng = np.random.default_rng([seed, _STREAM])
+        rng = generator(seed, Stream.DELIVERY)
         off = rng.uniform(-_OFF, _OFF, len(robot.joints)).tolist()
         turned = (rng.random(len(robot.joints)) < _REVERSED).tolist()
         joints = []
@@ -79,7 +90,7 @@ class FactoryState:
                 continue
             set_up = {
                 "id": joint.id,
-                "baud_rate": table(servo.model_number).bauds.index(robot.bus.baud),
+                "baud_rate": table(servo.model_number).bauds.index(self.bus_baud(robot)),
                 "return_delay_time": 0,
             }
             if self.assembly == "file":
@@ -112,3 +123,16 @@ def add_factory_state_arguments(parser: argparse.ArgumentParser) -> None:
         default="file",
         help="zeros and directions: as in the robot's file (default), or others that calibration has to find",
     )
+    parser.add_argument(
+        "--no-board",
+        action="store_false",
+        dest="board",
+        help="servos alone, always powered, as on a U2D2 with a supply of their own",
+    )
+    parser.add_argument("--powered", action="store_true", help="the board gives the servos power from the start")
+    parser.add_argument("--baud", type=int, metavar="BPS", help="of servos and board (default: as in the robot's file)")
+
+
+def factory_state_of(args: argparse.Namespace) -> FactoryState:
+    """What those arguments say."""
+    return FactoryState(tuple(args.fresh), tuple(args.only), args.assembly, args.board, args.powered, args.baud)

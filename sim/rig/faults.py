@@ -15,12 +15,11 @@ from enum import Enum
 from pathlib import Path
 from typing import Literal, get_args
 
-import numpy as np
-
 from servoid.hw.config import ConfigError, load_yaml, nearest
-from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.protocol import codec
 from servoid.hw.faults import ENCODER, INPUT_VOLTAGE, OVERHEATING, OVERLOAD, SHOCK
 from servoid.hw.robot.description import Robot
+from servoid.hw.seeds import Stream, generator
 
 Kind = Literal[
     "drop", "late", "truncate", "duplicate", "wrong_id", "corrupt", "error_status", "stuffed",
@@ -57,9 +56,9 @@ EXPECTED: dict[str, Outcome] = {
     **dict.fromkeys(("vanish", "vanish_in_read", "stall", "brown_out"), Outcome.FATAL),
 }
 NEEDS_SERVO = (*ALERTS, "reboot", "torque_off", "id_conflict", "dead", "baud_mismatch", "watchdog", "heat")
-# s of lateness, V at the servos, s of the step, s of the adapter's batch, error number, bits of the buttons, C
+# s of lateness, s of the step, s of the adapter's batch, error number, bits of the buttons, C
 _VALUES = {
-    "late": 0.003, "brown_out": 5.5, "clock_step": 0.5, "batching": 0.016, "error_status": 1.0, "button": 1.0,
+    "late": 0.003, "clock_step": 0.5, "batching": 0.016, "error_status": 1.0, "button": 1.0,
     "heat": 72.0,
 }  # fmt: skip
 
@@ -146,7 +145,7 @@ class FaultInjector:
 
     def __post_init__(self) -> None:
         self._faults: list[tuple[Fault, int]] = []
-        self._rng = np.random.default_rng([self.scenario.seed, 7])
+        self._rng = generator(self.scenario.seed, Stream.FAULTS)
         self.pending: list[tuple[float, bool, Fault, int]] = []  # time, whether it begins, of what has yet to happen
         for fault in self.scenario.faults:
             self.add(fault)

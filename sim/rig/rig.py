@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from servoid.hw.config import nearest
 from servoid.hw.contracts.body import Array
 from servoid.hw.imu.mounting import Mounting
 from servoid.hw.robot.description import Robot
@@ -27,7 +28,8 @@ from servoid.sim.rig.servo.virtual_servo import VirtualServo
 from servoid.sim.rig.wire.dispatcher import Dispatcher
 from servoid.sim.rig.wire.half_duplex import Wire
 
-BROWN_OUT, BOARD_BROWN_OUT = 6.0, 4.5  # V below which a servo and the board lose power
+BROWN_OUT, BOARD_BROWN_OUT = 0.5, 0.375  # of its servo's nominal voltage, below which a servo or the board is dead
+_BROWN_OUT_FAULT = 5.5 / 12.0  # of the nominal voltage, where the scenario does not say
 _LONGEST_BROWN_OUT = 0.05  # s, when the scenario does not say
 _REMEMBERED = 200_000  # accepted writes that are kept for whoever asks: 200 s of 20 goals 50 times a second
 _BABBLE = 0.8  # share of the line that a babbling device fills
@@ -92,12 +94,17 @@ class Rig:
         unplugged = self.factory_state.unplugged(self.robot.names)
         for servo, name in zip(self.servos, self.robot.names, strict=True):
             servo.dead = name in unplugged
+        self._least = [BROWN_OUT * servo.voltage for servo in self.robot.servos]
+        self._board_least = BOARD_BROWN_OUT * self.robot.servos[0].voltage
         codes = self.servos[0].table.bauds
-        board = {"id": self.robot.bus.board_id, "baud_rate": codes.index(self.robot.bus.baud)}
+        board = {"id": self.robot.bus.board_id, "baud_rate": codes.index(self.factory_state.bus_baud(self.robot))}
         mounting = Mounting(self.robot.imu.signs, self.robot.imu.mounting)
         self.board = VirtualBoard(self.motors, board, self._switch, mounting)
         self._switch(False)
-        self.dispatcher.devices = [*self.servos, self.board]
+        self.dispatcher.devices = [*self.servos, self.board] if self.factory_state.board else [*self.servos]
+        if self.factory_state.powered or not self.factory_state.board:
+            self.board.put("dynamixel_power", 1)
+            self._switch(True)
 
     def _record(self, joint: int, register: str, value: int, angle: float, now_ns: int) -> None:
         if math.isfinite(angle):
@@ -170,16 +177,16 @@ class Rig:
             self.plant.release()
 
     def _supply(self) -> None:
-        """Devices lose power when the battery's voltage breaks down."""
+        """Devices lose power when the battery's voltage breaks down, each below its own limit."""
         supply = self.motors.supply
-        if supply < BROWN_OUT:
-            self._switch(False)
-            if supply < BOARD_BROWN_OUT:
-                self.board.power(False, self.now_ns)
-        else:
+        if supply >= min(self._least):
             self.board.power(True, self.now_ns)
-            if self.board.get("dynamixel_power"):
-                self._switch(True)
+        elif supply < self._board_least and self.factory_state.board:
+            self.board.power(False, self.now_ns)
+        on = bool(self.board.get("dynamixel_power"))
+        for servo, least in zip(self.servos, self._least, strict=True):
+            if not servo.dead and (on or supply < least):
+                servo.power(supply >= least, self.now_ns)
 
     def _deliver(self) -> Iterator[bytes]:
         data, fresh = b"", self.wire.take_delivery(self.now_ns)
@@ -231,7 +238,8 @@ class Rig:
         elif kind == "clock_step" and begins:
             self.skew_ns += round(fault.amount * 1e9)
         elif kind == "brown_out":
-            self.motors.sag = self.motors.open_circuit - fault.amount if begins else 0.0
+            volts = _BROWN_OUT_FAULT * self.robot.servos[0].voltage if fault.value is None else fault.value
+            self.motors.sag = self.motors.open_circuit - volts if begins else 0.0
             if begins and fault.until is None:
                 end = self.seconds + _LONGEST_BROWN_OUT
                 self.injector.pending = [(end, False, fault, id), *self.injector.pending]
@@ -271,9 +279,16 @@ class Rig:
     # What tests and evaluation may know
 
     def move(self, pose: dict[str, float]) -> None:
-        """Move joints of the held robot by hand, to angles [rad]. Raises ValueError if it stands on its own."""
+        """Move limp joints of the held robot by hand, to angles [rad]. Raises ValueError for a robot that stands on its
+        own, and for joints that it has not or that have torque."""
         if not self.plant.held:
-            raise ValueError("the robot is not held: reset it first")
+            raise ValueError("the robot is not held: it is again 3 s after all torque went off, or after a reset")
+        for name in pose:
+            if name not in self.robot.names:
+                raise ValueError(f"{self.robot.name} has no joint '{name}'; {nearest(name, self.robot.names)}")
+        stiff = [name for name, on in zip(self.robot.names, self.motors.firmware.powered, strict=True) if on]
+        if held := [name for name in pose if name in stiff]:
+            raise ValueError(f"{', '.join(held)}: the servo has torque and cannot be moved by hand")
         joints = self.plant.joints.copy()
         for name, angle in pose.items():
             joints[self.robot.names.index(name)] = angle

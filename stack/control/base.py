@@ -16,11 +16,11 @@ class BasePolicy:
         """The plan that was taken over in the last call of `act`."""
         return None
 
-    def reset(self, seed: int) -> None:
-        """Begin an episode, whose random numbers all come from `seed`."""
+    def reset(self, where: Array | None, seeds: Array) -> None:
+        """Begin an episode in the worlds `where` `(...,)` bool, None being all, with random numbers from `seeds`."""
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
-        """Joint targets `(n_joints,)` rad for the next tick; `applied` are those that the guard sent last."""
+        """Joint targets `(..., n_joints)` rad for the next tick; `applied` are those that the guard sent last."""
         raise NotImplementedError(f"{type(self).__name__} does not act")
 
     def take_events(self) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """Many robots under the loop's own chain: simulated sensors, the estimator, and the run-time limits.
 
-Training, collection and the survival checks all drive a Fleet, so that what learns sees what runs.
+Training, collection and the survival checks all drive a Fleet, so that what learns sees what runs; what drives it are
+the policies that a run has, of shape `(n,)`.
 """
 
 from __future__ import annotations
@@ -8,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from servoid.hw.contracts.body import Array, Command, Mode
-from servoid.hw.contracts.control import State
+from servoid.hw.contracts.control import Instruction, Policy, State
 from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import Robot
+from servoid.hw.seeds import generator
 from servoid.policy.mlp import Mlp
 from servoid.sim.truth import Truth
 from servoid.sim.worlds import Worlds
@@ -44,7 +46,8 @@ class Fleet:
         self.estimator = Estimator(robot, odometry, (n,))
         self.applied = np.tile(robot.home, (n, 1))
         self.rngs = [np.random.default_rng(0)] * n
-        self._episodes = np.zeros(n, int)
+        self._episodes = np.zeros(n, int)  # begun
+        self._seed = seed
         self._ones = np.ones((n, len(robot.joints)))
         self.state: State
 
@@ -52,6 +55,11 @@ class Fleet:
     def truth(self) -> Truth:
         """The worlds' truth, for rewards and evaluation."""
         return self.worlds.truth
+
+    @property
+    def seeds(self) -> Array:
+        """A seed `(n,)` for who drives each world in its present episode."""
+        return self._seed + np.arange(self.n) + self.n * np.maximum(self._episodes - 1, 0)
 
     def reset(self, where: Array, start: Start | None = None) -> None:
         """Begin new episodes in the worlds `where` `(n,)` bool; `start` has a row for every world.
@@ -62,7 +70,7 @@ class Fleet:
         if not len(ids):
             return
         for i in ids:
-            self.rngs[i] = np.random.default_rng([*self._stream, int(i), int(self._episodes[i])])
+            self.rngs[i] = generator(*self._stream, int(i), int(self._episodes[i]))
             self._episodes[i] += 1
         start = Start() if start is None else start.of(ids)
         self.worlds.reset(ids, [self.rngs[i] for i in ids], start)
@@ -87,3 +95,7 @@ class Fleet:
         self.applied = clean if noise is None else limit(clean + noise, self.applied, self.robot)
         self.worlds.step(Command(self.applied, self._ones, Mode.ACTIVE))
         return clean
+
+    def drive(self, policy: Policy, command: Array, noise: Array | None = None) -> Array:
+        """Observe, and do for a tick what `policy`, of shape `(n,)`, decides under velocities `(n, 3)`; see `step`."""
+        return self.step(policy.act(self.observe(), self.applied, Instruction(command)), noise)

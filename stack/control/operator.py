@@ -116,8 +116,12 @@ class Keyboard:
 
     def read(self) -> Wish:
         while select.select([self._fd], [], [], 0.0)[0]:
-            pressed = os.read(self._fd, 64).decode("ascii", "ignore")
-            if not pressed:
+            try:
+                pressed = os.read(self._fd, 64).decode("ascii", "ignore")
+            except OSError:  # a terminal that was closed
+                pressed = ""
+            if not pressed:  # nobody steers any more
+                self._way, self._ends = np.zeros(3), True
                 break
             self._press(pressed)
         return Wish(self._way.copy(), self._ends)
@@ -140,22 +144,6 @@ class Keyboard:
             elif key in _KEYS:
                 part, change = _KEYS[key]
                 self._way[part] = np.clip(self._way[part] + change, -1.0, 1.0)
-
-
-class Recorded:
-    """Wishes of a recorded run, one a tick. `ended`: whether with the last one the person ended the run."""
-
-    def __init__(self, ways: Array, ended: bool) -> None:
-        self._ways, self._ended, self._next = ways, ended, 0
-
-    def read(self) -> Wish:
-        if self._next >= len(self._ways):
-            return Wish(np.zeros(3), self._ended)
-        self._next += 1
-        return Wish(self._ways[self._next - 1], self._ended and self._next == len(self._ways))
-
-    def close(self) -> None:
-        self._next = len(self._ways)
 
 
 def open_steering(device: str) -> Steering:

@@ -1,6 +1,6 @@
 """Planners answer plan requests beside the loop: in line for simulation, in a process of their own in real time.
 
-Both give the plan of a request the same noise, so a run does not depend on which one answered, as long as none is late.
+A plan depends on its request alone, so a run does not depend on which one answered, as long as none is late.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from typing import Protocol
 
 from servoid.hw.contracts.control import Plan, PlanRequest
 
-# (request, seed) -> plan
-Answer = Callable[[PlanRequest, int], Plan]
+Answer = Callable[[PlanRequest], Plan]
 
 
 class PlannerError(Exception):
@@ -30,8 +29,8 @@ class PlannerError(Exception):
 class Planner(Protocol):
     """Answers one request at a time; a new one replaces what was not collected."""
 
-    def reset(self, seed: int) -> None:
-        """Forget all requests; plans from now on draw their noise from `seed` and their tick."""
+    def reset(self) -> None:
+        """Forget all requests."""
         ...
 
     def submit(self, request: PlanRequest) -> None: ...
@@ -46,13 +45,11 @@ class Planner(Protocol):
 class InlinePlanner:
     """Plans when collected, so a plan is never late: for simulation as fast as possible."""
 
-    def __init__(self, answer: Answer, seed: int = 0) -> None:
+    def __init__(self, answer: Answer) -> None:
         self._answer = answer
-        self._seed = seed
         self._request: PlanRequest | None = None
 
-    def reset(self, seed: int) -> None:
-        self._seed = seed
+    def reset(self) -> None:
         self._request = None
 
     def submit(self, request: PlanRequest) -> None:
@@ -63,7 +60,7 @@ class InlinePlanner:
         if request is None or request.tick != tick:
             return None
         self._request = None
-        return self._answer(request, self._seed)
+        return self._answer(request)
 
     def close(self) -> None:
         self._request = None
@@ -76,15 +73,14 @@ class ProcessPlanner:
     that finds it busy, with a request from before it or from the last episode, waits here.
     """
 
-    def __init__(self, build: Callable[[], Answer], seed: int = 0, start_timeout: float = 120.0) -> None:
+    def __init__(self, build: Callable[[], Answer], start_timeout: float = 120.0) -> None:
         """Start the process and wait until it has called `build`, which must be picklable, there.
 
         Raises PlannerError with the reason when that fails or takes longer than `start_timeout` [s].
         """
-        self._seed = seed
         self._serial = 0  # of the newest request
         self._busy = False
-        self._waiting: tuple[int, int, PlanRequest] | None = None
+        self._waiting: tuple[int, PlanRequest] | None = None
         self._ready: tuple[int, Plan] | None = None
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
@@ -103,15 +99,14 @@ class ProcessPlanner:
             self.close()
             raise
 
-    def reset(self, seed: int) -> None:
-        self._seed = seed
+    def reset(self) -> None:
         self._serial += 1  # what is still being planned is not wanted any more
         self._waiting = self._ready = None
 
     def submit(self, request: PlanRequest) -> None:
         self._serial += 1
         self._ready = None
-        self._waiting = (self._serial, self._seed, request)
+        self._waiting = (self._serial, request)
         self._pump(0.0)
 
     def collect(self, tick: int, wait: bool) -> Plan | None:
@@ -180,8 +175,8 @@ def _serve(pipe: Connection, build: Callable[[], Answer]) -> None:
         gc.freeze()  # a full collection with torch imported takes longer than a plan
         pipe.send(None)
         while True:
-            serial, seed, request = pipe.recv()
-            pipe.send((serial, answer(request, seed)))
+            serial, request = pipe.recv()
+            pipe.send((serial, answer(request)))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return  # the parent closed the pipe, or died
     except Exception:

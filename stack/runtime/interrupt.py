@@ -11,16 +11,28 @@ from typing import Any
 
 from servoid.stack.safety.event import Event
 
+# Whatever ends a process, or freezes it, and can be handled: a robot that walks is brought to rest first. Of these a
+# program around this one may have given some a meaning of its own, or `nohup` told it to go on: then it does.
+ALWAYS = (signal.SIGINT, signal.SIGTERM)
+ELSE = (
+    *(signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGALRM),
+    *(signal.SIGVTALRM, signal.SIGPROF, signal.SIGXCPU, signal.SIGIO, signal.SIGPWR),
+)
+# Of a terminal that this process is in the background of: they would freeze it.
+IGNORED = (signal.SIGTTIN, signal.SIGTTOU)
+
 ONCE = "interrupted: stopping; once more for torque off at once"
 TWICE = "interrupted twice: torque off at once"
 
 
 class Interrupt:
-    """Counts SIGINT and SIGTERM while it is entered, and restores the handlers after.
+    """Counts the signals that ask to end while it is entered, and restores the handlers after.
 
-    The first asks for an orderly end, the second for torque off at once. A policy that hangs would never look: while
-    `breakable` is set, and only then, the second signal also raises KeyboardInterrupt. Outside the main thread, where
-    Python forbids handlers, it stays at zero unless `request` is called.
+    A terminal that closes, or an ssh connection that is lost, sends SIGHUP, often more than once and with a SIGTERM
+    behind it: all of that is one request. The first request asks for an orderly end, the second for torque off at once.
+    A policy that hangs would never look: while `breakable` is set, and only then, the second also raises
+    KeyboardInterrupt. Outside the main thread, where Python forbids handlers, it stays at zero unless `request` is
+    called.
 
     Before anything moves it may be `eager`, and raise at once. An exception can get lost in a library that is just
     being imported or is cleaning up; what was counted is not lost, and `settle` raises it.
@@ -31,6 +43,7 @@ class Interrupt:
         self.count = 0
         self.breakable = False
         self._handlers: dict[signal.Signals, Any] = {}
+        self._hung_up = self._terminated = False
 
     def request(self) -> None:
         """The same as one Ctrl-C."""
@@ -44,8 +57,10 @@ class Interrupt:
 
     def __enter__(self) -> Interrupt:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._handlers[number] = signal.signal(number, self._handle)
+            free = [number for number in (*ELSE, *IGNORED) if signal.getsignal(number) is signal.SIG_DFL]
+            for number in (*ALWAYS, *free):
+                handler = signal.SIG_IGN if number in IGNORED else self._handle
+                self._handlers[number] = signal.signal(number, handler)
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -54,9 +69,20 @@ class Interrupt:
         self._handlers.clear()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        self.count += 1
+        if not self._same(number):
+            self.count += 1
         if self.eager or (self.count > 1 and self.breakable):
             raise KeyboardInterrupt
+
+    def _same(self, number: int) -> bool:
+        """Whether a signal says again what a hang-up and what comes with it have said."""
+        again = self._hung_up or self._terminated
+        if number == signal.SIGHUP:
+            self._hung_up = True
+            return again
+        again = self._hung_up and not self._terminated
+        self._terminated |= number == signal.SIGTERM
+        return again and number == signal.SIGTERM
 
 
 @dataclass(frozen=True, slots=True)

@@ -216,7 +216,8 @@ def with_servos(folder: Path, **changes: Any) -> Robot:
     """The robot with servos of the user's own."""
     robot = Path(ROBOT.mjcf).with_suffix(".yaml").read_text().replace("mjcf: op3.xml", f"mjcf: {ROBOT.mjcf}")
     (folder / "servo.yaml").write_text(yaml.safe_dump(asdict(replace(ROBOT.servos[0], **changes))))
-    (folder / "own.yaml").write_text(robot.replace("xm430-w350", "servo.yaml"))
+    limits = [line for line in robot.splitlines(True) if "voltage: 10" not in line]  # of a supply of its own
+    (folder / "own.yaml").write_text("".join(limits).replace("xm430-w350", "servo.yaml"))
     return load_robot(folder / "own.yaml")
 
 

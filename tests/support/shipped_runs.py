@@ -24,8 +24,8 @@ ROBOT = load_robot()
 class Asked(InlinePlanner):
     """Keeps what it is asked, so that the same can be planned again with one thing changed."""
 
-    def __init__(self, answer: Answer, seed: int = 0) -> None:
-        super().__init__(answer, seed)
+    def __init__(self, answer: Answer) -> None:
+        super().__init__(answer)
         self.requests: list[PlanRequest] = []
 
     def submit(self, request: PlanRequest) -> None:
@@ -38,7 +38,7 @@ class Asked(InlinePlanner):
 
     def answer(self, request: PlanRequest) -> Plan:
         """The plan of a request, without collecting it."""
-        return self._answer(request, self._seed)
+        return self._answer(request)
 
     @property
     def runtime(self) -> Runtime:
@@ -102,7 +102,7 @@ def walked(driven: Driven, ticks: int = 101) -> Driven:
     assert len(driven.truth.yaw) == ticks
     settings = driven.planner.runtime.settings
     for planner in driven.planners:
-        assert len(planner.requests) >= (ticks - 6) // settings.replan
+        assert len(planner.requests) >= (ticks - 6) // settings.execution_horizon
     assert len(driven.plans) in (len(driven.planner.requests) - 1, len(driven.planner.requests))
     assert {plan.adopted - plan.requested for plan in driven.plans} == {settings.delay}
     # What is planned again is what was run: else no comparison of plans would be of the run's own.

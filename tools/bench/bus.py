@@ -58,12 +58,12 @@ COLUMNS = ("client", "mode", "baud", "median_ms", "p99_ms", "cpu_us", "failed", 
 def measure(report: Report, bauds: tuple[int, ...], cycles: int) -> list[dict[str, Any]]:
     """A row for each client, mode and baud, the wire's own among them."""
     from servoid.stack.runtime.realtime import undisturbed
-    from servoid.tools.bench.clients import CLIENTS
+    from servoid.tools.bench.bus_clients import CLIENTS
 
     rows = []
     with responder() as port, undisturbed(False, report.line):
         for baud in bauds:
-            runs = {(name, mode): Run() for mode in ("sync", "fast") for name in CLIENTS}
+            runs = {(name, mode): ClientTimes() for mode in ("sync", "fast") for name in CLIENTS}
             done = 0
             while done < cycles:
                 batch = min(BATCH, cycles - done)
@@ -78,7 +78,7 @@ def measure(report: Report, bauds: tuple[int, ...], cycles: int) -> list[dict[st
     return rows
 
 
-class Run:
+class ClientTimes:
     """Times of a client in one mode at one baud."""
 
     def __init__(self) -> None:
@@ -120,12 +120,12 @@ class Run:
 
 def wire_ms(mode: str, baud: int) -> float:
     """Time that the bytes of a cycle take on a wire, without any pause between them."""
-    from servoid.hw.dynamixel.bus import BITS
-    from servoid.hw.dynamixel.group_read import GroupRead
-    from servoid.tools.bench.clients import BOARD, BOARD_BYTES, GOAL_BYTES, PRESENT, PRESENT_BYTES
+    from servoid.hw.dynamixel.transport.bus import BITS
+    from servoid.hw.dynamixel.transport.group_read import GroupRead
+    from servoid.tools.bench.bus_clients import BOARD, BOARD_BYTES, GOAL_BYTES, PRESENT, PRESENT_BYTES
 
-    present = GroupRead([(id, PRESENT, PRESENT_BYTES) for id in range(SERVOS)], fast=mode == "fast").begin()
-    board = GroupRead([(BOARD_ID, BOARD, BOARD_BYTES)]).begin()
+    present = GroupRead([(id, PRESENT, PRESENT_BYTES) for id in range(SERVOS)], fast=mode == "fast").request_all()
+    board = GroupRead([(BOARD_ID, BOARD, BOARD_BYTES)]).request_all()
     goals = 14 + SERVOS * (1 + GOAL_BYTES)
     count = goals + sum(len(request.packet) + request.answer for request in (present, board))
     return 1e3 * BITS * count / baud

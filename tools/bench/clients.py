@@ -1,92 +1,60 @@
-"""The clients that `servoid bench bus` times: each writes 20 goals and reads 20 servos and the board in a cycle."""
+"""What other people's clients do, against the virtual rig: every verb of theirs, and whether the rig answers as servos.
+
+The verbs go through the official SDK, as those clients do, in the rig's own time: the result does not depend on how
+busy this machine is. Nothing of the clients' code is used.
+"""
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Sequence
-from typing import Any, Protocol
+import argparse
+from typing import Any
 
-import numpy as np
-
-from servoid.hw.clock import WallClock
-from servoid.hw.contracts.body import Array
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.codec import SyncWriter
-from servoid.hw.dynamixel.group_read import GroupRead
-from servoid.hw.dynamixel.port import SerialPort
-
-GOAL, GOAL_BYTES = 116, 4
-PRESENT, PRESENT_BYTES = 126, 10  # current, velocity, position
-BOARD, BOARD_BYTES = 30, 20  # from the buttons to the IMU's angles
-_FIELDS = np.dtype([("current", "<i2"), ("velocity", "<i4"), ("position", "<i4")])
+from servoid.hw.config import ConfigError, nearest
+from servoid.tools.common import exit_codes
+from servoid.tools.common.output import Report, add_json_argument, reporting
 
 
-class Client(Protocol):
-    """A program that drives the bus."""
-
-    def cycle(self, goals: Sequence[int]) -> Array | None:
-        """Write the goals, read everybody; raw current, velocity and position `(3, n)`, or None where any is lost."""
-        ...
-
-    def close(self) -> None: ...
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--client", action="append", metavar="NAME", help="only this one; can be repeated")
+    add_json_argument(parser)
 
 
-class Servoid:
-    """This project's bus."""
+def main(args: argparse.Namespace) -> int:
+    from servoid.tools.bench.client_verbs import CLIENTS
 
-    def __init__(self, port: str, baud: int, ids: Sequence[int], board: int, fast: bool) -> None:
-        self._port = SerialPort(port, baud)
-        self._bus = Bus(self._port, WallClock())
-        self._present = GroupRead([(id, PRESENT, PRESENT_BYTES) for id in ids], fast=fast)
-        self._board = GroupRead([(board, BOARD, BOARD_BYTES)])
-        self._goals = SyncWriter(ids, GOAL, GOAL_BYTES, signed=True)
-
-    def cycle(self, goals: Sequence[int]) -> Array | None:
-        if self._bus.read_groups((self._present, self._board), self._goals.packet(goals)):
-            return None
-        raw = np.frombuffer(b"".join(self._present.data), _FIELDS)  # type: ignore[arg-type]
-        return np.array([raw["current"], raw["velocity"], raw["position"]])
-
-    def close(self) -> None:
-        self._port.close()
-
-
-class Sdk:
-    """The official dynamixel-sdk, used as its examples do."""
-
-    def __init__(self, port: str, baud: int, ids: Sequence[int], board: int, fast: bool) -> None:
-        import dynamixel_sdk as sdk
-
-        self._ids, self._board, self._fast = ids, board, fast
-        self._port = sdk.PortHandler(port)
-        if not (self._port.openPort() and self._port.setBaudRate(baud)):
-            raise OSError(f"{port}: the SDK does not open it")
-        self._packets: Any = sdk.Protocol2PacketHandler()
-        self._write = sdk.GroupSyncWrite(self._port, self._packets, GOAL, GOAL_BYTES)
-        self._read = sdk.GroupSyncRead(self._port, self._packets, PRESENT, PRESENT_BYTES)
-        for id in ids:
-            self._read.addParam(id)
-            self._write.addParam(id, bytes(GOAL_BYTES))
-
-    def cycle(self, goals: Sequence[int]) -> Array | None:
-        for id, goal in zip(self._ids, goals, strict=True):
-            self._write.changeParam(id, struct.pack("<i", goal))
-        failed = self._write.txPacket()
-        failed |= self._read.fastSyncRead() if self._fast else self._read.txRxPacket()
-        _, result, error = self._packets.readTxRx(self._port, self._board, BOARD, BOARD_BYTES)
-        if failed or result or error:
-            return None
-        get = self._read.getData
-        return np.array(
-            [
-                [get(id, PRESENT, 2) for id in self._ids],
-                [get(id, PRESENT + 2, 4) for id in self._ids],
-                [get(id, PRESENT + 6, 4) for id in self._ids],
-            ]
+    with reporting(args.json) as report:
+        for name in args.client or ():
+            if name not in CLIENTS:
+                raise ConfigError(f"--client '{name}': {nearest(name, CLIENTS)}")
+        rows = measure(report, args.client or list(CLIENTS))
+        failed = [row for row in rows if row["problem"] is not None]
+        report.table(
+            ("client", "verb", "instructions", "result"),
+            [[row["client"], row["verb"], row["instructions"], row["problem"] or "passed"] for row in rows],
         )
+        report.line(f"{len(rows) - len(failed)} of {len(rows)} verbs pass")
+        report.result({"verbs": len(rows), "failed": len(failed), "rows": rows})
+    return exit_codes.DONE
 
-    def close(self) -> None:
-        self._port.closePort()
 
+def measure(report: Report, names: list[str]) -> list[dict[str, Any]]:
+    """A row for each verb, on a rig of its own."""
+    from tqdm import tqdm
 
-CLIENTS: dict[str, type[Servoid] | type[Sdk]] = {"servoid": Servoid, "sdk": Sdk}
+    from servoid.hw.robot.description import load_robot
+    from servoid.tools.bench.client_verbs import CLIENTS
+    from servoid.tools.bench.sdk_host import Refused, SdkHost
+
+    robot = load_robot()
+    rows = []
+    jobs = [(name, *verb) for name in names for verb in CLIENTS[name]]
+    for name, verb, factory_state, act in tqdm(jobs, unit="verb", mininterval=2.0):
+        host, problem = SdkHost(robot, factory_state), None
+        try:
+            act(host)
+        except Refused as error:
+            problem = str(error)
+        rows.append(
+            {"client": name, "verb": verb, "instructions": host.rig.dispatcher.instructions, "problem": problem}
+        )
+    return rows

@@ -126,8 +126,8 @@ def _run(args: argparse.Namespace, report: Report) -> None:
 
 
 def due_ms(settings: DiffusionSettings, dt: float) -> float:
-    """Milliseconds after its request by which a plan must be there: `delay`, or `replan` where there is no delay."""
-    return 1000 * (settings.delay or settings.replan) * dt
+    """Milliseconds after its request by which a plan must be there: `delay`, or else `execution_horizon`."""
+    return 1000 * (settings.delay or settings.execution_horizon) * dt
 
 
 def _time(
@@ -148,7 +148,7 @@ def _time(
     from servoid.policy.diffusion.runtime import Runtime
     from servoid.stack.tasks import load_task
 
-    cost = load_task("walk", dt=robot.dt).cost
+    cost = load_task("walk", dt=robot.dt).objective
     request = _request(robot, network.model, settings.delay)
     rows = []
     for gradient in (NONE, "analytic", "network") if engine == REFERENCE else (NONE, "analytic"):
@@ -254,16 +254,16 @@ def _request(robot: Robot, model: Model, delay: int) -> PlanRequest:
 
 
 def _plan_times(planner: Runtime, request: PlanRequest, plans: int) -> tuple[list[float], list[float]]:
-    """Milliseconds of plans in a row, each `replan` ticks after the one before, which it may go on from.
+    """Milliseconds of plans in a row, each `execution_horizon` ticks after the one before, which it may go on from.
 
     By the clock, and of the processor's time: on a machine that others use too only the second can be compared.
     """
     previous = None
     wall, cpu = [], []
     for i in range(WARM_UP + plans):
-        asked = replace(request, tick=i * planner.settings.replan, previous=previous)
+        asked = replace(request, tick=i * planner.settings.execution_horizon, previous=previous)
         start, busy = time.perf_counter(), time.process_time()
-        previous = planner.plan(asked, 0)
+        previous = planner.plan(asked)
         if i >= WARM_UP:
             wall.append(1000 * (time.perf_counter() - start))
             cpu.append(1000 * (time.process_time() - busy))

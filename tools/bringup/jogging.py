@@ -6,6 +6,7 @@ one slow and near: whatever the supervisor proposes, no more than that is sent.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import select
@@ -162,7 +163,8 @@ class Keys:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
+        with contextlib.suppress(termios.error):  # a terminal that is gone needs nothing any more
+            termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
 
     def wish(self, seconds: float, angle: float) -> Wish:
         """The newest key counts, for KEY_SECONDS: many that come at once over a slow line move no further than one."""
@@ -177,7 +179,10 @@ class Keys:
     def _newest(self) -> Wish | None:
         typed = b""
         while select.select([self._descriptor], [], [], 0)[0]:
-            piece = os.read(self._descriptor, 256)
+            try:
+                piece = os.read(self._descriptor, 256)
+            except OSError:
+                piece = b""
             if not piece:  # the terminal is gone
                 return Wish.END
             typed += piece

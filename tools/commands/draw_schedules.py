@@ -10,7 +10,7 @@ import numpy as np
 
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.schedule import DenoisingMatrix
-from servoid.policy.diffusion.settings import Autoregressive, DiffusionSettings, Gradual
+from servoid.policy.diffusion.settings import Autoregressive, DiffusionSettings, Pyramid
 
 NETWORK = DenoiserConfig(108, 20)  # 4 past and 16 future states, 20 noise levels
 FOLDER = Path("docs/schedules")
@@ -19,9 +19,9 @@ FOLDER = Path("docs/schedules")
 PICTURES = {
     "full_sequence": DiffusionSettings(steps=5, lead=1),
     "autoregressive": DiffusionSettings(schedule="autoregressive", steps=5, autoregressive=Autoregressive(block=4)),
-    "gradual": DiffusionSettings(schedule="gradual", steps=5, gradual=Gradual(spread=5)),
-    "trapezoid": DiffusionSettings(schedule="gradual", steps=5, gradual=Gradual(spread=5, shape="trapezoid")),
-    "rolling": DiffusionSettings(schedule="rolling", steps=3, replan=1, delay=1),
+    "pyramid": DiffusionSettings(schedule="pyramid", steps=5, pyramid=Pyramid(spread=5)),
+    "trapezoid": DiffusionSettings(schedule="pyramid", steps=5, pyramid=Pyramid(spread=5, shape="trapezoid")),
+    "rolling": DiffusionSettings(schedule="rolling", steps=3, execution_horizon=1, delay=1),
 }
 
 

@@ -42,7 +42,7 @@ def plot_path(log: FlightLog, out: Path) -> None:
     """The path from above alone, with goal and plans. Raises ModuleNotFoundError without matplotlib."""
     figure, axes = _figure(1, 1, (6.4, 6.0))
     _path(axes, log)
-    axes.set_title(_title(log))
+    axes.set_title(title(log))
     _save(figure, out)
 
 
@@ -51,7 +51,7 @@ def plot_run(log: FlightLog, out: Path) -> None:
     if not log.messages["/state"]:
         raise ConfigError(f"{log.path}: holds no state: the run ended before every sensor was read")
     figure, axes = _figure(2, 3, (16.0, 9.0))
-    figure.suptitle(_title(log))
+    figure.suptitle(title(log))
     _path(axes[0, 0], log)
     _velocity(axes[0, 1], log)
     _tilt(axes[0, 2], log)
@@ -78,12 +78,14 @@ def _save(figure: Any, out: Path) -> None:
         raise ConfigError(f"{out}: cannot be written ({error.strerror}): choose another place with --out") from None
 
 
-def _title(log: FlightLog) -> str:
+def title(log: FlightLog) -> str:
+    """What ran, and how it ended."""
     settings, result = log.header["settings"], log.result
     end = "cut short" if result is None else result["outcome"]
     if result is not None and "seconds" in result:
         end += f" after {result['seconds']:.1f} s"
-    return f"{settings['task']} with {settings['policy']} on {settings['robot']}, seed {settings['seed']}: {end}"
+    policy = log.header["policy"]["name"]  # settings name the default where a program brought its own
+    return f"{settings['task']} with {policy} on {settings['robot']}, seed {settings['seed']}: {end}"
 
 
 def _seconds(log: FlightLog, channel: str) -> Array:

@@ -1,17 +1,26 @@
-"""Serve a virtual rig on a serial port: servos and board that answer real bytes, moved by physics, until Ctrl-C."""
+"""Serve a virtual rig on a serial port: servos and board that answer real bytes, moved by physics, until Ctrl-C.
+
+Any program that speaks to Dynamixel servos can use the port. While the robot is held and its servos are limp, joints
+are moved as by hand with `servoid virtual --link PATH --move JOINT=RAD ...`, from where they are, within `--over`
+seconds: so other programs record ranges and calibrate.
+"""
 
 from __future__ import annotations
 
 import argparse
 import signal
+import time
 from pathlib import Path
 from types import FrameType
 
 from servoid.hw.config import ConfigError
 from servoid.sim.rig.factory_state import add_factory_state_arguments
 from servoid.tools.common import exit_codes
-from servoid.tools.common.output import add_json_argument, reporting
+from servoid.tools.common.output import Report, add_json_argument, reporting
 from servoid.tools.common.parser import check_seed
+
+HAND_SECONDS = 0.02  # between two places of a joint that is moved by hand
+BOARD_POWER = 24  # register of the board
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,38 +37,114 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the sensors' errors")
     parser.add_argument("--randomise", action="store_true", help="another robot within the ranges of training")
     add_factory_state_arguments(parser)
+    parser.add_argument(
+        "--move",
+        nargs="+",
+        metavar="JOINT=RAD",
+        help="serve nothing, but move limp joints of the rig that runs at --link or --control, as by hand",
+    )
+    parser.add_argument("--over", type=float, default=1.0, metavar="S", help="how long a --move takes (default: 1)")
     add_json_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
-    from servoid.sim.rig.process.server import build
-
     with reporting(args.json) as report:
         check_seed(args.seed)
         if args.control is None and args.link is not None:
             args.control = args.link.with_name(args.link.name + ".control")
+        if args.move is not None:
+            move(report, args.control, args.move, args.over)
+            return exit_codes.DONE
         if args.clock == "locked" and args.control is None:
             raise ConfigError("--clock locked needs a control socket: give --link or --control")
-        try:
-            server = build(args)
-        except OSError as error:
-            raise ConfigError(
-                f"the virtual port cannot be made: {error}: choose another --link or --control"
-            ) from error
-
-        def stop(signum: int, frame: FrameType | None) -> None:
-            server.stop()
-
-        robot = server.rig.robot
-        report.line(f"{robot.name}: {len(robot.joints)} servos and the board at {server.port}, {robot.bus.baud} bit/s")
-        if args.control is not None:
-            report.line(f"control socket: {args.control}")
-        report.line("The robot is held above the ground until all servos have torque. Ctrl-C ends it.")
-        report.result({"robot": robot.name, "port": server.port, "baud": robot.bus.baud, "control": args.control})
-        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            server.serve()
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        serve(report, args)
     return exit_codes.DONE
+
+
+def serve(report: Report, args: argparse.Namespace) -> None:
+    """Until Ctrl-C. Raises ConfigError."""
+    from servoid.sim.rig.process.server import build
+
+    try:
+        server = build(args, told=report.line)
+    except OSError as error:
+        raise ConfigError(f"the virtual port cannot be made: {error}: choose another --link or --control") from error
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        server.stop()
+
+    rig = server.rig
+    baud = rig.factory_state.bus_baud(rig.robot)
+    for line in told(rig.robot.name, len(rig.robot.joints), rig.robot.bus.board_id, baud, server.port, args):
+        report.line(line)
+    board = rig.robot.bus.board_id if args.board else None
+    values = {"robot": rig.robot.name, "port": server.port, "baud": baud, "control": args.control, "board_id": board}
+    report.result(values | {"powered": args.powered or not args.board})
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        server.serve()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def told(robot: str, servos: int, board_id: int, baud: int, port: str, args: argparse.Namespace) -> list[str]:
+    """What a client has to know and to do."""
+    board = f" and the board (ID {board_id})" if args.board else ""
+    lines = [f"{robot}: {servos} servos{board} at {port}, {baud} bit/s, protocol 2.0"]
+    if not args.board:
+        lines.append("There is no board: the servos have power.")
+    elif args.powered:
+        lines.append("The servos have power already.")
+    else:
+        lines.append(
+            f"The servos have no power and are silent until a client writes 1 to register {BOARD_POWER} of the board, "
+            f"ID {board_id}; they answer 0.3 s later. A client that knows no board needs --powered or --no-board."
+        )
+    if args.fresh:
+        lines.append(f"As from the factory, ID 1 at 57600 bit/s: {', '.join(args.fresh)}.")
+    lines.append("The robot is held above the ground until all servos have torque.")
+    if args.control is not None:
+        where = f"--link {args.link}" if args.link is not None else f"--control {args.control}"
+        lines.append(f"While servos are limp, move their joints by hand: servoid virtual {where} --move JOINT=RAD ...")
+    else:
+        lines.append("To move its joints by hand, give --link or --control.")
+    return [*lines, "Ctrl-C ends it."]
+
+
+def move(report: Report, control_path: Path | None, words: list[str], seconds: float) -> None:
+    """Move joints of a rig that runs, evenly, from where they are. Raises ConfigError, and BackendError where the rig
+    is gone or refuses: joints that it has not or that have torque, a robot that is not held."""
+    import numpy as np
+
+    from servoid.sim.rig.process.control import Control
+
+    if control_path is None:
+        raise ConfigError("--move needs a rig that runs: give its --link or --control")
+    if not 0.0 <= seconds < float("inf"):
+        raise ConfigError(f"--over {seconds}: give a time from 0 s on")
+    goals = dict(_goal(word) for word in words)
+    control = Control(control_path)
+    try:
+        start = control.joints()
+        begin = {name: start.get(name, goal) for name, goal in goals.items()}
+        for share in np.linspace(0.0, 1.0, max(round(seconds / HAND_SECONDS), 1) + 1)[1:].tolist():
+            control.move({name: begin[name] + share * (goal - begin[name]) for name, goal in goals.items()})
+            time.sleep(HAND_SECONDS if seconds else 0.0)
+        now = control.joints()
+    finally:
+        control.close()
+    for name in goals:
+        report.line(f"{name}: from {begin[name]:+.3f} to {now[name]:+.3f} rad")
+    report.result({"joints": {name: now[name] for name in goals}})
+
+
+def _goal(word: str) -> tuple[str, float]:
+    name, _, text = word.partition("=")
+    try:
+        angle = float(text)
+    except ValueError:
+        angle = float("nan")
+    if not (name and abs(angle) < float("inf")):
+        raise ConfigError(f"--move {word}: give JOINT=RAD, such as l_knee=0.5")
+    return name, angle

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import io
 import json
 import math
@@ -32,7 +33,7 @@ class Report:
 
     def line(self, text: str = "") -> None:
         """A line for a person."""
-        print(text, file=sys.stderr if self.as_json else self._stdout, flush=True)
+        say(text, sys.stderr if self.as_json else self._stdout)
 
     def table(self, head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
         """A table for a person, columns aligned."""
@@ -47,7 +48,18 @@ class Report:
             raise RuntimeError("a command has one result")
         self.has_result = True
         if self.as_json:
-            print(to_json(values), file=self._stdout, flush=True)
+            say(to_json(values), self._stdout)
+
+
+def say(text: str, stream: TextIO) -> None:
+    """Print a line. Once a terminal was closed, or went with an ssh connection, nothing is printed: what remains to be
+    done is done all the same."""
+    try:
+        print(text, file=stream, flush=True)
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # Python writes once more at exit
 
 
 class Screen:

@@ -59,9 +59,9 @@ def fuzz(report: Report, args: argparse.Namespace) -> dict[str, Any]:
 
     from servoid.hw.robot.description import load_robot
     from servoid.tools.faults.streams import stream
-    from servoid.tools.faults.targets import Codec, Driver, Imus, Servos, Target, Unbounded
+    from servoid.tools.faults.targets import CodecTarget, DriverTarget, ImuTarget, ServoTarget, Target, Unbounded
 
-    servos = Servos(load_robot(args.robot))
+    servos = ServoTarget(load_robot(args.robot))
     counts = {"exceptions": 0, "hangs": 0, "unbounded": 0}
     failures: list[dict[str, Any]] = []
     began, settled = time.monotonic(), 0.0
@@ -73,7 +73,7 @@ def fuzz(report: Report, args: argparse.Namespace) -> dict[str, Any]:
             done = number - args.first
             if done % BLOCK == 0:
                 servos.renew()
-                targets = [Codec(), Driver(), Imus(), servos]
+                targets = [CodecTarget(), DriverTarget(), ImuTarget(), servos]
                 settled = memory_mb() if done <= BLOCK else settled
             pieces = stream(args.seed, number)
             total_bytes += sum(map(len, pieces))

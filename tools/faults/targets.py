@@ -12,10 +12,10 @@ from typing import Protocol
 
 import numpy as np
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.codec import MAX_LENGTH, Parser
-from servoid.hw.dynamixel.group_read import GroupRead
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import MAX_LENGTH, Parser
+from servoid.hw.dynamixel.transport.bus import Bus
+from servoid.hw.dynamixel.transport.group_read import GroupRead
 from servoid.hw.imu.bno08x import Bno08x
 from servoid.hw.imu.reading import Decoder
 from servoid.hw.imu.witmotion import WitMotion
@@ -42,7 +42,7 @@ class Target(Protocol):
     def take(self, pieces: Sequence[bytes]) -> None: ...
 
 
-class Codec:
+class CodecTarget:
     """The parser of packets, and the ways through whole answers."""
 
     name = "codec"
@@ -64,7 +64,7 @@ class Codec:
         codec.whole_sync(data, self._heads, WIDTH)
 
 
-class Imus:
+class ImuTarget:
     """The parsers of IMUs on a serial port of their own."""
 
     name = "imu"
@@ -83,7 +83,7 @@ class Imus:
                         raise ValueError(f"a sample that is infinite: {sample}")
 
 
-class Servos:
+class ServoTarget:
     """The virtual servos and the board, moved by physics."""
 
     name = "servos"
@@ -119,7 +119,7 @@ class Servos:
                 raise ValueError("the body is no longer anywhere")
 
 
-class Driver:
+class DriverTarget:
     """The driver's bus, whose servos answer with the stream."""
 
     name = "bus"
@@ -137,7 +137,7 @@ class Driver:
         began = self._line.time
         for group in self._groups:
             self._line.answer(pieces)
-            self._bus.read_group(group)
+            self._bus.sync_read(group)
         self._line.answer(pieces)
         self._bus.ping(1, tries=1)
         if self._line.time - began > 200_000_000:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +12,11 @@ import numpy as np
 from servoid.hw.robot.description import load_robot
 
 if TYPE_CHECKING:
+    from servoid.hw.contracts.control import Policy
     from servoid.hw.robot.description import Robot
     from servoid.policy.diffusion.model.config import DenoiserConfig
     from servoid.policy.diffusion.settings import DiffusionSettings
     from servoid.stack.control.fleet import Fleet
-    from servoid.tools.learn.collect.episode_cutter import Driver
 
 _CHANGE = 125  # ticks between commands
 _PUSH_EVERY = 50  # ticks
@@ -33,15 +32,14 @@ def closed_loop_survival(
     """Run a diffusion checkpoint in `worlds` worlds, all planned as one batch: see `survival_of`."""
     from servoid.policy.checkpoint import read_header
     from servoid.policy.diffusion.model.config import check_fit
-    from servoid.policy.diffusion.runtime import load_runtime
+    from servoid.stack.control.diffusion import diffusion_policy
     from servoid.stack.tasks import load_task
-    from servoid.tools.learn.envs.planned import PlannedWalker
 
     robot, head = load_robot(robot_name), read_header(checkpoint)
     settings = planning(check_fit(checkpoint, head, robot), head["training"])
     settings = replace(settings, checkpoint=str(checkpoint))
-    runtime = load_runtime(robot, settings, load_task("walk", {}, robot.dt).cost)
-    return survival_of(partial(PlannedWalker, runtime=runtime, seed=seed), robot, seconds, worlds, seed)
+    policy = diffusion_policy(robot, settings, load_task("walk", {}, robot.dt).objective, shape=(worlds,))
+    return survival_of(policy, measured_fleet(robot, worlds, seed), seconds)
 
 
 def planning(network: DenoiserConfig, training: Mapping[str, Any]) -> DiffusionSettings:
@@ -56,26 +54,29 @@ def planning(network: DenoiserConfig, training: Mapping[str, Any]) -> DiffusionS
     return settings
 
 
-def survival_of(
-    drive: Callable[[Fleet], Driver], robot: Robot, seconds: float, worlds: int, seed: int
-) -> dict[str, float]:
-    """Walk in `worlds` worlds under changing velocity commands and pushes, the same ones for the same `seed`.
+def measured_fleet(robot: Robot, worlds: int, seed: int) -> Fleet:
+    """Robots that are none of those that data is collected on with this seed, half of them drawn at random."""
+    from servoid.stack.control.fleet import Fleet
+    from servoid.stack.estimation.odometry import load_odometry
 
-    Pushes, and a robot drawn at random in half of the worlds, tell networks apart: without them every network that
-    walks at all survives.
+    return Fleet(robot, worlds, load_odometry(robot), randomise=_RANDOMISED, seed=seed, tag=_MEASURED)
+
+
+def survival_of(policy: Policy, fleet: Fleet, seconds: float) -> dict[str, float]:
+    """Let a `policy` of shape `(fleet.n,)` walk under changing velocity commands and pushes, drawn by the fleet's seed.
+
+    Pushes, and robots drawn at random, tell networks apart: without them every network that walks at all survives.
 
     Returns `survival`, the share of worlds that never fell, and `velocity_error`, the mean planar error [m/s] of
     those, smoothed over a cycle, from 2 s after each command.
     """
     from servoid.policy.references.gait import load_gait
-    from servoid.stack.control.fleet import Fleet
-    from servoid.stack.estimation.odometry import load_odometry
 
-    fleet = Fleet(robot, worlds, load_odometry(robot), randomise=_RANDOMISED, seed=seed, tag=_MEASURED)
+    robot, worlds = fleet.robot, fleet.n
+    everything = np.ones(worlds, bool)
     cycle, low, high = load_gait().cycle, _LOW * robot.walking.scale, _HIGH * robot.walking.scale
-    walker, everything = drive(fleet), np.ones(worlds, bool)
     fleet.reset(everything)
-    walker.reset(everything)
+    policy.reset(None, fleet.seeds)
     command = np.zeros((worlds, 3))
     alive, errors = everything.copy(), []
     smooth = np.zeros((worlds, 2))
@@ -85,8 +86,7 @@ def survival_of(
         if tick % _PUSH_EVERY == 0 and tick:
             bearing = np.array([rng.uniform(-np.pi, np.pi) for rng in fleet.rngs])
             fleet.worlds.push(_PUSH * robot.walking.forward * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1))
-        fleet.observe()
-        fleet.step(walker.act(command))
+        fleet.drive(policy, command)
         alive &= ~fleet.truth.fallen
         smooth += robot.dt / cycle * (fleet.truth.velocity[:, :2] - smooth)
         if (tick - 25) % _CHANGE >= 100 and tick > 25:

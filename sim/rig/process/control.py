@@ -79,8 +79,12 @@ class Control:
         self.call("roll", places=np.asarray(places).tolist())
 
     def move(self, pose: dict[str, float]) -> None:
-        """Move joints of the held robot by hand [rad]."""
+        """Move limp joints of the held robot by hand [rad]."""
         self.call("move", pose=pose)
+
+    def joints(self) -> dict[str, float]:
+        """Where each joint is [rad]."""
+        return dict(self.call("joints")["joints"])
 
     def press(self, buttons: int) -> None:
         """Hold down buttons of the board; 0 lets go."""
@@ -99,6 +103,12 @@ class Control:
         if answer["forgotten"]:
             raise BackendError(f"virtual rig: {answer['forgotten']} accepted writes were forgotten: ask more often")
         return list(answer["accepted"])
+
+    def lateness(self) -> str | None:
+        """What a person should know of a rig in real time that was late since this was last asked; None if it was
+        not."""
+        text: str | None = self.call("lateness")["text"]
+        return text
 
     def servos(self) -> list[dict[str, Any]]:
         """State of each servo, in the robot's joint order."""

@@ -78,6 +78,10 @@ def _move(rig: Rig, pose: dict[str, float]) -> dict[str, Any]:
     return {}
 
 
+def _joints(rig: Rig) -> dict[str, Any]:
+    return {"joints": dict(zip(rig.robot.names, rig.plant.joints.tolist(), strict=True))}
+
+
 def _press(rig: Rig, buttons: int) -> dict[str, Any]:
     rig.board.buttons = int(buttons)
     return {}
@@ -118,6 +122,7 @@ _REQUESTS: dict[str, Callable[..., dict[str, Any]]] = {
     "furnish": _furnish,
     "roll": _roll,
     "move": _move,
+    "joints": _joints,
     "press": _press,
     "inject": _inject,
     "truth": _truth,

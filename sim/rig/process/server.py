@@ -19,6 +19,7 @@ import signal
 import socket
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -28,15 +29,17 @@ from typing import Any, Literal
 from servoid.hw.clock import wake_sharply
 from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
-from servoid.sim.rig.factory_state import FactoryState, add_factory_state_arguments
+from servoid.sim.rig.factory_state import add_factory_state_arguments, factory_state_of
 from servoid.sim.rig.faults import Scenario, load_scenario
 from servoid.sim.rig.process import control_requests
 from servoid.sim.rig.process.control_requests import Connection
+from servoid.sim.rig.process.lateness import NOTICED_NS, Lateness, packets, sentence
 from servoid.sim.rig.process.pty import Pty
 from servoid.sim.rig.rig import Rig
 
 ClockKind = Literal["real", "locked"]
 PICK_UP_SECONDS = 3.0  # without torque anywhere, before somebody picks a free-running robot up
+_LONGEST_WAIT = 50_000_000  # ns of a packet for a line that is never quiet
 _FARTHEST_BEHIND = 200_000_000  # ns that a rig hurries to catch up; of longer pauses the rest never happened
 
 
@@ -51,9 +54,13 @@ class Server:
         link: Path | None = None,
         control: Path | None = None,
         linger: float | None = None,
+        told: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """Raises OSError when the link or the socket cannot be made."""
+        """`told` hears when the rig was late. Raises OSError when the link or the socket cannot be made."""
         self.rig = rig
+        self.lateness = Lateness(told)
+        self._sent_ns = 0  # when the last of them went out
+        self._waiting: deque[bytes] = deque()  # packets that came together because the rig was late
         self._listener = None if control is None else _listen(control)
         try:
             self.pty = Pty(link)
@@ -145,8 +152,7 @@ class Server:
             rig.host_sends(sent)
             heard = rig.advance(to_ns)
         else:
-            heard = rig.advance(to_ns)
-            rig.host_sends(sent)
+            heard = self._catch_up(sent, to_ns)
         if sent:
             self._used = time.monotonic()
         if rig.skew_ns:
@@ -157,6 +163,29 @@ class Server:
             pty.write(heard, visible=visible)
         self._plug()
         return len(heard)
+
+    def _catch_up(self, sent: bytes, to_ns: int) -> bytes:
+        """Live until `to_ns` in real time. What the host has written was written just now; of a rig that was late
+        nobody can say when, so its packets count as written one after the other since it last looked, none into an
+        answer."""
+        rig = self.rig
+        late = to_ns - rig.next_event()
+        self.lateness.note(late, time.monotonic_ns())
+        if late <= NOTICED_NS and not self._waiting:
+            heard = rig.advance(to_ns)
+            rig.host_sends(sent)
+            return heard
+        self._waiting += packets(sent)
+        heard, began, count = b"", rig.now_ns, len(self._waiting)
+        for i in range(count):
+            heard += rig.advance(max(rig.now_ns, began + (to_ns - began) * i // count))
+            while rig.wire.busy and rig.next_event() <= to_ns:
+                heard += rig.advance(rig.next_event())
+            if rig.wire.busy and rig.now_ns - self._sent_ns < _LONGEST_WAIT:
+                break
+            self._sent_ns = rig.now_ns
+            rig.host_sends(self._waiting.popleft())
+        return heard + rig.advance(to_ns)
 
     def _plug(self) -> None:
         """Make the port what the faults say."""
@@ -207,6 +236,7 @@ class Server:
             "lock": partial(self._lock, number),
             "advance": self._advance,
             "reset": self._reset,
+            "lateness": self._lateness,
         }
         try:
             request = json.loads(line)
@@ -232,9 +262,15 @@ class Server:
         heard = self._exchange(max(to, self.rig.now_ns), visible=True)
         return {"now": self.rig.now_ns, "heard": heard}
 
+    def _lateness(self) -> dict[str, Any]:
+        """How often, and by how much, the rig was late since this was last asked."""
+        times, worst = self.lateness.take()
+        return {"times": times, "worst_ms": worst * 1e-6, "text": sentence(times, worst) if times else None}
+
     def _reset(self, seed: int, randomise: bool = False) -> dict[str, Any]:
         if self.pty.is_open:
             self.pty.flush()
+        self._waiting.clear()
         self.rig.reset(seed, randomise=randomise)
         self._plug()
         return {}
@@ -266,14 +302,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_factory_state_arguments(parser)
 
 
-def build(args: argparse.Namespace, *, linger: float | None = None) -> Server:
+def build(
+    args: argparse.Namespace, *, linger: float | None = None, told: Callable[[str], None] = lambda text: None
+) -> Server:
     """A server as the arguments say. Raises ConfigError, and OSError for a link or socket that cannot be made."""
     scenario = load_scenario(args.faults) if args.faults else Scenario()
-    factory_state = FactoryState(tuple(args.fresh), tuple(args.only), args.assembly)
+    factory_state = factory_state_of(args)
     rig = Rig(
         load_robot(args.robot), seed=args.seed, randomise=args.randomise, scenario=scenario, factory_state=factory_state
     )
-    return Server(rig, clock=args.clock, link=args.link, control=args.control, linger=linger)
+    return Server(rig, clock=args.clock, link=args.link, control=args.control, linger=linger, told=told)
 
 
 def main() -> int:

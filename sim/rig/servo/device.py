@@ -1,50 +1,49 @@
-"""A device on a Dynamixel bus as its firmware answers: a control table in memory, and instructions that touch it."""
+"""A device on a Dynamixel bus as its firmware answers: instructions that touch a control table.
+
+Source of the instructions and of what is refused: ROBOTIS e-Manual, protocol 2.0 and the pages of the X series.
+"""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
 
-from servoid.hw.dynamixel.codec import CLEAR_REVOLUTIONS, Instruction, Reset, Status, StatusError
-from servoid.hw.dynamixel.tables import ControlTable, Item
+from servoid.hw.dynamixel.protocol.codec import BROADCAST, CLEAR_REVOLUTIONS, Instruction, Reset, Status, StatusError
+from servoid.hw.dynamixel.protocol.tables import ControlTable, Item
+from servoid.sim.rig.servo.registers import Registers
 
+BACKUP = 0x20  # the instruction: control table backup
+_BACKUP_KEY = b"CTRL"
+_STORE, _RESTORE = b"\x01" + _BACKUP_KEY, b"\x02" + _BACKUP_KEY
+_BACKED_UP = (  # beside the whole EEPROM and the indirect addresses
+    "velocity_i_gain", "velocity_p_gain", "position_d_gain", "position_i_gain", "position_p_gain",
+    "feedforward_2nd_gain", "feedforward_1st_gain", "profile_acceleration", "profile_velocity",
+)  # fmt: skip
+_RAM_RESTORE = 2  # bit of the startup configuration
+_SAFE_RESET_FIRMWARE = 42  # from which a factory reset of everything to everybody is not executed
 _KEPT = {Reset.ALL: (), Reset.EXCEPT_ID: ("id",), Reset.EXCEPT_ID_AND_BAUD: ("id", "baud_rate")}
+_FOR_SHADOWS = (
+    Instruction.WRITE, Instruction.REG_WRITE, Instruction.ACTION, Instruction.REBOOT, Instruction.CLEAR,
+)  # fmt: skip
+LAST_SHADOW = 252  # above it the secondary ID is none
+PROTOCOL_1 = 1  # value of the register
 
 
-class VirtualDevice:
-    """Registers and instructions common to servos and boards. Times are the rig's, in nanoseconds."""
+class VirtualDevice(Registers):
+    """Instructions common to servos and boards. Times are the rig's, in nanoseconds."""
 
     BOOT_NS = 300_000_000
 
     def __init__(self, table: ControlTable, eeprom: dict[str, int]) -> None:
         """`eeprom` holds what differs from the factory's values. Raises KeyError for a register that is not there."""
-        self.table = table
-        self.memory = bytearray(table.size)
-        self._places = {name: (item.address, item.end, item.signed) for name, item in table.items.items()}
-        self._starts = {item.address: item for item in table.items.values()}
-        self._pointers = {block.data + i: block.address + 2 * i for block in table.indirect for i in range(block.count)}
-        self._first_pointer = min(self._pointers, default=len(self.memory))
+        super().__init__(table)
         self._registered: tuple[int, bytes] | None = None
+        self._backup: dict[str, int] | None = None
         self.powered = True
         self.dead = False
         self._silent_until = 0
-        self._load(lambda item: True)
+        self.load(lambda item: True)
         for name, value in eeprom.items():
             self.put(name, value)
-
-    # Registers
-
-    def get(self, name: str) -> int:
-        """Raw value of a register. Raises KeyError where the model has none of that name."""
-        start, end, signed = self._places[name]
-        return int.from_bytes(self.memory[start:end], "little", signed=signed)
-
-    def put(self, name: str, value: int) -> None:
-        """Set a register from inside: no rule applies, and a value that does not fit is cut to what does."""
-        item = self.table.item(name)
-        bits = 8 * item.width
-        low, high = (-(1 << (bits - 1)), (1 << (bits - 1)) - 1) if item.signed else (0, (1 << bits) - 1)
-        self.memory[item.address : item.end] = item.encode(min(max(value, low), high))
 
     @property
     def id(self) -> int:
@@ -59,26 +58,36 @@ class VirtualDevice:
     def return_delay_ns(self) -> int:
         return self.memory[9] * 2000
 
+    @property
+    def old_protocol(self) -> bool:
+        """Whether it speaks protocol 1.0 and hears no packet of 2.0."""
+        return self.memory[13] == PROTOCOL_1 and "protocol_type" in self.table
+
     def answers_to(self, id: int) -> bool:
         return id == self.memory[7]
 
     def shadow(self, id: int) -> bool:
         """Whether the device obeys this ID too, without answering."""
-        return "secondary_id" in self.table and id == self.get("secondary_id") and id != self.id
+        return "secondary_id" in self.table and id == self.get("secondary_id") and id <= LAST_SHADOW and id != self.id
+
+    @property
+    def _level(self) -> int:
+        return self.get("status_return_level") if "status_return_level" in self._places else 2
+
+    @property
+    def talkative(self) -> bool:
+        """Whether it answers every instruction that is sent to it alone."""
+        return self._level == 2
 
     def fast(self) -> bool:
-        """Whether the firmware knows the fast reads."""
+        """Whether the firmware is of those that know the fast reads, and with them backup and startup configuration
+        where the model has them."""
         oldest = self.table.fast_firmware
         return oldest is not None and self.get("firmware_version") >= oldest
 
     def online(self, now_ns: int) -> bool:
         """Whether the device has power, lives and has booted."""
         return self.powered and not self.dead and now_ns >= self._silent_until
-
-    def _load(self, which: Callable[[Item], bool]) -> None:
-        for item in self.table.items.values():
-            if which(item):
-                self.memory[item.address : item.end] = item.encode(item.default or 0)
 
     # What a kind of device adds
 
@@ -106,28 +115,41 @@ class VirtualDevice:
 
     # Instructions
 
-    def execute(self, instruction: int, params: bytes, now_ns: int) -> Status | None:
-        """Execute an instruction addressed to this device alone; the reply, if the status level wants one."""
-        level = self.get("status_return_level") if "status_return_level" in self.table else 2
-        error, data = self._execute(instruction, params, now_ns)
+    def execute(self, instruction: int, params: bytes, now_ns: int, *, to: int | None = None) -> Status | None:
+        """Execute an instruction that was sent `to` the device's own ID, if to no other; the reply, if the status level
+        wants one. It carries the ID that was asked, whatever the instruction made of it."""
+        id, level = self.id, self._level
+        error, data = self._execute(instruction, params, now_ns, id if to is None else to)
         if instruction == Instruction.PING:
             wanted = 0
         elif instruction == Instruction.READ:
             wanted = 1
         else:
             wanted = 2
-        return self.status(error, data) if level >= wanted else None
+        return self.status(error, data)._replace(id=id) if level >= wanted else None
+
+    def execute_as_shadow(self, instruction: int, params: bytes, now_ns: int) -> None:
+        """Execute what was sent to the secondary ID: nobody answers, and EEPROM cannot be written that way."""
+        if instruction in (Instruction.WRITE, Instruction.REG_WRITE):
+            self.write_as_shadow(int.from_bytes(params[:2], "little"), params[2:], now_ns, instruction)
+        elif instruction in _FOR_SHADOWS:
+            self._execute(instruction, params, now_ns, self.id)
+
+    def write_as_shadow(self, address: int, data: bytes, now_ns: int, instruction: int = Instruction.WRITE) -> None:
+        writes = self.resolve(address, data)
+        if not isinstance(writes, StatusError) and not any(item.eeprom for item, _ in writes):
+            self._execute(instruction, struct.pack("<H", address) + data, now_ns, self.id)
 
     def sample(self, address: int, length: int, now_ns: int) -> Status | None:
         """The answer to a read within a group, if the status level wants one."""
-        if "status_return_level" in self._places and not self.get("status_return_level"):
+        if not self._level:
             return None
         return self.status(*self.read(address, length, now_ns))
 
     def status(self, error: int, data: bytes = b"") -> Status:
         return Status(self.id, int(error), self.alert(), data)
 
-    def _execute(self, instruction: int, params: bytes, now_ns: int) -> tuple[StatusError, bytes]:
+    def _execute(self, instruction: int, params: bytes, now_ns: int, to: int) -> tuple[StatusError, bytes]:
         word = int.from_bytes(params[:2], "little")
         if instruction == Instruction.PING:
             return StatusError.NONE, struct.pack("<HB", self.get("model_number"), self.get("firmware_version"))
@@ -140,7 +162,7 @@ class VirtualDevice:
                 return StatusError.DATA_LENGTH, b""
             if instruction == Instruction.WRITE:
                 return self.write(word, params[2:], now_ns), b""
-            error = self._check(self._resolve(word, params[2:]))
+            error = self._check(self.resolve(word, params[2:]))
             if error is StatusError.NONE:
                 self._registered = word, params[2:]
                 self._mark_registered()
@@ -151,68 +173,33 @@ class VirtualDevice:
             self.reboot(now_ns)
             return StatusError.NONE, b""
         if instruction == Instruction.FACTORY_RESET:
-            return self._factory_reset(params, now_ns), b""
+            return self._factory_reset(params, now_ns, to), b""
         if instruction == Instruction.CLEAR:
             if params != CLEAR_REVOLUTIONS:
                 return StatusError.DATA_RANGE, b""
             return self.clear(now_ns), b""
+        if instruction == BACKUP:
+            return self._back_up(params, now_ns), b""
         return StatusError.INSTRUCTION, b""
 
     def read(self, address: int, length: int, now_ns: int) -> tuple[StatusError, bytes]:
-        """Bytes of the table, through indirect addresses where there are; gaps read zero."""
-        if length == 0 or address + length > len(self.memory):
+        """Bytes of the table from a register on."""
+        if length == 0:
             return StatusError.DATA_RANGE, b""
         self.refresh(now_ns)
-        data = bytearray(self.memory[address : address + length])
-        if address + length > self._first_pointer:
-            for at in range(max(address, self._first_pointer), address + length):
-                pointer = self._pointers.get(at)
-                if pointer is not None:
-                    data[at - address] = self.memory[self._target(pointer, at)]
-        return StatusError.NONE, bytes(data)
+        data = self.peek(address, length)
+        return (StatusError.ACCESS, b"") if data is None else (StatusError.NONE, data)
 
     def write(self, address: int, data: bytes, now_ns: int) -> StatusError:
         """Write registers, all or none."""
-        writes = self._resolve(address, data)
+        writes = self.resolve(address, data)
         error = self._check(writes)
         if error is StatusError.NONE:
-            self._apply(writes, now_ns)
+            assert not isinstance(writes, StatusError)
+            for item, value in writes:
+                self.memory[item.address : item.end] = item.encode(value)
+                self.changed(item, value, now_ns)
         return error
-
-    def _target(self, pointer: int, data: int) -> int:
-        """Where an indirect data byte leads; one that points outside the table leads to itself."""
-        target = int.from_bytes(self.memory[pointer : pointer + 2], "little")
-        return target if target < len(self.memory) else data
-
-    def _resolve(self, address: int, data: bytes) -> list[tuple[Item, int]] | StatusError:
-        """The registers that `data` at `address` sets and their new values, or why not."""
-        if address + len(data) > len(self.memory):
-            return StatusError.DATA_RANGE
-        runs: list[tuple[int, bytearray]] = []
-        for offset, byte in enumerate(data):
-            at = address + offset
-            if at in self._pointers:
-                at = self._target(self._pointers[at], at)
-            if runs and at == runs[-1][0] + len(runs[-1][1]):
-                runs[-1][1].append(byte)
-            else:
-                runs.append((at, bytearray([byte])))
-        writes: list[tuple[Item, int]] = []
-        for start, run in runs:
-            for item, raw in self._split(start, bytes(run)):
-                if item is None:
-                    return StatusError.ACCESS
-                if len(raw) < item.width:
-                    return StatusError.DATA_LENGTH
-                writes.append((item, item.decode(raw)))
-        return writes
-
-    def _split(self, start: int, run: bytes) -> Iterator[tuple[Item | None, bytes]]:
-        at = 0
-        while at < len(run):
-            item = self._starts.get(start + at)
-            yield item, run[at : at + (item.width if item else 1)]
-            at += item.width if item else 1
 
     def _check(self, writes: list[tuple[Item, int]] | StatusError) -> StatusError:
         if isinstance(writes, StatusError):
@@ -225,25 +212,9 @@ class VirtualDevice:
                 return error
         return StatusError.NONE
 
-    def in_range(self, item: Item, value: int) -> StatusError:
-        """Whether `value` is within the register's own range, or between the registers that limit it."""
-        if item.range is not None and not item.range[0] <= value <= item.range[1]:
-            return StatusError.DATA_RANGE
-        if item.limits is not None:
-            low, high = (-self.get(name[1:]) if name.startswith("-") else self.get(name) for name in item.limits)
-            if not low <= value <= high:
-                return StatusError.DATA_LIMIT
-        return StatusError.NONE
-
-    def _apply(self, writes: list[tuple[Item, int]] | StatusError, now_ns: int) -> None:
-        assert not isinstance(writes, StatusError)
-        for item, value in writes:
-            self.memory[item.address : item.end] = item.encode(value)
-            self.changed(item, value, now_ns)
-
     def _action(self, now_ns: int) -> StatusError:
         if self._registered is None:
-            return StatusError.RESULT
+            return StatusError.INSTRUCTION
         (address, data), self._registered = self._registered, None
         self._mark_registered()
         return self.write(address, data, now_ns)
@@ -252,29 +223,66 @@ class VirtualDevice:
         if "registered_instruction" in self.table:
             self.put("registered_instruction", int(self._registered is not None))
 
-    def _factory_reset(self, params: bytes, now_ns: int) -> StatusError:
+    def _factory_reset(self, params: bytes, now_ns: int, to: int) -> StatusError:
         if len(params) != 1 or params[0] not in _KEPT:
             return StatusError.DATA_RANGE
-        values = {name: self.get(name) for name in ("firmware_version", "model_number", *_KEPT[Reset(params[0])])}
-        self._load(lambda item: True)
+        spared = Reset(params[0])
+        careless = self.table.modes and self.get("firmware_version") < _SAFE_RESET_FIRMWARE  # servos of old
+        if spared is Reset.ALL and to == BROADCAST and not careless:
+            return StatusError.NONE  # or every servo of a robot would have ID 1
+        values = {name: self.get(name) for name in ("firmware_version", "model_number", *_KEPT[spared])}
+        self.load(lambda item: True)
         for name, value in values.items():
             self.put(name, value)
         self.reboot(now_ns)
         return StatusError.NONE
 
+    def _back_up(self, params: bytes, now_ns: int) -> StatusError:
+        """Store what can be backed up, or restore the EEPROM from it and reboot."""
+        if not (self.fast() and "backup_ready" in self.table):
+            return StatusError.INSTRUCTION
+        if params not in (_STORE, _RESTORE):
+            return StatusError.DATA_RANGE
+        if self.get("torque_enable") or (params == _RESTORE and self._backup is None):
+            return StatusError.RESULT
+        if params == _STORE:
+            items = self.table.items.values()
+            kept = [i.name for i in items if i.eeprom or i.name in _BACKED_UP or i.name.startswith("indirect_address")]
+            self._backup = {name: self.get(name) for name in kept}
+            self.put("backup_ready", 1)
+        else:
+            self._restore(eeprom=True)
+            self.reboot(now_ns)
+        return StatusError.NONE
+
+    def _restore(self, *, eeprom: bool) -> None:
+        for name, value in (self._backup or {}).items():
+            if self.table.item(name).eeprom is eeprom:
+                self.put(name, value)
+
     def reboot(self, now_ns: int) -> None:
         """Lose RAM and be silent while starting."""
-        self._load(lambda item: not item.eeprom)
-        self._registered = None
         self._silent_until = now_ns + self.BOOT_NS
-        self.restarted(now_ns)
+        self._lose_ram(now_ns)
 
     def power(self, on: bool, now_ns: int) -> None:
         """Switch the supply; RAM is lost with it."""
         if on and not self.powered:
             self._silent_until = now_ns + self.BOOT_NS
         if on is not self.powered:
-            self._load(lambda item: not item.eeprom)
-            self._registered = None
             self.powered = on
-            self.restarted(now_ns)
+            self._lose_ram(now_ns)
+
+    def _lose_ram(self, now_ns: int) -> None:
+        self.load(lambda item: not item.eeprom)
+        self._registered = None
+        if self._backup is not None:
+            self.put("backup_ready", 1)
+            if self.startup & _RAM_RESTORE:
+                self._restore(eeprom=False)
+        self.restarted(now_ns)
+
+    @property
+    def startup(self) -> int:
+        """The startup configuration, as far as the firmware knows one."""
+        return self.get("startup_configuration") if "startup_configuration" in self.table and self.fast() else 0

@@ -6,8 +6,8 @@ import math
 import struct
 from collections.abc import Callable
 
-from servoid.hw.dynamixel.codec import StatusError
-from servoid.hw.dynamixel.tables import Item, table
+from servoid.hw.dynamixel.protocol.codec import StatusError
+from servoid.hw.dynamixel.protocol.tables import Item, table
 from servoid.sim.rig.factory_state import ticks_per_turn
 from servoid.sim.rig.servo.device import VirtualDevice
 from servoid.sim.rig.servo.firmware import CURRENT, CURRENT_POSITION, EXTENDED, FULL_PWM, POSITION, PWM
@@ -17,6 +17,8 @@ FIRMWARE = 52  # the newest that changed anything in the tables
 _HOMING_RANGE = 1024  # ticks that count in position mode
 _TURNS_RANGE = 1_048_575  # ticks of the modes that count turns
 _REVERSE, _TIME_BASED, _TORQUE_BY_GOAL = 1, 4, 8  # bits of the drive mode
+_STARTUP_TORQUE = 1  # bit of the startup configuration
+_PROTOCOLS = (1, 2, 20, 21, 22)  # 1.0, 2.0 and those of remote controls, which fall back to 2.0 where they hear none
 _TRIPPED = 255  # what an expired bus watchdog reads
 _GOALS = ("goal_position", "goal_velocity", "goal_current", "goal_pwm")
 _MEASURED = struct.Struct("<HBBhhiiiiHB")  # registers 120 to 146, laid out alike in every model
@@ -45,6 +47,7 @@ class VirtualServo(VirtualDevice):
         self._base = 0  # ticks of whole turns that do not count
         self._watch_ns: int | None = None  # when the bus was last heard, with torque on and the watchdog set
         self._locked_out = False  # by a shutdown, until reboot
+        self._starts_torque = False  # once it has booted
         super().__init__(table(model), {"firmware_version": FIRMWARE, **eeprom})
         items = self.table
         self._tick = items.item("present_position").scale
@@ -85,6 +88,8 @@ class VirtualServo(VirtualDevice):
         if item.eeprom and self.torque:
             return StatusError.ACCESS
         if item.name == "operating_mode" and value not in self.table.modes:
+            return StatusError.DATA_RANGE
+        if item.name == "protocol_type" and value not in _PROTOCOLS:
             return StatusError.DATA_RANGE
         if item.name in _GOALS and self.tripped:
             return StatusError.DATA_RANGE
@@ -247,6 +252,11 @@ class VirtualServo(VirtualDevice):
 
     def guard(self, now_ns: int) -> None:
         """What the firmware checks between packets: the bus watchdog, errors, and the shutdown that they cause."""
+        if self._starts_torque and self.online(now_ns):
+            self._starts_torque = False
+            self._default_goals()
+            self.put("torque_enable", 1)
+            self._torque(True, now_ns)
         error = int(self.motors.firmware.error[self.index])
         if error:
             error |= self.get("hardware_error_status")
@@ -294,6 +304,7 @@ class VirtualServo(VirtualDevice):
         firmware.powered[i] = firmware.halted[i] = False
         firmware.error[i] = 0
         self._watch_ns, self._locked_out = None, False
+        self._starts_torque = bool(self.startup & _STARTUP_TORQUE)
         self._base = self._whole_turns()
         self._configure()
         self._default_goals()

@@ -1,17 +1,21 @@
-"""Instructions from the wire to the devices, and their replies onto it, each in its turn."""
+"""Instructions from the wire to the devices, and their replies onto it, each in its turn.
+
+A device whose protocol type says so hears protocol 1.0 alone, and is not there for those who speak 2.0.
+"""
 
 from __future__ import annotations
 
 import functools
 import operator
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import Instruction, Packet, Parser, Status
-from servoid.hw.dynamixel.crc import crc16
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import HEADER, Instruction, Packet, Parser, Status, StatusError
+from servoid.hw.dynamixel.protocol.crc import crc16
 from servoid.sim.rig.faults import MISSPOKEN, STATUS_KINDS, Chunk, FaultInjector
 from servoid.sim.rig.servo.device import VirtualDevice
+from servoid.sim.rig.wire import protocol1
 from servoid.sim.rig.wire.half_duplex import FRAME_BITS, Wire, same_baud
 
 TURNAROUND_NS = 2_000  # from the last byte of a request to the first of the reply, at return delay 0
@@ -31,24 +35,44 @@ class Dispatcher:
         self.wire, self.injector = wire, injector
         self.devices: list[VirtualDevice] = []
         self.instructions = 0
-        self._parser = Parser()
+        self._parser, self._old_parser = Parser(), protocol1.Protocol1Parser()
         self._heard_ns = 0
 
     def receive(self, data: bytes, baud: int, now_ns: int) -> None:
         """Bytes of the host whose last arrived at `now_ns`."""
         if now_ns - _wire_ns(len(data), baud) - self._heard_ns > _SILENCE_NS:
             self._parser.reset()
+            self._old_parser.reset()
         self._heard_ns = now_ns
-        for packet in self._parser.feed(data):
-            if packet.instruction == Instruction.STATUS:
-                continue
-            self.instructions += 1
-            listening = [d for d in self.devices if d.online(now_ns) and same_baud(d.baud, baud)]
-            for device in listening:
-                device.heard(now_ns)
-            self._dispatch(packet, listening, now_ns)
+        spoiled = self._parser.bad_crc
+        packets = self._parser.feed(data)
+        for packet in packets:
+            if packet.instruction != Instruction.STATUS:
+                self._dispatch(packet, self._listening(baud, now_ns), now_ns)
+        if not packets and self._parser.bad_crc > spoiled:
+            self._refuse(data, self._listening(baud, now_ns), now_ns)
+        if any(device.old_protocol for device in self.devices):
+            for packet in self._old_parser.feed(data):
+                self._dispatch_old(packet, self._listening(baud, now_ns, old=True), now_ns)
+
+    def _listening(self, baud: int, now_ns: int, *, old: bool = False) -> list[VirtualDevice]:
+        return [
+            device
+            for device in self.devices
+            if device.online(now_ns) and same_baud(device.baud, baud) and device.old_protocol is old
+        ]
+
+    def _refuse(self, data: bytes, listening: list[VirtualDevice], now_ns: int) -> None:
+        """A packet whose checksum is wrong, by itself on the line: the one that it names says so."""
+        if data.startswith(HEADER) and len(data) >= 7 and len(data) == 7 + int.from_bytes(data[5:7], "little"):
+            for device in _called(listening, data[4]):
+                if device.talkative:
+                    self._send(device.status(StatusError.CRC), now_ns + _pause(device), device.baud, now_ns)
 
     def _dispatch(self, packet: Packet, listening: list[VirtualDevice], now_ns: int) -> None:
+        self.instructions += 1
+        for device in listening:
+            device.heard(now_ns)
         instruction, params = packet.instruction, packet.params
         if instruction in (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ):
             if len(params) > 4:
@@ -60,29 +84,49 @@ class Dispatcher:
             self._read_group(parts, listening, instruction == Instruction.FAST_BULK_READ, now_ns)
         elif instruction in (Instruction.SYNC_WRITE, Instruction.BULK_WRITE):
             writes = _sync_writes(params) if instruction == Instruction.SYNC_WRITE else _bulk_writes(params)
-            for id, address, data in writes:
-                for device in _called(listening, id):
-                    device.write(address, data, now_ns)
+            _write_all(writes, listening, now_ns)
         elif packet.id == codec.BROADCAST:
             self._broadcast(packet, listening, now_ns)
         else:
             for device in listening:
-                if device.shadow(packet.id) and instruction not in (Instruction.PING, Instruction.READ):
-                    device.execute(instruction, params, now_ns)
+                if device.shadow(packet.id):
+                    device.execute_as_shadow(instruction, params, now_ns)
             for device in _called(listening, packet.id):
-                baud, delay = device.baud, device.return_delay_ns  # a change of either begins after the reply
+                baud, pause = device.baud, _pause(device)  # a change of either begins after the reply
                 status = device.execute(instruction, params, now_ns)
                 if status is not None:
-                    self._send(status, now_ns + TURNAROUND_NS + delay, baud, now_ns)
+                    self._send(status, now_ns + pause, baud, now_ns)
+
+    def _dispatch_old(self, packet: Packet, listening: list[VirtualDevice], now_ns: int) -> None:
+        """A packet of protocol 1.0."""
+        self.instructions += 1
+        for device in listening:
+            device.heard(now_ns)
+        if packet.instruction == Instruction.SYNC_WRITE:
+            _write_all(_sync_writes(packet.params), listening, now_ns)
+            return
+        for device in listening:
+            if packet.id != codec.BROADCAST and not device.answers_to(packet.id):
+                continue
+            baud, pause, hardware = device.baud, _pause(device), device.get("hardware_error_status")
+            status = device.execute(packet.instruction, packet.params, now_ns, to=packet.id)
+            if status is not None and packet.id != codec.BROADCAST:
+                data = b"" if packet.instruction == Instruction.PING else status.data
+                frame = protocol1.status(status.id, StatusError(status.error), hardware, data)
+                self._put([Chunk(frame)], now_ns + pause, baud, now_ns)
 
     def _broadcast(self, packet: Packet, listening: list[VirtualDevice], now_ns: int) -> None:
-        """To everyone: only a ping is answered, by each in the slot of its ID."""
-        for device in listening:
-            baud, delay = device.baud, device.return_delay_ns
-            status = device.execute(packet.instruction, packet.params, now_ns)
+        """To everyone: only a ping is answered, in the order of the IDs, by each in the slot of its own, or when those
+        before it, who may wait longer by their return delay, have ended."""
+        free_ns, last = now_ns, -1
+        for device in sorted(listening, key=lambda device: device.id):
+            baud, pause, id = device.baud, _pause(device), device.id
+            status = device.execute(packet.instruction, packet.params, now_ns, to=codec.BROADCAST)
             if status is not None and packet.instruction == Instruction.PING:
-                slot = device.id * (_wire_ns(_PING_BYTES, baud) + TURNAROUND_NS)
-                self._send(status, now_ns + TURNAROUND_NS + delay + slot, baud, now_ns)
+                start = now_ns + pause + id * (_wire_ns(_PING_BYTES, baud) + TURNAROUND_NS)
+                if id != last:  # two with one ID talk at once
+                    start, last = max(start, free_ns + TURNAROUND_NS), id
+                free_ns = max(free_ns, self._send(status, start, baud, now_ns))
 
     def _read_group(self, parts: Sequence[Part], listening: list[VirtualDevice], fast: bool, now_ns: int) -> None:
         """Sync and bulk reads. All sample now; each transmits when the one before it has."""
@@ -95,7 +139,7 @@ class Dispatcher:
             devices = _called(listening, id)
             answered = end
             for device in devices:
-                start = end + TURNAROUND_NS + device.return_delay_ns
+                start = end + _pause(device)
                 status = device.sample(address, length, now_ns)
                 if status is not None:
                     answered = max(answered, self._send(status, start, device.baud, now_ns))
@@ -136,7 +180,7 @@ class Dispatcher:
             chunks += self.injector.spoil(fault, block)
             if fault.kind in ("drop", "truncate"):
                 break
-        self._put(chunks, now_ns + TURNAROUND_NS + first.return_delay_ns, first.baud, now_ns)
+        self._put(chunks, now_ns + _pause(first), first.baud, now_ns)
 
     def _send(self, status: Status, start_ns: int, baud: int, now_ns: int) -> int:
         """Put a status on the wire; returns when it ends."""
@@ -160,6 +204,21 @@ class Dispatcher:
                 at, joined = at + round(chunk.wait * 1e9), bytearray()
             joined += chunk.data
         return self.wire.device_sends(bytes(joined), at, baud, now_ns).end_ns if joined else at
+
+
+def _pause(device: VirtualDevice) -> int:
+    """From the last byte of a request to the first of the device's reply [ns]."""
+    return TURNAROUND_NS + device.return_delay_ns
+
+
+def _write_all(writes: Iterable[tuple[int, int, bytes]], listening: list[VirtualDevice], now_ns: int) -> None:
+    """Sync and bulk writes: nobody answers."""
+    for id, address, data in writes:
+        for device in listening:
+            if device.answers_to(id):
+                device.write(address, data, now_ns)
+            elif device.shadow(id):
+                device.write_as_shadow(address, data, now_ns)
 
 
 def _called(devices: list[VirtualDevice], id: int) -> list[VirtualDevice]:

@@ -67,6 +67,11 @@ class Wire:
         self._replies.clear()
         self._host_free_ns = 0
 
+    @property
+    def busy(self) -> bool:
+        """Whether bytes of the host or answers to them are still under way."""
+        return bool(self._received or self._replies)
+
     def host_sends(self, data: bytes, now_ns: int) -> None:
         """Bytes that the host's program wrote at `now_ns`; they queue behind those before."""
         sent = Transmission(max(now_ns, self._host_free_ns), self.host_baud, bytearray(data), True)

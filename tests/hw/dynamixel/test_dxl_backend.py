@@ -12,10 +12,10 @@ from scripted_op3 import ROBOT, Robot, active, run
 
 from servoid.hw.config import CONFIGS
 from servoid.hw.contracts.body import BackendError, Command, Mode
-from servoid.hw.dynamixel import codec
 from servoid.hw.dynamixel.backend import DynamixelBackend
-from servoid.hw.dynamixel.codec import Instruction
-from servoid.hw.dynamixel.register_check import as_table
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Instruction
+from servoid.hw.dynamixel.servos.register_check import as_table
 
 
 @pytest.fixture
@@ -327,6 +327,29 @@ def test_torque_that_does_not_go_off_is_said(robot: Robot) -> None:
         backend.close()
     assert robot.line.gone, "the port is given back all the same"
     assert sum(servo.get("torque_enable") for servo in robot.servos) == 1
+
+
+@pytest.mark.parametrize("heard_by", ["the guardian", "closing"])
+def test_torque_that_is_proven_off_after_all_is_no_longer_doubted(
+    robot: Robot, heard_by: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a busy machine "20 of 20 off, acknowledged" was followed by "20 did not say that torque is off"."""
+
+    class Guardian:
+        def close(self) -> bool:
+            return heard_by == "the guardian"
+
+    backend = robot.backend()
+    sensors, motors = backend.connect()
+    run(robot, sensors, motors, 2)
+    robot.joint("l_knee").answers = False
+    with pytest.raises(BackendError, match=r"l_knee .*did not say") as raised:
+        motors.write(Command(ROBOT.home, np.ones(20), Mode.OFF))
+    robot.joint("l_knee").answers = heard_by == "closing"
+    monkeypatch.setattr(backend, "_lifeline", Guardian())
+    backend.close()
+    assert "did not say" not in str(raised.value)
+    assert "l_knee (ID 14) were late to say that torque is off: it is off now, ack" in str(raised.value)
 
 
 def test_closing_lets_go(robot: Robot) -> None:

@@ -18,11 +18,12 @@ import pytest
 from scripted import Memory
 
 from servoid.hw.contracts.body import BackendError
-from servoid.hw.dynamixel import codec, guardian
-from servoid.hw.dynamixel.codec import Instruction, Packet, Parser
+from servoid.hw.dynamixel import guardian
 from servoid.hw.dynamixel.guardian_client import Lifeline
-from servoid.hw.dynamixel.port import SerialPort
-from servoid.hw.dynamixel.tables import table
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Instruction, Packet, Parser
+from servoid.hw.dynamixel.protocol.tables import table
+from servoid.hw.dynamixel.transport.port import SerialPort
 
 IDS = (1, 2, 3, 14)
 TORQUE = table("xm430-w350").item("torque_enable").address
@@ -117,7 +118,7 @@ def test_a_pipe_that_closes_with_torque_on_damps_and_then_lets_go(
     port = SerialPort(servos.port, 2_000_000)
     line = Lifeline(port, IDS, table("xm430-w350"), 0.0)
     line.hold()
-    line.close()  # for the guardian the same as a kill: nothing said that torque is off
+    assert line.close()  # for the guardian the same as a kill: nothing said that torque is off
     port.close()
     assert servos.torque() == [0] * len(IDS)
     for servo in servos.memory.values():
@@ -145,7 +146,7 @@ def test_a_clean_end_sends_nothing_and_leaves_nothing(servos: Servos, line: Life
     line.hold()
     line.let_go()
     pid, began = line.pid, time.monotonic()
-    line.close()
+    assert not line.close()
     assert time.monotonic() - began < 1.0
     assert not Path(f"/proc/{pid}").exists()
     assert servos.packets == []
@@ -201,7 +202,7 @@ def test_only_the_answer_about_torque_counts(servos: Servos, line: Lifeline, tmp
     line.hold()
     on = codec.status(14, 0, b"\1\0")
     servos.spoil = lambda id, answer: on + codec.status(14, 0, b"\0") + codec.status(14) if id == 14 else answer
-    line.close()
+    assert not line.close()
     said = told(tmp_path)
     assert "3 of 4 servos damped and off, no word from ID 14: hold the robot" in said
     assert len(servos.writes("torque_enable")) > 4 * 10, "it is asked again and again"
@@ -211,7 +212,7 @@ def test_a_port_that_is_gone_too_is_said(servos: Servos, line: Lifeline, tmp_pat
     line.hold()
     servos.end()
     began = time.monotonic()
-    line.close()
+    assert not line.close()
     assert time.monotonic() - began < 1.0
     assert "cannot be reached either" in told(tmp_path)
 
@@ -258,8 +259,8 @@ def test_a_guardian_that_cannot_be_replaced_does_not_keep_torque_on(
 CONTROLLER = """
 import os, sys, time
 from servoid.hw.dynamixel.guardian_client import Lifeline
-from servoid.hw.dynamixel.port import SerialPort
-from servoid.hw.dynamixel.tables import table
+from servoid.hw.dynamixel.transport.port import SerialPort
+from servoid.hw.dynamixel.protocol.tables import table
 line = Lifeline(SerialPort(sys.argv[1], 2_000_000), (1, 2, 3, 14), table("xm430-w350"), 0.0)
 line.hold()
 if os.fork() == 0:  # a child that keeps everything open, the pipe among it

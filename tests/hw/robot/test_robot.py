@@ -254,12 +254,12 @@ def test_what_a_robot_may_be_asked_is_derived_from_its_height(tmp_path: Path) ->
         )
         return load_robot(path).walking
 
-    op3, derived, tall = load_robot().walking, loaded("", 0.25), loaded("", 1.0)
+    op3, derived, small = load_robot().walking, loaded("", 0.25), loaded("", 0.0625)
     np.testing.assert_allclose(derived.upper, op3.upper, rtol=0.02)
     np.testing.assert_allclose(derived.lower, op3.lower, rtol=0.02)
     assert derived.height == 0.25
-    assert tall.forward == pytest.approx(2 * derived.forward)
-    assert tall.turning == pytest.approx(0.5 * derived.turning)
+    assert derived.forward == pytest.approx(2 * small.forward)
+    assert derived.turning == pytest.approx(0.5 * small.turning)
     part = loaded("walking: {forward: 0.4, sideways: 0.2}\n", 0.25)
     assert part.upper == pytest.approx([0.4, 0.2, 0.8])
     assert part.backward == pytest.approx(0.12)

@@ -27,10 +27,18 @@ def test_unknown_names_are_refused_with_the_line_and_the_nearest_one(tmp_path: P
         r"mine\.yaml:2: no schedule is called 'roling': did you mean 'rolling'",
     )
     refused(
-        tmp_path, "gradual:\n  shape: pyramide\n", r"gradual: no shape is called 'pyramide': did you mean 'pyramid'"
+        tmp_path, "pyramid:\n  shape: pyramide\n", r"pyramid: no shape is called 'pyramide': did you mean 'pyramid'"
     )
     refused(tmp_path, "guidance:\n  choose: worst\n", "choose must be 'mean' or 'best', not 'worst'")
     refused(tmp_path, "rolling:\n  level: 3\n", "rolling.level: unknown key")
+
+
+def test_keys_that_were_renamed_say_what_they_are_called_now(tmp_path: Path) -> None:
+    """Files of users hold them, and the nearest known name is no help."""
+    refused(tmp_path, "steps: 5\nreplan: 4\n", r"mine\.yaml:2: replan: this key is called 'execution_horizon' now")
+    refused(tmp_path, "stabilise: 1\n", "this key is called 'stabilization_level' now")
+    refused(tmp_path, "gradual:\n  spread: 3\n", "gradual: this key is called 'pyramid' now")
+    refused(tmp_path, "schedule: gradual\n", "the schedule 'gradual' is called 'pyramid' now")
 
 
 def test_numbers_that_make_no_sense_are_refused(tmp_path: Path) -> None:
@@ -47,12 +55,12 @@ def test_what_a_checkpoint_does_not_have_is_refused_with_the_remedy() -> None:
         DiffusionSettings(horizon=32).check(NETWORK)
     with pytest.raises(ConfigError, match="history 6 is asked for, and this checkpoint has 1 to 4"):
         DiffusionSettings(history=6).check(NETWORK)
-    with pytest.raises(ConfigError, match=r"replan .* delay = 6 ticks, and this one has actions for 5"):
-        DiffusionSettings(horizon=5, replan=4, delay=2).check(NETWORK)
+    with pytest.raises(ConfigError, match=r"execution_horizon .* delay = 6 ticks, and this one has actions for 5"):
+        DiffusionSettings(horizon=5, execution_horizon=4, delay=2).check(NETWORK)
     with pytest.raises(ConfigError, match="level of 1 to 20, not 30"):
         DiffusionSettings(schedule="rolling", rolling=Rolling(state_level=30)).check(NETWORK)
-    with pytest.raises(ConfigError, match="stabilise must be at most 20"):
-        DiffusionSettings(stabilise=21).check(NETWORK)
+    with pytest.raises(ConfigError, match="stabilization_level must be at most 20"):
+        DiffusionSettings(stabilization_level=21).check(NETWORK)
 
 
 @pytest.mark.parametrize(
@@ -60,6 +68,7 @@ def test_what_a_checkpoint_does_not_have_is_refused_with_the_remedy() -> None:
     [
         ({}, {"committed": 2}, (5, 4, 2)),
         ({}, {"committed": 1}, (5, 4, 1)),
+        ({}, {"inference_delay": 1}, (5, 4, 1)),
         ({"actions": 3}, {"committed": 2}, (5, 2, 1)),
         ({"actions": 1}, {"committed": 2}, (5, 1, 0)),
         ({}, {"committed": 2, "far_actions": 0.0, "near_actions": 5}, (5, 3, 2)),
@@ -71,8 +80,8 @@ def test_settings_are_fitted_to_what_a_network_can_do(
     shape: dict[str, int], training: dict[str, Any], expected: tuple[int, int, int]
 ) -> None:
     network = DenoiserConfig(108, 20, **shape)
-    settings = DiffusionSettings(steps=5, replan=4, delay=2).fitted(network, training)
-    assert (settings.steps, settings.replan, settings.delay) == expected
+    settings = DiffusionSettings(steps=5, execution_horizon=4, delay=2).fitted(network, training)
+    assert (settings.steps, settings.execution_horizon, settings.delay) == expected
     settings.check(network, training)
 
 
@@ -83,7 +92,7 @@ def test_every_file_of_diffusion_settings_loads_and_fits_the_default_network() -
         load_yaml(path, DiffusionSettings).check(NETWORK)
 
 
-@pytest.mark.parametrize("schedule", ["full_sequence", "autoregressive", "gradual", "rolling"])
+@pytest.mark.parametrize("schedule", ["full_sequence", "autoregressive", "pyramid", "rolling"])
 def test_a_shorter_history_and_horizon_leave_the_rest_as_noise(schedule: str) -> None:
     settings = DiffusionSettings(schedule=schedule, history=2, horizon=8)
     matrix = settings.matrix(NETWORK, fresh=1)

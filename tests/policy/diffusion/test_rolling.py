@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_runtime import ROBOT, model, moved, request, speed_cost
+from test_runtime import ROBOT, model, moved, request, seeded_with, speed_cost
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Instruction, Keyframes, Plan
@@ -17,7 +17,7 @@ from servoid.policy.diffusion.sampler import Known, Sampler
 from servoid.policy.diffusion.schedule import cosine_signal, rolling
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 
-ROLLING = DiffusionSettings(schedule="rolling", steps=3, lead=1, replan=1, delay=1)
+ROLLING = DiffusionSettings(schedule="rolling", steps=3, lead=1, execution_horizon=1, delay=1)
 
 
 def previous_plan(tick: int) -> Plan:
@@ -58,18 +58,22 @@ def test_a_frame_keeps_its_noise_when_the_tick_goes_on() -> None:
 def test_a_plan_goes_on_from_the_one_that_runs_and_is_a_function_of_its_request() -> None:
     runtime, asked = Runtime(model(), ROLLING, ROBOT.dt), request(delay=1)
     warm = replace(asked, previous=previous_plan(39))
-    first, again = runtime.plan(warm, 7), runtime.plan(warm, 7)
+    first, again = runtime.plan(seeded_with(warm, 7)), runtime.plan(seeded_with(warm, 7))
     np.testing.assert_array_equal(first.actions, again.actions)
     # What was planned in between does not matter: nothing is kept from one request to the next.
-    runtime.plan(replace(asked, tick=41, previous=previous_plan(40)), 7)
-    np.testing.assert_array_equal(first.actions, runtime.plan(warm, 7).actions)
-    cold = runtime.plan(asked, 7).actions
+    runtime.plan(seeded_with(replace(asked, tick=41, previous=previous_plan(40)), 7))
+    np.testing.assert_array_equal(first.actions, runtime.plan(seeded_with(warm, 7)).actions)
+    cold = runtime.plan(seeded_with(asked, 7)).actions
     assert np.abs(first.actions - cold).max() > 1e-3
     other = replace(warm, previous=replace(previous_plan(39), actions=previous_plan(39).actions + 0.05))
-    assert np.abs(first.actions[1:] - runtime.plan(other, 7).actions[1:]).max() > 1e-4
+    assert np.abs(first.actions[1:] - runtime.plan(seeded_with(other, 7)).actions[1:]).max() > 1e-4
     # A plan that has run out, or that is of another episode, is nothing to go on from.
-    np.testing.assert_array_equal(cold, runtime.plan(replace(asked, previous=previous_plan(20)), 7).actions)
-    np.testing.assert_array_equal(cold, runtime.plan(replace(asked, previous=previous_plan(50)), 7).actions)
+    np.testing.assert_array_equal(
+        cold, runtime.plan(seeded_with(replace(asked, previous=previous_plan(20)), 7)).actions
+    )
+    np.testing.assert_array_equal(
+        cold, runtime.plan(seeded_with(replace(asked, previous=previous_plan(50)), 7)).actions
+    )
 
 
 def test_what_goes_on_from_a_low_level_stays_near_the_plan_that_runs() -> None:
@@ -98,19 +102,24 @@ def test_what_goes_on_from_a_low_level_stays_near_the_plan_that_runs() -> None:
 
 
 def test_other_schedules_do_not_read_the_plan_that_runs() -> None:
-    runtime = Runtime(model(), replace(ROLLING, schedule="gradual"), ROBOT.dt)
+    runtime = Runtime(model(), replace(ROLLING, schedule="pyramid"), ROBOT.dt)
     asked = request(delay=1)
-    plain, warm = runtime.plan(asked, 7), runtime.plan(replace(asked, previous=previous_plan(39)), 7)
+    plain, warm = (
+        runtime.plan(seeded_with(asked, 7)),
+        runtime.plan(seeded_with(replace(asked, previous=previous_plan(39)), 7)),
+    )
     np.testing.assert_array_equal(plain.actions, warm.actions)
 
 
 # -- what a plan can be asked beside ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("schedule", ["autoregressive", "gradual"])
+@pytest.mark.parametrize("schedule", ["autoregressive", "pyramid"])
 def test_every_schedule_plans_and_a_shorter_horizon_plans_less(schedule: str) -> None:
-    settings = DiffusionSettings(schedule=schedule, steps=3, history=2, horizon=8, replan=4, delay=2, stabilise=2)
-    plan = Runtime(model(), settings, ROBOT.dt).plan(request(), 0)
+    settings = DiffusionSettings(
+        schedule=schedule, steps=3, history=2, horizon=8, execution_horizon=4, delay=2, stabilization_level=2
+    )
+    plan = Runtime(model(), settings, ROBOT.dt).plan(request())
     assert plan.actions.shape == (8, 20)
     assert plan.states.shape == (8, raw_layout(20).size)
     assert plan.path.shape == (8, 2)
@@ -124,9 +133,9 @@ def test_a_state_beyond_the_chosen_history_is_not_read() -> None:
     older, recent = asked.states.copy(), asked.states.copy()
     older[0, 2] += 0.1
     recent[2, 2] += 0.1
-    plain = runtime.plan(asked, 0).actions
-    np.testing.assert_array_equal(plain, runtime.plan(replace(asked, states=older), 0).actions)
-    assert np.abs(plain - runtime.plan(replace(asked, states=recent), 0).actions).max() > 1e-6
+    plain = runtime.plan(asked).actions
+    np.testing.assert_array_equal(plain, runtime.plan(replace(asked, states=older)).actions)
+    assert np.abs(plain - runtime.plan(replace(asked, states=recent)).actions).max() > 1e-6
 
 
 def with_keyframes(*ticks: int, free: tuple[str, ...] = ()) -> tuple[Instruction, np.ndarray]:
@@ -145,13 +154,13 @@ def test_keyframes_are_met_and_change_what_comes_before(emphasis: float) -> None
         plain = Normaliser(made.states.mean.numpy(), made.states.std.numpy())
         made = replace(model(state_size=108), states=Emphasis.of(plain, 20, emphasis, 0).to_torch())
     runtime, asked = Runtime(made, DiffusionSettings(steps=3), ROBOT.dt), request()
-    without = runtime.plan(asked, 0)
+    without = runtime.plan(asked)
     whole, rows = with_keyframes(6, 12, 40)  # the last is beyond the horizon, and comes in later
-    plan = runtime.plan(replace(asked, instruction=whole), 0)
+    plan = runtime.plan(replace(asked, instruction=whole))
     np.testing.assert_allclose(plan.states[[5, 11]], rows[:2], atol=2e-3)
     assert np.abs(plan.states[4] - without.states[4]).max() > 1e-4
     partly, rows = with_keyframes(6, 12, free=("joint_velocity", "velocity", "displacement"))
-    plan, joints = runtime.plan(replace(asked, instruction=partly), 0), raw_layout(20).slice("position")
+    plan, joints = runtime.plan(replace(asked, instruction=partly)), raw_layout(20).slice("position")
     np.testing.assert_allclose(plan.states[[5, 11], joints], rows[:, joints], atol=2e-3)
     assert np.isfinite(plan.states).all()
     assert np.abs(plan.states[4] - without.states[4]).max() > 1e-4
@@ -161,15 +170,15 @@ def test_keyframes_that_make_no_sense_are_refused() -> None:
     runtime, asked = Runtime(model(), DiffusionSettings(steps=3), ROBOT.dt), request()
     for ticks, match in (((0, 5), "at least 1 and rise"), ((6, 6), "at least 1 and rise")):
         with pytest.raises(ValueError, match=match):
-            runtime.plan(replace(asked, instruction=with_keyframes(*ticks)[0]), 0)
+            runtime.plan(replace(asked, instruction=with_keyframes(*ticks)[0]))
     for feature in (0, 1):  # the other would be lost as well, when both are turned into the present heading
         half, rows = with_keyframes(6, 12)
         rows[1, feature] = np.nan
         with pytest.raises(ValueError, match="x and y must both be given or both be free, at tick 12"):
-            runtime.plan(replace(asked, instruction=half), 0)
+            runtime.plan(replace(asked, instruction=half))
     short = Instruction(np.zeros(3), keyframes=Keyframes(np.array([3]), np.zeros((1, 20))))
     with pytest.raises(ValueError, match=r"states are \(1, 20\) for ticks of \(1,\), \(k, 53\)"):
-        runtime.plan(replace(asked, instruction=short), 0)
+        runtime.plan(replace(asked, instruction=short))
 
 
 def test_the_best_of_many_samples_is_run_and_with_the_mean_the_first() -> None:
@@ -177,7 +186,7 @@ def test_the_best_of_many_samples_is_run_and_with_the_mean_the_first() -> None:
         guidance = GuidanceSettings(weight=1e-6, samples=samples, choose=choose)
         runtime = Runtime(model(), DiffusionSettings(steps=3, guidance=guidance), ROBOT.dt, speed_cost)
         velocity = raw_layout(20).slice("velocity")
-        plans = [runtime.plan(request(), seed) for seed in range(5)]
+        plans = [runtime.plan(seeded_with(request(), seed)) for seed in range(5)]
         return np.array([np.square(plan.states[:, velocity][:, 0] - 0.2).mean() for plan in plans])
 
     one, best = costs("best", 1), costs("best", 4)
@@ -209,11 +218,11 @@ def test_guidance_that_drives_a_plan_out_of_all_bounds_gives_no_plan() -> None:
     guidance = GuidanceSettings(weight=1e6, clip=1e9)
     runtime = Runtime(model(), DiffusionSettings(steps=4, guidance=guidance), ROBOT.dt, speed_cost)
     with pytest.raises(Diverged, match="lower the weight of guidance"):
-        runtime.plan(request(), 0)
+        runtime.plan(request())
 
 
 def test_a_checkpoint_that_never_learned_far_actions_does_not_execute_them() -> None:
     made = replace(model(), header={"training": {"far_actions": 0.0, "near_actions": 4}})
     with pytest.raises(ConfigError, match="learned the actions of the next 4 only"):
-        Runtime(made, DiffusionSettings(steps=4, replan=4, delay=2), ROBOT.dt)
-    Runtime(made, DiffusionSettings(steps=4, replan=3, delay=1), ROBOT.dt)
+        Runtime(made, DiffusionSettings(steps=4, execution_horizon=4, delay=2), ROBOT.dt)
+    Runtime(made, DiffusionSettings(steps=4, execution_horizon=3, delay=1), ROBOT.dt)

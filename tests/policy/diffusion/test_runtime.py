@@ -42,6 +42,10 @@ def request(tick: int = 40, delay: int = 2, seed: int = 3) -> PlanRequest:
     return PlanRequest(tick, raw[37:41], applied[37 : 40 + delay], Instruction(np.array([0.2, 0.0, 0.1])))
 
 
+def seeded_with(request: PlanRequest, seed: int) -> PlanRequest:
+    return replace(request, seeds=np.array(seed))
+
+
 def moved(states: Array, x: float, y: float, yaw: float) -> Array:
     layout, out = raw_layout(20), states.copy()
     c, s = np.cos(yaw), np.sin(yaw)
@@ -56,11 +60,11 @@ def speed_cost(trajectory: Trajectory, instruction: Instruction) -> Any:
 
 def test_the_same_request_and_seed_give_the_same_plan() -> None:
     runtime = Runtime(model(), SETTINGS, ROBOT.dt)
-    first, again = runtime.plan(request(), 7), runtime.plan(request(), 7)
+    first, again = runtime.plan(seeded_with(request(), 7)), runtime.plan(seeded_with(request(), 7))
     np.testing.assert_array_equal(first.actions, again.actions)
     np.testing.assert_array_equal(first.states, again.states)
-    assert not np.array_equal(first.actions, runtime.plan(request(), 8).actions)
-    assert not np.array_equal(first.actions, runtime.plan(request(tick=41), 7).actions)
+    assert not np.array_equal(first.actions, runtime.plan(seeded_with(request(), 8)).actions)
+    assert not np.array_equal(first.actions, runtime.plan(seeded_with(request(tick=41), 7)).actions)
 
 
 def test_an_empty_sentence_leaves_the_velocity_untold() -> None:
@@ -69,7 +73,7 @@ def test_an_empty_sentence_leaves_the_velocity_untold() -> None:
 
     def first(text: str | None, velocity: float) -> Array:
         asked = replace(request(), instruction=Instruction(np.array([velocity, 0.0, 0.0]), text=text))
-        return runtime.plan(asked, 7).actions
+        return runtime.plan(seeded_with(asked, 7)).actions
 
     assert not np.array_equal(first(None, 0.2), first(None, -0.1))
     assert not np.array_equal(first("", 0.2), first(None, 0.2))
@@ -101,7 +105,7 @@ def test_a_sentence_is_read_as_the_nearest_that_was_trained_with_unless_told_oth
     def first(text: str, nearest: bool) -> Array:
         settings = replace(SETTINGS, text_nearest=nearest)
         runtime = Runtime(model(text="words", text_size=load_encoder("words").size), settings, ROBOT.dt)
-        return runtime.plan(replace(request(), instruction=Instruction(np.zeros(3), text=text)), 7).actions
+        return runtime.plan(seeded_with(replace(request(), instruction=Instruction(np.zeros(3), text=text)), 7)).actions
 
     np.testing.assert_array_equal(first(told, True), first(known, True))
     np.testing.assert_array_equal(first(known, True), first(known, False))
@@ -110,7 +114,7 @@ def test_a_sentence_is_read_as_the_nearest_that_was_trained_with_unless_told_oth
 
 def test_committed_actions_are_part_of_the_plan() -> None:
     asked = request(delay=2)
-    plan = Runtime(model(), SETTINGS, ROBOT.dt).plan(asked, 0)
+    plan = Runtime(model(), SETTINGS, ROBOT.dt).plan(asked)
     assert plan.tick == 40
     assert plan.actions.shape == (16, 20)
     assert plan.states.shape == (16, raw_layout(20).size)
@@ -119,13 +123,13 @@ def test_committed_actions_are_part_of_the_plan() -> None:
     assert plan.seconds > 0
     # What they are matters for what follows.
     changed = replace(asked, actions=asked.actions + 0.1 * (np.arange(5) >= 3)[:, None])
-    assert np.abs(Runtime(model(), SETTINGS, ROBOT.dt).plan(changed, 0).actions[2:] - plan.actions[2:]).max() > 1e-4
+    assert np.abs(Runtime(model(), SETTINGS, ROBOT.dt).plan(changed).actions[2:] - plan.actions[2:]).max() > 1e-4
 
 
 def test_a_plan_does_not_depend_on_where_odometry_began() -> None:
     runtime, here = Runtime(model(), SETTINGS, ROBOT.dt), request()
     there = replace(here, states=moved(here.states, 30.0, -20.0, 2.0))
-    a, b = runtime.plan(here, 0), runtime.plan(there, 0)
+    a, b = runtime.plan(here), runtime.plan(there)
     np.testing.assert_allclose(a.actions, b.actions, atol=1e-4)
     np.testing.assert_allclose(a.path, b.path, atol=1e-4)
     # The predicted rows are in the odometry frame of the request, the path in its heading frame.
@@ -139,8 +143,8 @@ def test_a_plan_does_not_depend_on_where_odometry_began() -> None:
 def test_guidance_lowers_the_cost_of_the_prediction(gradient: str, weight: float) -> None:
     guidance = GuidanceSettings(weight=weight, clip=10.0, gradient=gradient)
     asked, velocity = request(), raw_layout(20).slice("velocity")
-    plain = Runtime(model(), SETTINGS, ROBOT.dt).plan(asked, 0)
-    guided = Runtime(model(), replace(SETTINGS, guidance=guidance), ROBOT.dt, speed_cost).plan(asked, 0)
+    plain = Runtime(model(), SETTINGS, ROBOT.dt).plan(asked)
+    guided = Runtime(model(), replace(SETTINGS, guidance=guidance), ROBOT.dt, speed_cost).plan(asked)
     error = [np.square(p.states[:, velocity][:, 0] - 0.2).mean() for p in (plain, guided)]
     assert error[1] < 0.8 * error[0]
     assert np.abs(guided.actions[2:] - plain.actions[2:]).max() > 1e-5
@@ -152,7 +156,7 @@ def test_a_batch_plans_like_each_of_its_robots() -> None:
     states, actions = np.stack([r.states for r in asked]), np.stack([r.actions for r in asked])
     targets, _ = runtime.plan_batch(states, actions, asked[0].instruction, [(5, r.tick) for r in asked])
     for together, alone in zip(targets, asked, strict=True):
-        np.testing.assert_allclose(together, runtime.plan(alone, 5).actions, atol=1e-5)
+        np.testing.assert_allclose(together, runtime.plan(seeded_with(alone, 5)).actions, atol=1e-5)
 
 
 def test_requests_that_cannot_be_planned_are_refused() -> None:
@@ -160,20 +164,20 @@ def test_requests_that_cannot_be_planned_are_refused() -> None:
     broken = asked.states.copy()
     broken[0, 10] = np.nan
     with pytest.raises(ValueError, match="not finite"):
-        runtime.plan(replace(asked, states=broken), 0)
+        runtime.plan(replace(asked, states=broken))
     with pytest.raises(ValueError, match=r"states are \(3, 53\), \(4, 53\) are needed"):
-        runtime.plan(replace(asked, states=asked.states[1:]), 0)
+        runtime.plan(replace(asked, states=asked.states[1:]))
     with pytest.raises(ValueError, match="actions are"):
-        runtime.plan(replace(asked, actions=asked.actions[:2]), 0)
+        runtime.plan(replace(asked, actions=asked.actions[:2]))
 
 
 def test_settings_that_a_network_cannot_serve_are_refused() -> None:
-    with pytest.raises(ConfigError, match="lower replan or delay"):
-        Runtime(model(horizon=8), replace(SETTINGS, replan=7, delay=2), ROBOT.dt)
+    with pytest.raises(ConfigError, match="lower execution_horizon or delay"):
+        Runtime(model(horizon=8), replace(SETTINGS, execution_horizon=7, delay=2), ROBOT.dt)
     with pytest.raises(ConfigError, match="1 to 20"):
         Runtime(model(), replace(SETTINGS, steps=21), ROBOT.dt)
-    with pytest.raises(ValueError, match="delay must be 0 to replan"):
-        DiffusionSettings(replan=2, delay=3)
+    with pytest.raises(ValueError, match="delay must be 0 to execution_horizon"):
+        DiffusionSettings(execution_horizon=2, delay=3)
     with pytest.raises(ValueError, match="gradient"):
         GuidanceSettings(gradient="numeric")
 
@@ -198,7 +202,7 @@ def test_a_checkpoint_plans_as_what_was_saved(tmp_path: Path) -> None:
     checkpoint.save(path, weights, made.config, made.states, made.actions, ROBOT, **facts)
     loaded = checkpoint.load(path, ROBOT)
     assert loaded.config == made.config
-    a, b = (Runtime(m, SETTINGS, ROBOT.dt).plan(request(), 0) for m in (made, loaded))
+    a, b = (Runtime(m, SETTINGS, ROBOT.dt).plan(request()) for m in (made, loaded))
     np.testing.assert_array_equal(a.actions, b.actions)
     with pytest.raises(CheckpointError, match="joints do not fit"):
         checkpoint.load(path, replace(ROBOT, joints=ROBOT.joints[1:]))

@@ -123,7 +123,7 @@ def test_finished_tokens_are_shown_slightly_noisy_and_keep_their_values() -> Non
     known.states[:, 0] = 3.0
     known.state_mask[0] = True
     matrix = autoregressive(20, 2, np.arange(3), np.arange(3))
-    states, _ = Sampler(predict, cosine_signal(20), stabilise=3).sample(matrix, known, generators(1))
+    states, _ = Sampler(predict, cosine_signal(20), stabilization_level=3).sample(matrix, known, generators(1))
     assert shown[0] == [3, 20, 20, 20, 20, 20]
     assert shown[2] == [3, 20, 20, 3, 20, 20]
     assert shown[4] == [3, 3, 20, 3, 3, 20]

@@ -11,7 +11,7 @@ from servoid.policy.diffusion.schedule import (
     cosine_signal,
     ddim_levels,
     full_sequence,
-    gradual,
+    pyramid,
     rolling,
 )
 
@@ -73,14 +73,14 @@ def matrices(draw: st.DrawFn) -> tuple[DenoisingMatrix, int]:
     horizon, history = draw(st.integers(1, 32)), draw(st.integers(1, 6))
     frames = np.arange(-history, horizon), np.arange(1 - history, horizon)
     level, count = st.integers(1, levels), st.integers(1, 40)
-    name = draw(st.sampled_from(["full_sequence", "autoregressive", "gradual", "rolling"]))
+    name = draw(st.sampled_from(["full_sequence", "autoregressive", "pyramid", "rolling"]))
     if name == "full_sequence":
         return full_sequence(levels, steps, len(frames[0]), len(frames[1]), lead), levels
     if name == "autoregressive":
         return autoregressive(levels, steps, *frames, block=draw(count), lead=lead), levels
-    if name == "gradual":
+    if name == "pyramid":
         shape, spread = draw(st.sampled_from(["pyramid", "trapezoid"])), draw(st.integers(0, 20))
-        return gradual(levels, steps, *frames, spread=spread, shape=shape, lead=lead), levels
+        return pyramid(levels, steps, *frames, spread=spread, shape=shape, lead=lead), levels
     start, fresh = (draw(level), draw(level)), draw(st.integers(0, horizon))
     return rolling(levels, steps, *frames, *start, fresh=fresh, ramp=draw(count), lead=lead), levels
 
@@ -112,17 +112,17 @@ def test_autoregressive_finishes_a_block_of_frames_before_the_next_begins() -> N
 
 
 def test_a_pyramid_rises_along_the_window_and_a_trapezoid_to_its_middle() -> None:
-    pyramid = gradual(20, 5, STATES, ACTIONS, spread=6)
-    assert pyramid.calls == 11
-    assert (np.diff(pyramid.states, axis=1) >= 0).all()
-    assert pyramid.states[5, STATES == 0] == 0  # the first frame is clean
-    assert pyramid.states[5, STATES == 15] == 20  # when the last has hardly begun
-    trapezoid = gradual(20, 5, STATES, ACTIONS, spread=6, shape="trapezoid").states[:, 4:]
+    rows = pyramid(20, 5, STATES, ACTIONS, spread=6)
+    assert rows.calls == 11
+    assert (np.diff(rows.states, axis=1) >= 0).all()
+    assert rows.states[5, STATES == 0] == 0  # the first frame is clean
+    assert rows.states[5, STATES == 15] == 20  # when the last has hardly begun
+    trapezoid = pyramid(20, 5, STATES, ACTIONS, spread=6, shape="trapezoid").states[:, 4:]
     np.testing.assert_array_equal(trapezoid, trapezoid[:, ::-1])
     assert (np.diff(trapezoid[:, :8], axis=1) >= 0).all()
     assert trapezoid[5, 0] == trapezoid[5, -1] == 0
     assert trapezoid[5, 7] == 20
-    np.testing.assert_array_equal(gradual(20, 5, STATES, ACTIONS, spread=0).states, full_sequence(20, 5, 20, 19).states)
+    np.testing.assert_array_equal(pyramid(20, 5, STATES, ACTIONS, spread=0).states, full_sequence(20, 5, 20, 19).states)
 
 
 def test_rolling_goes_on_from_its_own_levels_and_begins_fresh_frames_as_noise() -> None:
@@ -139,9 +139,9 @@ def test_schedules_that_make_no_sense_are_refused() -> None:
     with pytest.raises(ValueError, match="at least one, not 0"):
         autoregressive(20, 5, STATES, ACTIONS, block=0)
     with pytest.raises(ValueError, match="not 'pyramids'"):
-        gradual(20, 5, STATES, ACTIONS, spread=2, shape="pyramids")
+        pyramid(20, 5, STATES, ACTIONS, spread=2, shape="pyramids")
     with pytest.raises(ValueError, match="must not be negative"):
-        gradual(20, 5, STATES, ACTIONS, spread=-1)
+        pyramid(20, 5, STATES, ACTIONS, spread=-1)
     with pytest.raises(ValueError, match="rolling states must go on from a level of 1 to 20, not 21"):
         rolling(20, 5, STATES, ACTIONS, 21, 4)
     with pytest.raises(ValueError, match="ramp"):

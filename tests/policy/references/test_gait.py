@@ -14,7 +14,7 @@ from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.legs import LegInverse, Legs
 from servoid.policy.references.gait import Gait, GaitSettings, GyroFeedback, load_gait
 from servoid.stack.control.fleet import Fleet
-from servoid.tools.learn.envs.walker import Walker
+from servoid.stack.control.gait import GaitPolicy
 
 ROBOT, SETTINGS = load_robot(), load_gait()
 LEGS = Legs(ROBOT)
@@ -265,13 +265,11 @@ def test_a_robot_with_other_arms_can_walk() -> None:
 def test_it_walks_five_seconds_on_the_nominal_robot() -> None:
     commands = np.array([[0.2, 0, 0], [-0.1, 0, 0], [0, 0.08, 0], [0.1, -0.05, 0], [0.1, 0, 0.5], [0, 0, -0.8]])
     fleet = Fleet(ROBOT, len(commands), None, seed=4, threads=1)
-    walker, everything = Walker(fleet, None), np.ones(len(commands), bool)
-    fleet.reset(everything)
-    walker.reset(everything)
+    policy = GaitPolicy(ROBOT, (fleet.n,))
+    fleet.reset(np.ones(fleet.n, bool))
     turned, heading = np.zeros(len(commands)), fleet.truth.yaw
     for _ in range(250):
-        fleet.observe()
-        fleet.step(walker.act(commands))
+        fleet.drive(policy, commands)
         turned += (fleet.truth.yaw - heading + np.pi) % (2 * np.pi) - np.pi
         heading = fleet.truth.yaw
         assert not fleet.truth.fallen.any()

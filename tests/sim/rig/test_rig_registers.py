@@ -8,9 +8,9 @@ import pytest
 from rig_host import BOARD, XM430, Host
 
 import servoid.sim.rig.rig
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import Reset, StatusError
-from servoid.hw.dynamixel.tables import models
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Reset, StatusError
+from servoid.hw.dynamixel.protocol.tables import models
 from servoid.hw.robot.description import Robot
 from servoid.sim.rig.process import control_requests
 from servoid.sim.rig.rig import Rig
@@ -38,7 +38,7 @@ def test_eeprom_is_locked_under_torque(host: Host) -> None:
 
 
 def test_every_writable_register_keeps_what_is_written(host: Host) -> None:
-    kept_by_others = {"id", "baud_rate", "operating_mode", "status_return_level"}
+    kept_by_others = {"id", "baud_rate", "operating_mode", "status_return_level", "protocol_type"}
     for item in XM430.items.values():
         if not item.writable or item.name in kept_by_others or item.name.startswith("indirect"):
             continue
@@ -60,9 +60,15 @@ def test_every_writable_register_keeps_what_is_written(host: Host) -> None:
         (codec.write(1, 11, b"\7"), StatusError.DATA_RANGE),  # a mode that this model has not
         (codec.write(1, 116, (4000).to_bytes(4, "little")), StatusError.DATA_LIMIT),
         (codec.write(1, 100, (900).to_bytes(2, "little")), StatusError.DATA_LIMIT),
-        (codec.read(1, 660, 10), StatusError.DATA_RANGE),  # beyond the table
+        (codec.read(1, 660, 10), StatusError.ACCESS),  # beyond the table
+        (codec.read(1, 700, 1), StatusError.ACCESS),
+        (codec.read(1, 72, 1), StatusError.ACCESS),  # a gap in the table does not read as zero
+        (codec.read(1, 14, 6), StatusError.ACCESS),
+        (codec.read(1, 40, 4), StatusError.ACCESS),  # a register that only other models have
+        (codec.action(1), StatusError.INSTRUCTION),  # nothing was registered
+        (codec.packet(1, 0x21, b"\1CTRL"), StatusError.INSTRUCTION),
         (codec.packet(1, codec.Instruction.READ, b"\0"), StatusError.DATA_LENGTH),
-        (codec.packet(1, 0x20, b""), StatusError.INSTRUCTION),
+        (codec.packet(1, 0x20, b"\1CTRM"), StatusError.DATA_RANGE),  # another key
     ],
 )
 def test_refusals_say_why(host: Host, packet: bytes, error: StatusError) -> None:

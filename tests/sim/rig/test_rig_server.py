@@ -16,7 +16,7 @@ import serial
 from rig_host import BOARD, XM430
 
 from servoid.hw.contracts.body import BackendError
-from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.protocol import codec
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.sim.rig.process.control import Control, LockedClock, RigProcess
 from servoid.sim.rig.process.server import Server
@@ -145,6 +145,68 @@ def test_a_clock_step_and_a_vanishing_port() -> None:
         host.wait(8)
         with pytest.raises(OSError, match="Input/output error"):
             _ = host.port.in_waiting
+
+
+class FreeRig:
+    """A server in real time that only looks at its port when it is told what time it is: a busy machine at will."""
+
+    def __init__(self, rig: Rig, told: list[str]) -> None:
+        self.server = Server(rig, told=told.append)
+        self.port = serial.Serial(self.server.port, rig.robot.bus.baud, timeout=0)
+        self.rig = rig
+        self.port.write(codec.write(BOARD, 24, b"\1"))
+        for _ in range(400):
+            self.look(1.0)
+        self.port.reset_input_buffer()
+
+    def look(self, ms: float) -> None:
+        """Look at the port, so long after the last time."""
+        self.server._exchange(self.rig.now_ns + round(ms * MS), visible=False)
+
+    def heard(self) -> list[int]:
+        """Who answered."""
+        deadline, data = time.monotonic() + 0.2, b""
+        while time.monotonic() < deadline:  # the kernel may take a moment to hand the bytes over
+            data += self.port.read(4096)
+        return [packet.id for packet in codec.Parser().feed(data)]
+
+
+def test_reads_that_a_late_rig_finds_together_were_not_sent_into_answers(rig: Rig, robot: Robot) -> None:
+    """Twenty reads some ms apart, each after the other's answer or its time, on a machine that had no time for the rig:
+    all at once they would count as collisions. It says that it was late."""
+    told: list[str] = []
+    free, ids = FreeRig(rig, told), [joint.id for joint in robot.joints]
+    assert told == []
+    for id in ids:
+        free.port.write(codec.read(id, 132, 4))
+    free.look(50.0)
+    assert free.heard() == ids
+    assert rig.wire.collisions == 0
+    assert len(told) == 1
+    assert "late" in told[0]
+    assert "busy" in told[0]
+    assert free.server.lateness.worst_ns > 40 * MS
+    free.port.write(codec.sync_write(64, 1, dict.fromkeys(ids, b"\1")) + codec.read(1, 64, 1))
+    free.look(4.0 + 1.0)
+    assert free.heard() == [1]
+    free.server.close()
+
+
+def test_a_rig_that_is_late_does_not_starve_its_servos(rig: Rig, robot: Robot) -> None:
+    """What the host wrote every 20 ms feeds the watchdog of 80 ms, though the rig saw none of it for 120."""
+    free, ids = FreeRig(rig, []), [joint.id for joint in robot.joints]
+    watchdog = XM430.item("bus_watchdog")
+    free.port.write(codec.sync_write(64, 1, dict.fromkeys(ids, b"\1")))
+    free.port.write(codec.sync_write(watchdog.address, 1, dict.fromkeys(ids, b"\4")))
+    free.look(2.0)
+    free.look(2.0)
+    for _ in range(6):
+        free.port.write(codec.sync_write(116, 4, {id: b"\0\x08\0\0" for id in ids}))
+    free.look(120.0)
+    assert not any(servo.tripped for servo in rig.servos)
+    free.look(120.0)
+    assert all(servo.tripped for servo in rig.servos)
+    free.server.close()
 
 
 def test_an_unused_rig_ends_by_itself(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 from servoid.stack.control import planner as planner_module
 from servoid.stack.control.diffusion import DiffusionPolicy, diffusion_policy
+from servoid.stack.control.plan_buffer import Pace
 from servoid.stack.control.planner import InlinePlanner, ProcessPlanner
 from servoid.stack.control.trim import Trim
 from servoid.stack.safety.min_jerk import MinJerk
@@ -48,7 +49,7 @@ def state(tick: int) -> State:
     )
 
 
-def marked(asked: PlanRequest, seed: int) -> Plan:
+def marked(asked: PlanRequest) -> Plan:
     """A plan whose action for tick t is 1000 * its own tick + t."""
     actions = 1000.0 * asked.tick + asked.tick + np.arange(16.0)[:, None] * np.ones(20)
     return Plan(asked.tick, actions, np.zeros((16, 53)), np.zeros((16, 2)), 0.0)
@@ -96,23 +97,23 @@ def run(policy: DiffusionPolicy, ticks: int) -> list[float]:
 
 
 def test_plans_are_adopted_after_the_delay_and_run_by_tick() -> None:
-    policy = DiffusionPolicy(Spy(), history=4, replan=4, delay=2)
+    policy = DiffusionPolicy(Spy(), Pace(4, 4, 2))
     # The history is full at tick 3; the first request is that of tick 4, adopted at 6; the next, of 8, at 10.
     assert run(policy, 14) == [0.5] * 6 + [4006, 4007, 4008, 4009, 8010, 8011, 8012, 8013]
     assert adoptions(policy) == [(4, 6), (8, 10)]
-    assert policy.latest_plan is not None
-    assert policy.latest_plan.tick == 8
+    assert policy.plans.latest is not None
+    assert policy.plans.latest.tick == 8
     assert policy.take_events() == ()
 
 
 def test_without_delay_a_plan_runs_from_its_own_tick() -> None:
-    policy = DiffusionPolicy(Spy(), history=4, replan=4, delay=0)
+    policy = DiffusionPolicy(Spy(), Pace(4, 4, 0))
     assert run(policy, 9)[3:] == [0.5, 4004, 4005, 4006, 4007, 8008]
 
 
 def test_requests_hold_what_was_applied_and_what_will_run_meanwhile() -> None:
     planner = Spy()
-    policy = DiffusionPolicy(planner, history=4, replan=4, delay=2)
+    policy = DiffusionPolicy(planner, Pace(4, 4, 2))
     targets = run(policy, 13)
     asked = planner.requests[2]
     assert asked.tick == 12
@@ -124,14 +125,14 @@ def test_requests_hold_what_was_applied_and_what_will_run_meanwhile() -> None:
 
 def test_what_the_guard_changed_is_what_the_planner_is_told() -> None:
     planner = Spy()
-    policy = DiffusionPolicy(planner, history=4, replan=4, delay=1)
+    policy = DiffusionPolicy(planner, Pace(4, 4, 1))
     for tick in range(5):
         act(policy, state(tick), np.full(20, tick / 10), INSTRUCTION)
     assert planner.requests[0].actions[:3, 0].tolist() == pytest.approx([0.2, 0.3, 0.4])
 
 
 def test_a_late_plan_is_adopted_when_it_comes_and_the_last_goes_on_until_then() -> None:
-    policy = DiffusionPolicy(Spy(late={8: 2}), history=4, replan=4, delay=1)
+    policy = DiffusionPolicy(Spy(late={8: 2}), Pace(4, 4, 1))
     assert run(policy, 15)[8:] == [4008, 4009, 4010, 8011, 8012, 12013, 12014]
     assert adoptions(policy) == [(4, 5), (8, 11), (12, 13)]
     assert policy.take_events() == ("the plan requested at tick 8 was not ready at 9: that of 4 goes on",)
@@ -140,14 +141,14 @@ def test_a_late_plan_is_adopted_when_it_comes_and_the_last_goes_on_until_then() 
 
 def test_nothing_else_is_asked_of_a_planner_that_is_late_and_what_has_passed_is_not_adopted() -> None:
     planner = Spy(late={8: 16})  # the actions of a plan are 16
-    policy = DiffusionPolicy(planner, history=4, replan=4, delay=1)
+    policy = DiffusionPolicy(planner, Pace(4, 4, 1))
     assert run(policy, 33)[8:] == [*range(4008, 4020), *[4019] * 9, 28029, 28030, 28031, 28032]
     assert [asked.tick for asked in planner.requests] == [4, 8, 28, 32]
     assert adoptions(policy) == [(4, 5), (28, 29)]
 
 
 def test_a_machine_that_is_too_slow_walks_by_later_plans_and_says_so() -> None:
-    policy = DiffusionPolicy(Spy(late=dict.fromkeys(range(200), 1)), history=4, replan=2, delay=1)
+    policy = DiffusionPolicy(Spy(late=dict.fromkeys(range(200), 1)), Pace(4, 2, 1))
     targets = run(policy, 80)
     assert adoptions(policy) == [(tick, tick + 2) for tick in range(4, 78, 2)]
     assert targets[10:14] == [8010, 8011, 10012, 10013]
@@ -158,13 +159,13 @@ def test_a_machine_that_is_too_slow_walks_by_later_plans_and_says_so() -> None:
 
 def test_a_recorded_run_is_repeated_with_its_late_plans() -> None:
     def walk(planner: Spy, only: dict[int, int] | None) -> tuple[list[float], list[int], tuple[str, ...]]:
-        policy = DiffusionPolicy(planner, history=4, replan=2, delay=1)
+        policy = DiffusionPolicy(planner, Pace(4, 2, 1))
         if only is not None:
             policy.repeat(only)
         return run(policy, 60), [asked.tick for asked in planner.requests], policy.take_events()
 
     late = {8: 2, 14: 1, 20: 16}
-    policy = DiffusionPolicy(Spy(late=late), history=4, replan=2, delay=1)
+    policy = DiffusionPolicy(Spy(late=late), Pace(4, 2, 1))
     run(policy, 60)
     repeated = walk(Spy(), dict(adoptions(policy)))
     assert repeated == walk(Spy(late=late), None)
@@ -178,10 +179,10 @@ class FakePipe:
         self.now, self._takes = 0.0, takes
         self._answers: list[tuple[float, object]] = [(0.0, None)]  # when there, and what; the first: it is ready
 
-    def send(self, message: tuple[int, int, PlanRequest]) -> None:
-        serial, seed, asked = message
+    def send(self, message: tuple[int, PlanRequest]) -> None:
+        serial, asked = message
         assert not self._answers, "it is busy"
-        self._answers.append((self.now + self._takes(asked.tick), (serial, marked(asked, seed))))
+        self._answers.append((self.now + self._takes(asked.tick), (serial, marked(asked))))
 
     def poll(self, timeout: float) -> bool:
         return bool(self._answers) and self._answers[0][0] <= self.now
@@ -202,7 +203,7 @@ def test_planning_goes_on_after_a_slow_plan(
     pipe = FakePipe(lambda tick: slow if tick == 20 else usual * delay)
     context = SimpleNamespace(Pipe=lambda: (pipe, MagicMock()), Process=MagicMock())
     monkeypatch.setattr(planner_module.multiprocessing, "get_context", lambda method: context)
-    policy = DiffusionPolicy(ProcessPlanner(MagicMock()), history=4, replan=replan, delay=delay, wait=False)
+    policy = DiffusionPolicy(ProcessPlanner(MagicMock()), Pace(4, replan, delay, wait=False))
     for tick in range(60):
         pipe.now = float(tick)
         act(policy, state(tick), np.full(20, 0.5), INSTRUCTION)
@@ -214,7 +215,7 @@ def test_planning_goes_on_after_a_slow_plan(
 def test_what_is_asked_is_corrected_and_has_the_name_of_its_correction() -> None:
     """A name of its own for what was asked would pull against the correction: the planner names what it is asked."""
     spy = Spy()
-    policy = DiffusionPolicy(spy, history=4, replan=4, delay=2, trim=Trim(ROBOT.dt, rate=5.0))
+    policy = DiffusionPolicy(spy, Pace(4, 4, 2), trim=Trim(ROBOT.dt, rate=5.0))
     turning = replace(state(0), angular_velocity=np.array([0.0, 0.0, 0.4]))
     for tick in range(200):
         act(policy, replace(turning, time_ns=tick * 20_000_000), np.full(20, 0.5), INSTRUCTION)
@@ -225,9 +226,7 @@ def test_what_is_asked_is_corrected_and_has_the_name_of_its_correction() -> None
 
 def test_without_a_plan_it_comes_to_a_stand_and_from_there_goes_on_with_the_next() -> None:
     home = np.full(20, -1.0)
-    policy = DiffusionPolicy(
-        Spy(late={8: 16}), history=4, replan=4, delay=1, stand=lambda pose: MinJerk(pose, home, ticks=4)
-    )
+    policy = DiffusionPolicy(Spy(late={8: 16}), Pace(4, 4, 1), stand=lambda pose: MinJerk(pose, home, ticks=4))
     targets = run(policy, 32)
     assert targets[18:20] == [4018, 4019]  # its last actions
     np.testing.assert_allclose(targets[19:23], -1.0 + 4020.0 * (1.0 - np.array([0.0, 0.103515625, 0.5, 0.896484375])))
@@ -238,7 +237,7 @@ def test_without_a_plan_it_comes_to_a_stand_and_from_there_goes_on_with_the_next
 def test_a_plan_that_is_asked_for_on_the_way_to_a_stand_knows_of_that_way() -> None:
     home = np.full(20, -1.0)
     spy = Spy(late={8: 16})
-    policy = DiffusionPolicy(spy, history=4, replan=4, delay=3, stand=lambda pose: MinJerk(pose, home, ticks=40))
+    policy = DiffusionPolicy(spy, Pace(4, 4, 3), stand=lambda pose: MinJerk(pose, home, ticks=40))
     targets = run(policy, 40)
     standing = [request for request in spy.requests if request.tick > 20 and targets[request.tick] < 4019.0]
     assert standing
@@ -249,7 +248,7 @@ def test_a_plan_that_is_asked_for_on_the_way_to_a_stand_knows_of_that_way() -> N
 
 
 def test_the_last_action_is_held_when_plans_stop_coming_and_it_is_said_once() -> None:
-    policy = DiffusionPolicy(Spy(late={8: 100}), history=4, replan=4, delay=1)
+    policy = DiffusionPolicy(Spy(late={8: 100}), Pace(4, 4, 1))
     assert run(policy, 24)[18:] == [4018, 4019, 4019, 4019, 4019, 4019]
     ended = [text for text in policy.take_events() if "ended before another one came" in text]
     assert ended == ["the plan of tick 4 ended before another one came: its last action is held"]
@@ -257,12 +256,12 @@ def test_the_last_action_is_held_when_plans_stop_coming_and_it_is_said_once() ->
 
 def test_a_request_holds_the_plan_that_runs() -> None:
     planner = Spy()
-    policy = DiffusionPolicy(planner, history=4, replan=1, delay=1)
+    policy = DiffusionPolicy(planner, Pace(4, 1, 1))
     run(policy, 8)
     previous = [None if r.previous is None else r.previous.tick for r in planner.requests]
     assert [r.tick for r in planner.requests] == [3, 4, 5, 6, 7]
     assert previous == [None, 3, 4, 5, 6]
-    policy.reset(1)
+    policy.reset(None, np.array(1))
     run(policy, 4)
     assert planner.requests[-1].previous is None
 
@@ -279,7 +278,7 @@ class Refusing(Spy):
 
 
 def test_a_plan_that_could_not_be_made_is_said_once_and_the_last_goes_on() -> None:
-    policy = DiffusionPolicy(Refusing(), history=4, replan=4, delay=1)
+    policy = DiffusionPolicy(Refusing(), Pace(4, 4, 1))
     assert run(policy, 18)[8:] == [*range(4008, 4017), 16017]
     assert policy.take_events() == ("no plan for tick 8: guidance diverged: that of 4 goes on",)
     assert adoptions(policy) == [(4, 5), (16, 17)]
@@ -290,9 +289,9 @@ def test_a_plan_that_could_not_be_made_is_said_once_and_the_last_goes_on() -> No
 
 
 def test_reset_forgets_the_episode() -> None:
-    policy = DiffusionPolicy(Spy(), history=4, replan=4, delay=1)
+    policy = DiffusionPolicy(Spy(), Pace(4, 4, 1))
     first = run(policy, 12)
-    policy.reset(1)
+    policy.reset(None, np.array(1))
     assert policy.adopted is None
     assert run(policy, 12) == first
 
@@ -314,12 +313,12 @@ def untrained(tmp_path: Path, **training: Any) -> DiffusionSettings:
     actions = Normaliser(torch.tensor(ROBOT.home, dtype=torch.float32), torch.full((20,), 0.1))
     facts: dict[str, Any] = {"data": "none", "licence": "none", "results": {}, "training": training}
     checkpoint.save(path, Denoiser(config).state_dict(), config, states, actions, ROBOT, **facts)
-    return DiffusionSettings(checkpoint=str(path), steps=5, replan=4, delay=2)
+    return DiffusionSettings(checkpoint=str(path), steps=5, execution_horizon=4, delay=2)
 
 
 def trace(policy: DiffusionPolicy, seed: int, wait: bool) -> Array:
-    policy._wait = wait
-    policy.reset(seed)
+    policy.plans.pace = replace(policy.plans.pace, wait=wait)
+    policy.reset(None, np.array(seed))
     applied, out = ROBOT.home, []
     for tick in range(13):
         applied = act(policy, state(tick), applied, INSTRUCTION)
@@ -366,8 +365,8 @@ def test_a_checkpoint_for_another_rate_is_refused_before_anything_starts(
 ) -> None:
     with pytest.raises(ConfigError, match="runs at 100"):
         diffusion_policy(replace(ROBOT, rate=100), settings, process=process)
-    with pytest.raises(ConfigError, match="lower replan or delay"):
-        diffusion_policy(ROBOT, replace(settings, replan=15, delay=2), process=process)
+    with pytest.raises(ConfigError, match="lower execution_horizon or delay"):
+        diffusion_policy(ROBOT, replace(settings, execution_horizon=15, delay=2), process=process)
     with pytest.raises(ConfigError, match="horizon 32 is asked for"):
         diffusion_policy(ROBOT, replace(settings, horizon=32), process=process)
 
@@ -388,7 +387,7 @@ def test_plans_that_take_no_time_are_for_simulation_only(settings: DiffusionSett
 
 
 def test_rolling_gives_the_same_actions_in_line_and_beside_the_loop(settings: DiffusionSettings) -> None:
-    rolling = replace(settings, schedule="rolling", steps=2, replan=1, delay=1)
+    rolling = replace(settings, schedule="rolling", steps=2, execution_horizon=1, delay=1)
     inline, process = diffusion_policy(ROBOT, rolling), diffusion_policy(ROBOT, rolling, process=True)
     try:
         first = trace(inline, 3, wait=True)

@@ -1,4 +1,4 @@
-"""The policies of one robot do what their batched twins do that trained and collected; the shipped expert stays up."""
+"""A policy does for one robot what it does for a world of many; the shipped expert stays up."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.gait import GaitPolicy
 from servoid.stack.control.tracker import ExpertPolicy
 from servoid.stack.estimation.odometry import load_odometry
-from servoid.tools.learn.envs.walker import Walker, load_tracker
 
 ROBOT = load_robot()
 
@@ -21,24 +20,21 @@ ROBOT = load_robot()
 @pytest.mark.parametrize("kind", [GaitPolicy, ExpertPolicy])
 def test_one_robot_acts_as_a_world_of_the_fleet(kind: type) -> None:
     fleet, everything = Fleet(ROBOT, 2, None, seed=3, threads=1), np.ones(2, bool)
-    walker = Walker(fleet, load_tracker(ROBOT) if kind is ExpertPolicy else None)
+    policy, batched = kind(ROBOT), kind(ROBOT, shape=(2,))
     fleet.reset(everything)
-    walker.reset(everything)
-    walker.gait.reset()  # a run starts at phase 0
-    policy = kind(ROBOT, None, False)
+    batched.reset(None, fleet.seeds)
     for attempt in range(2):  # a reset makes a used policy new
-        policy.reset(attempt)
+        policy.reset(None, np.array(attempt))
         if attempt:
             fleet.reset(everything)
-            walker.reset(everything)
-            walker.gait.reset()
+            batched.reset(everything, fleet.seeds)
         for tick in range(40):
             state = fleet.observe()
             command = np.array([[0.2, 0.0, 0.3], [0.0, 0.0, 0.0]]) * (tick > 5)
             values = {f.name: getattr(state, f.name) for f in fields(State)}
             one = State(**{name: value if name == "time_ns" else value[0] for name, value in values.items()})
             target = policy.act(one, fleet.applied[0], Instruction(command[0]))
-            targets = walker.act(command)
+            targets = batched.act(state, fleet.applied, Instruction(command))
             np.testing.assert_allclose(target, targets[0], atol=1e-5)
             fleet.step(targets)
         assert np.abs(targets[0] - ROBOT.home).max() > 0.1
@@ -48,15 +44,13 @@ def test_the_shipped_expert_stays_up_on_robots_it_does_not_know() -> None:
     """Pushed each second, half of the robots while going backward in a turn, where an older expert fell most."""
     n = 64
     fleet, everything = Fleet(ROBOT, n, load_odometry(ROBOT), randomise=1.0, seed=0), np.ones(n, bool)
-    walker = Walker(fleet, load_tracker(ROBOT))
+    policy = ExpertPolicy(ROBOT, shape=(n,))
     fleet.reset(everything)
-    walker.reset(everything)
     command, fallen = np.tile([[-0.1, 0.05, 0.4], [0.2, -0.05, -0.5]], (n // 2, 1)), ~everything
     for tick in range(8 * ROBOT.rate):
         if tick and tick % ROBOT.rate == 0:
             bearing = np.array([rng.uniform(-np.pi, np.pi) for rng in fleet.rngs])
             fleet.worlds.push(0.3 * np.stack([np.cos(bearing), np.sin(bearing)], -1))
-        fleet.observe()
-        fleet.step(walker.act(command))
+        fleet.drive(policy, command)
         fallen |= fleet.truth.fallen
     assert fallen.mean() <= 0.12

@@ -23,6 +23,7 @@ from servoid.policy.latent.actions import LatentActions, LatentConfig
 from servoid.policy.latent.network import LatentNetwork
 from servoid.policy.latent.proprioception import proprioception_layout
 from servoid.stack.control.diffusion import DiffusionPolicy, diffusion_policy
+from servoid.stack.control.plan_buffer import Pace
 
 SIZE = 3
 HEIGHT = raw_layout(20).slice("displacement").stop - 1
@@ -38,7 +39,7 @@ class Marked:
         return (actions + 100 * rows[..., HEIGHT : HEIGHT + 1]) * np.ones(20)
 
 
-def marked(asked: PlanRequest, seed: int) -> Plan:
+def marked(asked: PlanRequest) -> Plan:
     """A plan whose latent for tick t is 1000 * its own tick."""
     return Plan(asked.tick, np.full((9, 1), 1000.0 * asked.tick), np.zeros((9, 53)), np.zeros((9, 2)), 0.0)
 
@@ -46,7 +47,7 @@ def marked(asked: PlanRequest, seed: int) -> Plan:
 def policy(delay: int, late: dict[int, int] | None = None) -> tuple[DiffusionPolicy, Spy]:
     spy = Spy(late)
     spy._answer = marked
-    return DiffusionPolicy(spy, history=4, replan=4, delay=delay, space=Marked()), spy
+    return DiffusionPolicy(spy, Pace(4, 4, delay), space=Marked()), spy
 
 
 def run(of: DiffusionPolicy, ticks: int, changed: float = 0.0) -> list[float]:
@@ -105,12 +106,12 @@ def settings(tmp_path: Path) -> DiffusionSettings:
     facts: dict[str, Any] = {"data": "none", "licence": "none", "results": {}, "training": {}}
     weights = Denoiser(config).state_dict()
     checkpoint.save(path, weights, config, states, actions, ROBOT, **facts, latents=latents())
-    return DiffusionSettings(checkpoint=str(path), steps=5, replan=4, delay=2)
+    return DiffusionSettings(checkpoint=str(path), steps=5, execution_horizon=4, delay=2)
 
 
 def trace(of: DiffusionPolicy) -> Array:
-    of._wait = True
-    of.reset(3)
+    of.plans.pace = replace(of.plans.pace, wait=True)
+    of.reset(None, np.array(3))
     applied, out = ROBOT.home, []
     for tick in range(13):
         applied = of.act(state(tick), applied, INSTRUCTION)
@@ -122,14 +123,14 @@ def trace(of: DiffusionPolicy) -> Array:
 def test_a_checkpoint_with_latents_runs_by_itself(settings: DiffusionSettings, schedule: str) -> None:
     """In line and beside the loop, with nothing but its own file."""
     if schedule == "rolling":
-        settings = replace(settings, schedule=schedule, steps=2, replan=1, delay=1)
+        settings = replace(settings, schedule=schedule, steps=2, execution_horizon=1, delay=1)
     inline, process = (diffusion_policy(ROBOT, settings, process=beside) for beside in (False, True))
     try:
         first = trace(inline)
         np.testing.assert_array_equal(first, trace(process))
     finally:
         process.close()
-    plan = inline.latest_plan
+    plan = inline.plans.latest
     assert plan is not None
     assert plan.actions.shape == (16, SIZE)
     expected = latents().decode(raw_row(state(12)), plan.actions[12 - plan.tick])

@@ -16,23 +16,24 @@ from servoid.hw.contracts.control import Instruction, Plan, PlanRequest
 from servoid.stack.control.planner import InlinePlanner, PlannerError, ProcessPlanner
 
 
-def request(tick: int) -> PlanRequest:
-    return PlanRequest(tick, np.zeros((4, 53)), np.zeros((4, 20)), Instruction(np.zeros(3)))
+def request(tick: int, seed: int = 0) -> PlanRequest:
+    seeds = np.array(seed)
+    return PlanRequest(tick, np.zeros((4, 53)), np.zeros((4, 20)), Instruction(np.zeros(3)), seeds=seeds)
 
 
-def answer(asked: PlanRequest, seed: int, seconds: float = 0.0, fail_at: int = -1) -> Plan:
+def answer(asked: PlanRequest, seconds: float = 0.0, fail_at: int = -1) -> Plan:
     """A plan whose actions tell who asked; slow or failing where told to."""
     time.sleep(seconds)
     if asked.tick == fail_at:
         raise ValueError("the cost went wrong")
-    return Plan(asked.tick, np.full((16, 20), 1000.0 * seed + asked.tick), asked.states, np.zeros((16, 2)), 0.0)
+    return Plan(asked.tick, np.full((16, 20), 1000.0 * asked.seeds + asked.tick), asked.states, np.zeros((16, 2)), 0.0)
 
 
-def build(seconds: float = 0.0, fail_at: int = -1) -> Callable[[PlanRequest, int], Plan]:
+def build(seconds: float = 0.0, fail_at: int = -1) -> Callable[[PlanRequest], Plan]:
     return partial(answer, seconds=seconds, fail_at=fail_at)
 
 
-def build_badly() -> Callable[[PlanRequest, int], Plan]:
+def build_badly() -> Callable[[PlanRequest], Plan]:
     raise FileNotFoundError("no such weights")
 
 
@@ -55,8 +56,8 @@ def test_inline_and_process_planners_answer_alike() -> None:
     try:
         for seed in (1, 2):
             for planner in (inline, process):
-                planner.reset(seed)
-                planner.submit(request(8))
+                planner.reset()
+                planner.submit(request(8, seed))
             plans = [planner.collect(8, wait=True) for planner in (inline, process)]
             assert [plan.actions[0, 0] for plan in plans if plan] == [1000 * seed + 8] * 2
             assert inline.collect(8, wait=True) is None  # once
@@ -84,10 +85,10 @@ def test_a_slow_planner_never_blocks_and_plans_only_the_newest_of_what_waits() -
 def test_a_plan_of_the_episode_before_is_not_handed_out() -> None:
     planner = ProcessPlanner(partial(build, seconds=0.3))
     try:
-        planner.reset(1)
-        planner.submit(request(0))
-        planner.reset(2)
-        planner.submit(request(0))
+        planner.reset()
+        planner.submit(request(0, 1))
+        planner.reset()
+        planner.submit(request(0, 2))
         plan = planner.collect(0, wait=True)
         assert plan is not None
         assert plan.actions[0, 0] == 2000

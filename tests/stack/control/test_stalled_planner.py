@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,15 +32,15 @@ class Stalled:
         self._planner, self._stall = planner, range(first, first + STALL)
         self.policy: DiffusionPolicy
 
-    def reset(self, seed: int) -> None:
-        self._planner.reset(seed)
+    def reset(self) -> None:
+        self._planner.reset()
 
     def submit(self, request: PlanRequest) -> None:
         self._planner.submit(request)
 
     def collect(self, tick: int, wait: bool) -> Plan | None:
         assert not wait
-        return None if self.policy._tick in self._stall else self._planner.collect(tick, wait)
+        return None if self.policy.plans.tick in self._stall else self._planner.collect(tick, wait)
 
     def close(self) -> None:
         self._planner.close()
@@ -62,12 +62,13 @@ class Walk:
 
 def walk(first: int) -> Walk:
     job = RunSettings("walk", seconds=(first + STALL + AFTER) * ROBOT.dt, seed=1, set={"vx": str(SPEED)})
-    task, backend = prepare(job)
+    assignment, backend = prepare(job)
     body: Any = backend
-    policy = diffusion_policy(ROBOT, cost=task.cost)
-    stalled = Stalled(policy._planner, first)
+    policy = diffusion_policy(ROBOT, cost=assignment.task.objective)
+    stalled = Stalled(policy.plans.planner, first)
     stalled.policy = policy
-    policy._planner, policy._wait = stalled, False  # as beside the loop
+    plans = policy.plans
+    plans.planner, plans.pace = stalled, replace(plans.pace, wait=False)  # as beside the loop
     ground_truth, records = GroundTruth(body.simulation, ROBOT.dt), list[TickRecord]()
 
     def watch(record: TickRecord) -> None:
@@ -88,7 +89,7 @@ def test_the_last_plan_runs_out_and_the_robot_comes_to_a_stand_until_the_next(wa
         last = max(tick for tick in plans if tick < one.first + 2)
         plan, ends = plans[last], plans[last].tick + len(plans[last].actions)
         until = min(tick for tick in plans if tick > last)
-        assert one.first + STALL <= until <= one.first + STALL + load_settings().replan
+        assert one.first + STALL <= until <= one.first + STALL + load_settings().execution_horizon
         wished = np.array([record.proposal.target for record in one.task[last:until]])
         np.testing.assert_array_equal(wished[: ends - last], plan.actions[last - plan.tick :])
         away = np.abs(wished[ends - last - 1 :] - ROBOT.home).max(1)

@@ -7,11 +7,12 @@ import itertools
 import numpy as np
 import pytest
 
+from servoid.hw.contracts.control import Instruction
 from servoid.hw.geometry import rotate, up_vector, yaw_of
 from servoid.hw.robot.description import load_robot
 from servoid.stack.control.fleet import Fleet
+from servoid.stack.control.gait import GaitPolicy
 from servoid.stack.estimation.attitude import Attitude
-from servoid.tools.learn.envs.walker import Walker
 
 DT = 0.02
 LEVEL = np.array([0.0, 0.0, 9.81])
@@ -136,9 +137,8 @@ def test_worlds_are_independent_and_reset_alone() -> None:
 def test_gravity_and_heading_hold_while_it_walks() -> None:
     robot = load_robot()
     fleet = Fleet(robot, 6, None, seed=1, threads=1)
-    walker, everything = Walker(fleet, None), np.ones(6, bool)
-    fleet.reset(everything)
-    walker.reset(everything)
+    policy = GaitPolicy(robot, (6,))
+    fleet.reset(np.ones(6, bool))
     command = np.array([[0.2, 0, 0], [0.1, 0.05, 0], [0, 0, 0.5], [0.15, 0, -0.5], [0, -0.08, 0], [-0.1, 0, 0]])
     for _ in range(25):  # a reset drops the robot on its feet: as in a run, up is taken when it stands
         fleet.observe()
@@ -149,7 +149,7 @@ def test_gravity_and_heading_hold_while_it_walks() -> None:
         state = fleet.observe()
         upright = (state.gravity * fleet.truth.gravity).sum(-1)
         errors.append(np.arccos(np.clip(upright, -1, 1)))
-        fleet.step(walker.act(command))
+        fleet.step(policy.act(state, fleet.applied, Instruction(command)))
         assert not fleet.truth.fallen.any()
     heading = (fleet.observe().yaw - fleet.truth.yaw + np.pi) % (2 * np.pi) - np.pi
     assert np.sqrt(np.mean(np.square(errors))) < 0.03

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from servoid.hw.contracts.body import Observation
-from servoid.hw.contracts.control import State
+from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.geometry import rotate
 from servoid.hw.robot.description import load_robot
 from servoid.stack.control.fleet import Fleet
+from servoid.stack.control.tracker import ExpertPolicy
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import load_odometry
-from servoid.tools.learn.envs.walker import Walker, load_tracker
-from servoid.tools.learn.trainers.odometry import drift, driver
+from servoid.tools.learn.trainers.odometry import drift, maker
 
 ROBOT = load_robot()
 
@@ -30,9 +30,8 @@ def world(batch: Observation, i: int) -> Observation:
 def walk() -> tuple[list[Observation], list[np.ndarray], list[State], np.ndarray]:
     """What 3 randomised worlds saw, were commanded and believed over 4 s of walking; and the gyros' bias."""
     fleet = Fleet(ROBOT, 3, load_odometry(ROBOT), randomise=1.0, seed=2, threads=1)
-    walker, everything = Walker(fleet, load_tracker(ROBOT)), np.ones(3, bool)
-    fleet.reset(everything)
-    walker.reset(everything)
+    policy = ExpertPolicy(ROBOT, shape=(3,))
+    fleet.reset(np.ones(3, bool))
     bias = np.array([body.gyro_bias for body in fleet.worlds.bodies if body])
     fleet.estimator.reset(bias=bias)
     observations, applied, states = [], [], []
@@ -42,7 +41,8 @@ def walk() -> tuple[list[Observation], list[np.ndarray], list[State], np.ndarray
         applied.append(fleet.applied.copy())
         fleet.state = fleet.estimator.update(observation, fleet.applied)
         states.append(fleet.state)
-        fleet.step(walker.act(np.array([[0.2, 0, 0], [0.1, 0.05, 0.4], [0, 0, 0]])))
+        asked = Instruction(np.array([[0.2, 0, 0], [0.1, 0.05, 0.4], [0, 0, 0]]))
+        fleet.step(policy.act(fleet.state, fleet.applied, asked))
     return observations, applied, states, bias
 
 
@@ -168,7 +168,7 @@ def test_standing_it_neither_moves_nor_sinks() -> None:
 
 @pytest.mark.parametrize("policy", ["expert", "diffusion", "gait"])
 def test_drift_of_twenty_walks_is_a_small_share_of_the_path(policy: str) -> None:
-    result = drift(ROBOT, driver(ROBOT, policy), load_odometry(ROBOT), walks=20, seconds=30.0, seed=11)
+    result = drift(ROBOT, maker(ROBOT, policy), load_odometry(ROBOT), walks=20, seconds=30.0, seed=11)
     assert result.walks >= 15  # that stayed up and covered more than a metre
     assert result.p90 <= 0.04
     assert result.yaw_p90 <= 0.1

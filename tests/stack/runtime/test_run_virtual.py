@@ -94,8 +94,6 @@ def test_a_policy_that_hangs_after_a_push_is_broken_off_with_torque_off() -> Non
     """The second Ctrl-C is an exception in the middle of a tick: no request to the rig may be cut in half by it."""
 
     class Hangs(BasePolicy):
-        def reset(self, seed: int) -> None: ...
-
         def act(self, *_: Any) -> Array:
             os.kill(os.getpid(), signal.SIGINT)
             os.kill(os.getpid(), signal.SIGINT)

@@ -36,12 +36,12 @@ def requests() -> Sequence[PlanRequest]:
 
 
 def planner(engine: str) -> Runtime:
-    cost = load_task("walk", {}, ROBOT.dt, ROBOT).cost
+    cost = load_task("walk", {}, ROBOT.dt, ROBOT).objective
     return load_runtime(ROBOT, replace(SETTINGS, engine=engine), cost)
 
 
 def actions(runtime: Runtime, requests: Sequence[PlanRequest], seed: int = 7) -> Array:
-    return np.array([runtime.plan(request, seed).actions for request in requests])
+    return np.array([runtime.plan(replace(request, seeds=np.array(seed))).actions for request in requests])
 
 
 @pytest.mark.parametrize(("engine", "most"), [("onnx", 1e-4), ("onnx-int8", 0.05)])

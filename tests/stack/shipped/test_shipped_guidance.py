@@ -42,13 +42,15 @@ def walking() -> Sequence[PlanRequest]:
 
 
 def planner(settings: DiffusionSettings) -> Runtime:
-    return load_runtime(ROBOT, settings, load_task("walk", {}, ROBOT.dt, ROBOT).cost)
+    return load_runtime(ROBOT, settings, load_task("walk", {}, ROBOT.dt, ROBOT).objective)
 
 
 def actions(runtime: Runtime, requests: Sequence[PlanRequest], velocity: Sequence[float]) -> Array:
     """Planned actions `(requests, seeds, ticks, joints)` rad, without those that were committed."""
     asked = Instruction(np.array(velocity), text=AHEAD)
-    plans = [[runtime.plan(replace(one, instruction=asked), seed) for seed in SEEDS] for one in requests]
+    plans = [
+        [runtime.plan(replace(one, instruction=asked, seeds=np.array(seed))) for seed in SEEDS] for one in requests
+    ]
     return np.array([[plan.actions[SHIPPED.delay :] for plan in row] for row in plans])
 
 
@@ -78,8 +80,8 @@ class Told(BasePolicy):
     def __init__(self, policy: DiffusionPolicy) -> None:
         self._policy = policy
 
-    def reset(self, seed: int) -> None:
-        self._policy.reset(seed)
+    def reset(self, where: Array | None, seeds: Array) -> None:
+        self._policy.reset(where, seeds)
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         return self._policy.act(state, applied, replace(instruction, text=AHEAD))
@@ -88,10 +90,15 @@ class Told(BasePolicy):
 def walk(settings: DiffusionSettings, chosen: Mapping[str, str], seconds: float = 2.5) -> Trace:
     """A run by the truth."""
     job = RunSettings("walk", seconds=seconds, seed=1, set=chosen)
-    task, backend = prepare(job)
+    assignment, backend = prepare(job)
     body: Any = backend
     ground_truth = GroundTruth(body.simulation, ROBOT.dt)
-    run(job, backend=body, on_tick=ground_truth, policy=Told(diffusion_policy(ROBOT, settings, task.cost)))
+    run(
+        job,
+        backend=body,
+        on_tick=ground_truth,
+        policy=Told(diffusion_policy(ROBOT, settings, assignment.task.objective)),
+    )
     trace = ground_truth.trace()
     assert not trace.fallen
     assert len(trace.yaw) == 1 + round(seconds / ROBOT.dt)

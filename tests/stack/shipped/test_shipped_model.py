@@ -40,7 +40,7 @@ def test_it_starts_from_rest_and_walks_ten_seconds_where_it_is_asked(
         assert reached * np.sign(wanted) >= abs(wanted)
 
 
-@pytest.mark.parametrize(("name", "schedule", "samples"), [("uniphys", "gradual", 3), ("diffuse_cloc", "rolling", 1)])
+@pytest.mark.parametrize(("name", "schedule", "samples"), [("uniphys", "pyramid", 3), ("diffuse_cloc", "rolling", 1)])
 def test_it_walks_by_the_settings_of_either_paper(name: str, schedule: str, samples: int) -> None:
     driven = walked(drive("walk", {"vx": "0.2"}, policy=str(CONFIGS / "policies" / f"{name}.yaml")))
     assert driven.truth.displacement[-1, 0] > 0.2

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from servoid.tools.bench.bus import SERVOS, Run, wire_ms
+from servoid.tools.bench.bus import SERVOS, ClientTimes, wire_ms
 from servoid.tools.bench.responder import CURRENT, VELOCITY
 from servoid.tools.cli import main
 
@@ -44,7 +44,7 @@ def test_a_cycle_with_wrong_values_is_a_failed_one(fault: str | None) -> None:
 
         def close(self) -> None: ...
 
-    run = Run()
+    run = ClientTimes()
     run.batch(Client(), 3)
     assert run.failed == (3 if fault else 0)
     assert len(run.wall) == 3

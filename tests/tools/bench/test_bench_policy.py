@@ -50,7 +50,7 @@ def test_it_prints_one_row_for_each_network_runtime_and_kind_of_guidance(capfd: 
 
 
 def test_without_a_delay_a_plan_is_due_before_the_next_one() -> None:
-    assert policy.due_ms(replace(load_settings(), replan=4, delay=0), 0.02) == pytest.approx(80)
+    assert policy.due_ms(replace(load_settings(), execution_horizon=4, delay=0), 0.02) == pytest.approx(80)
 
 
 def test_operations_are_counted_as_the_layers_say() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from servoid.hw.contracts.body import Observation
-from servoid.hw.dynamixel.bus import Bus
+from servoid.hw.dynamixel.transport.bus import Bus
 from servoid.hw.robot.description import load_robot
 from servoid.sim.model import build
 from servoid.sim.rig.in_process import InProcessLine
@@ -283,8 +283,8 @@ def test_what_the_page_says_of_the_imu_is_what_physics_does(
     mujoco.mju_axisAngle2Quat(data.qpos[3:7], np.array(axis, float), angle)
     data.qvel[5] = turning
     mujoco.mj_inverse(model, data)  # the acceleration is none: it is held
-    assert data.sensor("accelerometer").data == pytest.approx(force, abs=0.05)
-    assert data.sensor("gyro").data[2] == pytest.approx(turning)
+    assert data.sensor("servoid/accelerometer").data == pytest.approx(force, abs=0.05)
+    assert data.sensor("servoid/gyro").data[2] == pytest.approx(turning)
 
 
 def test_watch_counts_more_reads_than_it_keeps_the_times_of(

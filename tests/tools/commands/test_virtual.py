@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.protocol import codec
 from servoid.stack.log.flightlog import read_log
 from servoid.tools.cli import main
 
@@ -49,6 +49,67 @@ def test_the_verb_serves_a_port_until_ctrl_c(tmp_path: Path) -> None:
     assert process.returncode == 0, err
     assert out == ""
     assert not list(tmp_path.iterdir()), "link and socket are taken away"
+
+
+@pytest.mark.parametrize(
+    ("options", "silent_board", "says"),
+    [
+        ((), False, "writes 1 to register 24 of the board, ID 200"),
+        (("--powered",), False, "The servos have power already."),
+        (("--no-board", "--baud", "1000000"), True, "There is no board: the servos have power."),
+    ],
+)
+def test_what_a_client_must_do_is_said_and_is_all_that_it_must_do(
+    options: tuple[str, ...], silent_board: bool, says: str
+) -> None:
+    process = start("virtual", "--link", "rig", "--json", *options)
+    assert process.stdout is not None
+    told = json.loads(process.stdout.readline())
+    assert told["board_id"] == (None if silent_board else 200)
+    with serial.Serial("rig", told["baud"], timeout=0.5) as port:
+
+        def asked(packet: bytes) -> int:
+            """How many bytes are answered; a busy machine may take its time."""
+            answer, deadline = b"", time.monotonic() + (1.0 if not told["powered"] else 10.0)
+            while not answer and time.monotonic() < deadline:
+                port.write(packet)
+                answer = port.read(14)
+            return len(answer)
+
+        assert bool(asked(codec.ping(1))) is told["powered"]
+        assert bool(asked(codec.ping(200))) is not silent_board
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=20)
+    assert says in err
+    assert "--move JOINT=RAD" in err
+
+
+def test_joints_of_a_limp_virtual_robot_are_moved_by_a_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """Another program records a range meanwhile: it sees the joint on its way, through the servo's own register."""
+    process = start("virtual", "--link", "rig", "--powered", "--json")
+    assert process.stdout is not None
+    baud = json.loads(process.stdout.readline())["baud"]
+    hand = start("virtual", "--link", "rig", "--move", "head_pan=1.0", "--over", "1", "--json")
+    seen: list[int] = []
+    with serial.Serial("rig", baud, timeout=0.05) as port:
+        while hand.poll() is None:
+            port.write(codec.read(19, 132, 4))
+            answer = port.read(15)
+            if len(answer) == 15:
+                seen.append(int.from_bytes(answer[9:13], "little", signed=True))
+        port.write(codec.write(19, 64, b"\1"))
+        port.read(11)
+    assert json.loads(hand.communicate()[0]) == {"joints": {"head_pan": 1.0}}
+    assert max(seen) - min(seen) > 600, "652 ticks to a radian"
+    assert len({tick for tick in seen if min(seen) + 50 < tick < max(seen) - 50}) > 2, "it did not jump"
+    assert main(["virtual", "--link", "rig", "--move", "head_pan=0"]) == 3
+    assert "head_pan: the servo has torque and cannot be moved by hand" in capsys.readouterr().err
+    assert main(["virtual", "--link", "rig", "--move", "head_pam=0"]) == 3
+    assert "did you mean 'head_pan'" in capsys.readouterr().err
+    for words in (["--move", "head_pan=x", "--link", "rig"], ["--move", "head_pan=1"]):
+        assert main(["virtual", *words]) == 2
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=20)
 
 
 def test_a_locked_rig_that_nobody_could_advance_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from servoid.hw.config import CONFIGS, ConfigError
 from servoid.hw.contracts.body import BackendError
+from servoid.hw.seeds import episode_seed
 from servoid.policy.checkpoint import resolve
 from servoid.stack.runtime.run import RunSettings
 from servoid.tools.cli import main
@@ -120,7 +121,7 @@ def test_episodes_are_not_those_that_settings_are_tried_on(tmp_path: Path, done:
         run: [job.settings.seed for job in done.jobs if job.settings.task == run] for run in ("goal-near", "goal-far")
     }
     assert seeds["goal-near"][:2] == seeds["goal-far"]  # the same for every row
-    assert not set(seeds["goal-near"]) & {rollout.episode_seed(0, episode) for episode in range(100)}
+    assert not set(seeds["goal-near"]) & {episode_seed(0, episode) for episode in range(100)}
 
 
 def test_what_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,7 +164,7 @@ def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path) -> None
     ran = []
 
     def do(job: EpisodeJob) -> EpisodeResult:
-        ran.append(load_settings(job.settings.policy).replan)
+        ran.append(load_settings(job.settings.policy).execution_horizon)
         mine.write_text("checkpoint: diffusion\nreplan: 8\n")
         return EpisodeResult(job, {"success": True})
 
@@ -173,7 +174,7 @@ def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path) -> None
 
 def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done: Episodes) -> None:
     stand = Row("t/stand", "Stand", Experiment("stand", episodes=3), SUCCESS)
-    variant = Row("t/variant", "Variant", Experiment("goal-near", plan={"replan": "8"}), SUCCESS)
+    variant = Row("t/variant", "Variant", Experiment("goal-near", plan={"execution_horizon": "8"}), SUCCESS)
     measured = evaluate([stand, variant, FAR], options(tmp_path), done)
     assert measured["t/stand"].refused == "the floor is missing"
     assert sum(job.settings.task == "stand" for job in done.jobs) == 1
@@ -291,6 +292,7 @@ def test_a_cache_that_cannot_be_written_says_so(tmp_path: Path) -> None:
         EpisodeCache(tmp_path / "file", {"a": 1})
 
 
+@pytest.mark.slow
 def test_the_command_from_episodes_to_pictures(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """A real one, two seconds long, with a pillar or two; and again, from what was kept."""
     words = [

@@ -34,7 +34,7 @@ def test_a_changed_checkpoint_setting_or_task_changes_what_episodes_depend_on(tm
     assert made_of(Experiment("goal-near", episodes=7)) == before  # more of the same
     others = [
         made_of(Experiment("goal-near", set={"radius": "0.09"})),
-        made_of(Experiment("goal-near", plan={"replan": "8"})),
+        made_of(Experiment("goal-near", plan={"execution_horizon": "8"})),
         made_of(Experiment("goal-near", randomise=True)),
         made_of(Experiment("goal-near", backend="virtual")),
         made_of(Experiment("goal-near", policy="expert")),
@@ -121,10 +121,10 @@ def test_variants_of_the_planner_are_files_that_the_policy_is_made_from(tmp_path
     from servoid.policy.diffusion.settings import load_settings
 
     policies = Policies("diffusion", tmp_path)
-    assert load_settings(policies.name(Experiment("goal"))).replan == load_settings().replan
+    assert load_settings(policies.name(Experiment("goal"))).execution_horizon == load_settings().execution_horizon
     assert policies.name(Experiment("goal", policy="expert")) == "expert"
-    written = load_settings(policies.name(Experiment("goal", plan={"replan": "8", "guidance.clip": "3"})))
-    assert (written.replan, written.guidance.clip) == (8, 3.0)
+    written = load_settings(policies.name(Experiment("goal", plan={"execution_horizon": "8", "guidance.clip": "3"})))
+    assert (written.execution_horizon, written.guidance.clip) == (8, 3.0)
     assert written.steps == load_settings().steps
     with pytest.raises(ConfigError, match="replann"):
         policies.name(Experiment("goal", plan={"replann": "8"}))

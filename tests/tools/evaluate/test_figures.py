@@ -195,7 +195,7 @@ def test_rows_are_measured_by_the_settings_of_the_files() -> None:
 
 def test_plans_are_sampled_as_the_papers_say() -> None:
     uniphys, cloc = load_policy("uniphys"), load_policy("diffuse_cloc")
-    assert (uniphys.schedule, uniphys.steps) == ("gradual", 5)  # UniPhys, table 1 and section A
+    assert (uniphys.schedule, uniphys.steps) == ("pyramid", 5)  # UniPhys, table 1 and section A
     assert (uniphys.guidance.samples, uniphys.guidance.choose) == (3, "mean")  # table A.1, eq. 4
     assert (cloc.schedule, cloc.rolling.state_level, cloc.rolling.action_level) == ("rolling", 14, 4)  # section 5.2
-    assert cloc.replan == 1  # table 1
+    assert cloc.execution_horizon == 1  # table 1

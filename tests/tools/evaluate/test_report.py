@@ -238,8 +238,12 @@ def test_stabilisation_is_about_as_noisy_as_the_papers() -> None:
     from servoid.policy.diffusion.settings import load_settings
 
     theirs = np.sqrt(1.0 - cosine_signal(50)[3])
-    stable = [int(row.experiment.plan["stabilise"]) for row in ROWS if row.experiment.plan.get("stabilise", "0") != "0"]
-    for level in {load_settings("uniphys").stabilise, *stable}:
+    stable = [
+        int(row.experiment.plan["stabilization_level"])
+        for row in ROWS
+        if row.experiment.plan.get("stabilization_level", "0") != "0"
+    ]
+    for level in {load_settings("uniphys").stabilization_level, *stable}:
         assert np.sqrt(1.0 - cosine_signal(20)[level]) == pytest.approx(theirs, rel=0.2)
 
 
@@ -272,7 +276,7 @@ def test_without_rolling_nothing_goes_over_from_plan_to_plan() -> None:
     none, both = rows["cloc/rolling-none"], rows["cloc/rolling-both"]
     assert none.experiment.plan["schedule"] == "full_sequence"  # `rolling` from any level keeps the noise of each frame
     assert "noise of its own" in none.note
-    for key in ("replan", "delay"):
+    for key in ("execution_horizon", "delay"):
         assert none.experiment.plan[key] == both.experiment.plan[key]
 
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import Parser
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Parser
 from servoid.tools.cli import main
 from servoid.tools.faults import fuzz, targets
 from servoid.tools.faults.streams import IDS, WIDTH, stream
@@ -27,7 +27,7 @@ def test_failures_of_every_kind_are_counted_with_what_repeats_them(
 ) -> None:
     count = iter(range(100))
 
-    def take(self: targets.Codec, pieces: Sequence[bytes]) -> None:
+    def take(self: targets.CodecTarget, pieces: Sequence[bytes]) -> None:
         number = next(count)
         if number == 2:
             raise IndexError("beyond the end")
@@ -36,7 +36,7 @@ def test_failures_of_every_kind_are_counted_with_what_repeats_them(
         if number == 6:
             raise targets.Unbounded("a million bytes")
 
-    monkeypatch.setattr(targets.Codec, "take", take)
+    monkeypatch.setattr(targets.CodecTarget, "take", take)
     monkeypatch.setattr(fuzz, "_HANG_SECONDS", 0.5)
     assert main(["bench", "fuzz", "--streams", "8", "--seed", "5", "--first", "10", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
@@ -60,7 +60,7 @@ def test_streams_repeat_themselves_and_reach_the_parsers() -> None:
 def test_the_bus_takes_whole_answers_one_after_the_other(fast: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Answers that came before they were asked for are dropped unread, and nothing of the bus would be tried."""
     monkeypatch.setattr(targets, "_BUS_EVERY", 1)
-    driver = targets.Driver()
+    driver = targets.DriverTarget()
     (group,) = (group for group in driver._groups if group.fast == fast)
     for value in range(3):
         data = bytes([value] * WIDTH)

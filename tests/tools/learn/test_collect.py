@@ -16,16 +16,17 @@ import yaml
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.policy.diffusion.dataset import read_recording
 from servoid.policy.diffusion.features import raw_layout
 from servoid.stack.control.fleet import Fleet
+from servoid.stack.control.gait import GaitPolicy
 from servoid.tools import cli
 from servoid.tools.learn.collect.disturbances import Disturbances, DisturbanceSettings, joint_noise
-from servoid.tools.learn.collect.episode_cutter import Recorder
+from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
 from servoid.tools.learn.collect.lerobot import DatasetWriter, Feature
 from servoid.tools.learn.collect.skills import SKILLS, skills_of
-from servoid.tools.learn.envs.walker import Walker
 
 TICKS = 250  # 5 s
 COMMAND = "collect --policy gait --plain-odometry --worlds 8 --frames 1500 --seconds 5 --threads 1 --json --out"
@@ -193,21 +194,23 @@ def test_same_options_same_files(collected: Path, tmp_path: Path) -> None:
     assert files(other)["data/chunk-000/file-000.parquet"] != ours["data/chunk-000/file-000.parquet"]
 
 
-class Faller:
+class Faller(GaitPolicy):
     """Stands; after `at` ticks it throws its limbs out in the worlds `who`. Notes how long each episode was."""
 
     def __init__(self, fleet: Fleet, at: int, who: Array) -> None:
-        self.walker, self.at, self.who = Walker(fleet, None), at, who
+        super().__init__(fleet.robot, (fleet.n,))
+        self.at, self.who = at, who
         self.tick = np.zeros(fleet.n, int)
         self.ends: list[int] = []
 
-    def reset(self, where: Array) -> None:
+    def reset(self, where: Array | None, seeds: Array) -> None:
+        assert where is not None
         self.ends += self.tick[where & (self.tick > 0)].tolist()
         self.tick[where] = 0
-        self.walker.reset(where)
+        super().reset(where, seeds)
 
-    def act(self, command: Array) -> Array:
-        target = self.walker.act(0 * command)
+    def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
+        target = super().act(state, applied, Instruction(0 * instruction.velocity))
         target[self.who & (self.tick >= self.at)] += 1.2 * np.sign(np.arange(target.shape[1]) % 2 - 0.5)
         self.tick += 1
         return target
@@ -217,9 +220,9 @@ def test_falls_lose_their_last_second(robot: Robot) -> None:
     fleet = Fleet(robot, 4, None, threads=1)
     driver = Faller(fleet, 180, np.array([False, True, False, True]))
     calm = DisturbanceSettings(noisy_share=0.0, pushed_share=0.0)
-    recorder = Recorder(fleet, driver, calm, TICKS / 50)
-    episodes = list(recorder.episodes(760))  # more than before the standing ones end
-    assert (recorder.begun, recorder.fell) == (6, 2)
+    cutter = EpisodeCutter(fleet, driver, calm, TICKS / 50)
+    episodes = list(cutter.episodes(760))  # more than before the standing ones end
+    assert (cutter.begun, cutter.fell) == (6, 2)
     assert all(180 < end < TICKS for end in driver.ends)
     lengths = [len(episode.skill) for episode in episodes]
     assert lengths == [*(end - 50 for end in driver.ends), TICKS, TICKS]  # in the order in which they ended
@@ -232,9 +235,9 @@ def test_episodes_under_way_end_early_but_whole(robot: Robot) -> None:
     """The frames that were asked for come, though no episode has reached its end."""
     fleet = Fleet(robot, 2, None, threads=1)
     driver = Faller(fleet, 10**6, np.ones(2, bool))
-    recorder = Recorder(fleet, driver, DisturbanceSettings(noisy_share=0.0, pushed_share=0.0), 20.0)
+    cutter = EpisodeCutter(fleet, driver, DisturbanceSettings(noisy_share=0.0, pushed_share=0.0), 20.0)
     told: list[int] = []
-    episodes = list(recorder.episodes(220, told.append))
+    episodes = list(cutter.episodes(220, told.append))
     assert [len(episode.skill) for episode in episodes] == [110, 110]
     assert driver.tick.tolist() == [160, 160]  # their last second is not kept: they may have been falling
     assert told[-1] == 220
@@ -243,9 +246,9 @@ def test_episodes_under_way_end_early_but_whole(robot: Robot) -> None:
 
 def test_policy_that_always_falls_is_given_up(robot: Robot) -> None:
     fleet = Fleet(robot, 2, None, threads=1)
-    recorder = Recorder(fleet, Faller(fleet, 0, np.ones(2, bool)), DisturbanceSettings(), 3.0)
+    cutter = EpisodeCutter(fleet, Faller(fleet, 0, np.ones(2, bool)), DisturbanceSettings(), 3.0)
     with pytest.raises(ConfigError, match="--policy"):
-        list(recorder.episodes(10_000))
+        list(cutter.episodes(10_000))
 
 
 def test_skills_are_asked_as_fast_as_the_robot_goes(robot: Robot) -> None:

@@ -231,9 +231,9 @@ def test_what_cannot_be_measured_is_refused_before_the_data_is_read(
     for committed in ("-1", "17"):
         with pytest.raises(ConfigError, match=f"--committed {committed}: 0 to the horizon of 16"):
             diffusion.main(parser.parse_args([*options, "--committed", committed]))
-    stabilised = replace(load_settings(), stabilise=9)
+    stabilised = replace(load_settings(), stabilization_level=9)
     monkeypatch.setattr("servoid.policy.diffusion.settings.load_settings", lambda: stabilised)
-    with pytest.raises(ConfigError, match="stabilise must be at most 8"):
+    with pytest.raises(ConfigError, match="stabilization_level must be at most 8"):
         diffusion.main(parser.parse_args([*options, "--levels", "8"]))
 
 

@@ -13,18 +13,19 @@ import pytest
 import torch
 
 from servoid.hw.config import ConfigError
+from servoid.hw.contracts.control import Instruction
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.checkpoint import read_header
 from servoid.policy.diffusion.dataset import Windows, read_recording
 from servoid.policy.diffusion.features import raw_mirror, raw_row
+from servoid.policy.diffusion.model.action_space import load_action_space
 from servoid.policy.diffusion.model.checkpoint import load
 from servoid.policy.diffusion.model.config import DenoiserConfig
-from servoid.policy.diffusion.runtime import load_runtime
 from servoid.policy.diffusion.settings import load_settings
 from servoid.policy.latent.actions import load_latents, same_latents
+from servoid.stack.control.diffusion import diffusion_policy
 from servoid.stack.control.fleet import Fleet
-from servoid.tools.learn.envs.planned import PlannedWalker
 from servoid.tools.learn.latent_roundtrip import recoded_survival
 from servoid.tools.learn.survival import closed_loop_survival
 from servoid.tools.learn.trainers import diffusion, latent
@@ -106,18 +107,20 @@ def test_windows_hold_the_latents_of_each_tick_and_its_state(made: Path, synthet
 def driven_by_the_present_state(path: Path) -> None:
     """Between two plans the fleet's latents are decoded with each tick's own state."""
     fleet = Fleet(ROBOT, 2, None)
-    runtime = load_runtime(ROBOT, replace(load_settings(), checkpoint=str(path)))
-    walker, everything = PlannedWalker(fleet, runtime), np.ones(2, bool)
-    fleet.reset(everything)
-    walker.reset(everything)
+    policy, space = (
+        diffusion_policy(ROBOT, replace(load_settings(), checkpoint=str(path)), shape=(2,)),
+        load_action_space(path, ROBOT),
+    )
+    fleet.reset(np.ones(2, bool))
     then = raw_row(fleet.observe())
-    for tick in range(runtime.settings.delay + 3):
+    for tick in range(9):
         row = raw_row(fleet.observe())
-        target = walker.act(np.zeros((2, 3)))
-        planned = walker._plan[:, tick - walker._made]
-        np.testing.assert_array_equal(target, runtime.model.space.decode(row, planned))
+        target = policy.act(fleet.state, fleet.applied, Instruction(np.zeros((2, 3))))
+        if (plan := policy.plans.latest) is not None:
+            planned = plan.actions[:, tick - plan.tick]
+            np.testing.assert_array_equal(target, space.decode(row, planned))
         fleet.step(target)
-    assert np.abs(target - runtime.model.space.decode(then, planned)).max() > 1e-3
+    assert np.abs(target - space.decode(then, planned)).max() > 1e-3
 
 
 def test_a_diffusion_model_learns_to_plan_latents_and_carries_their_decoder(

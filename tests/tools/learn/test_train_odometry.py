@@ -18,7 +18,7 @@ ROBOT = load_robot()
 
 @pytest.fixture(scope="module")
 def recorded() -> dict[str, np.ndarray]:
-    return odometry.record(ROBOT, odometry.driver(ROBOT, "gait"), 6, 4.0, seed=0)
+    return odometry.record(ROBOT, odometry.maker(ROBOT, "gait"), 6, 4.0, seed=0)
 
 
 def test_a_recording_is_what_the_network_will_see(recorded: dict[str, np.ndarray]) -> None:
@@ -70,6 +70,6 @@ def test_the_odometry_that_is_there_is_measured_and_nothing_is_trained(
 
 def test_walks_that_cover_no_metre_do_not_count() -> None:
     """Sway is no path: two seconds of walking sway a metre, and cover none."""
-    result = odometry.drift(ROBOT, odometry.driver(ROBOT, "gait"), None, walks=4, seconds=2.0, seed=1)
+    result = odometry.drift(ROBOT, odometry.maker(ROBOT, "gait"), None, walks=4, seconds=2.0, seed=1)
     assert result.walks == 0
     assert np.isnan(result.p90)

@@ -5,34 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
 from servoid.stack.control.fleet import Fleet
+from servoid.stack.control.gait import GaitPolicy
 from servoid.tools.learn import survival
 
 ROBOT = load_robot()
 
 
-class Still:
-    """Stands."""
-
-    def reset(self, where: Array) -> None:
-        pass
-
-    def act(self, command: Array) -> Array:
-        return np.tile(ROBOT.home, (len(command), 1))
-
-
 def test_robots_that_survival_is_measured_on_are_none_of_the_training_data(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(survival, "_RANDOMISED", 1.0)
-    measured: list[Fleet] = []
-
-    def drive(fleet: Fleet) -> Still:
-        measured.append(fleet)
-        return Still()
-
-    for _ in range(2):
-        survival.survival_of(drive, ROBOT, seconds=0.02, worlds=4, seed=0)
+    measured = [survival.measured_fleet(ROBOT, 4, 0) for _ in range(2)]
+    for fleet in measured:
+        survival.survival_of(GaitPolicy(ROBOT, (4,)), fleet, seconds=0.02)
     collected = Fleet(ROBOT, 4, None, randomise=1.0, seed=0, threads=1)
     collected.reset(np.ones(4, bool))
     bias, again, other = (np.stack([b.gyro_bias for b in f.worlds.bodies]) for f in (*measured, collected))  # type: ignore[union-attr]

@@ -25,7 +25,7 @@ from servoid.tools.common.output import add_json_argument, reporting
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
     from servoid.tools.learn.collect.disturbances import DisturbanceSettings
-    from servoid.tools.learn.collect.episode_cutter import Recorder
+    from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
     from servoid.tools.learn.collect.lerobot import Feature
 
 LICENCE = "Apache-2.0"
@@ -96,19 +96,21 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
     from servoid.hw.robot.description import load_robot
     from servoid.policy.checkpoint import resolve
     from servoid.stack.control.fleet import Fleet
+    from servoid.stack.control.gait import GaitPolicy
+    from servoid.stack.control.tracker import ExpertPolicy
     from servoid.stack.estimation.odometry import load_odometry
     from servoid.tools.learn.collect.disturbances import DisturbanceSettings
-    from servoid.tools.learn.collect.episode_cutter import Recorder
+    from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
     from servoid.tools.learn.collect.lerobot import DatasetWriter
     from servoid.tools.learn.collect.skills import SKILLS
-    from servoid.tools.learn.envs.walker import Walker, load_tracker
 
     begin = time.perf_counter()
     robot = load_robot(args.robot)
-    tracker = None if args.policy == "gait" else load_tracker(robot, args.policy)
+    shape = (args.worlds,)
+    policy = GaitPolicy(robot, shape) if args.policy == "gait" else ExpertPolicy(robot, args.policy, shape)
     odometry = None if args.plain_odometry else load_odometry(robot)
     sources = {
-        "policy": {"name": "gait"} if tracker is None else _source(resolve(args.policy)),
+        "policy": {"name": "gait"} if args.policy == "gait" else _source(resolve(args.policy)),
         "odometry": {"name": "legs"} if odometry is None else _source(resolve("odometry")),
     }
     settings = DisturbanceSettings(scale=(args.noise[0], args.noise[1]))
@@ -122,24 +124,24 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
     )
     with writer:
         fleet = Fleet(robot, args.worlds, odometry, randomise=args.randomise, seed=args.seed, threads=args.threads)
-        recorder = Recorder(fleet, Walker(fleet, tracker), settings, args.seconds)
+        cutter = EpisodeCutter(fleet, policy, settings, args.seconds)
         with tqdm(total=args.frames, desc="walking", unit="frame", mininterval=1.0) as bar:
 
             def progress(total: int) -> None:
                 bar.update(min(total, args.frames) - bar.n)
-                bar.set_postfix_str(f"{recorder.fell} of {recorder.begun} fell", refresh=False)
+                bar.set_postfix_str(f"{cutter.fell} of {cutter.begun} fell", refresh=False)
 
-            for episode in recorder.episodes(args.frames, progress):
+            for episode in cutter.episodes(args.frames, progress):
                 writer.add(episode.columns, episode.skill)
         result = {
             "episodes": writer.episodes,
             "frames": writer.frames,
-            "begun": recorder.begun,
-            "fell": recorder.fell,
-            "fell_share": round(recorder.fell / recorder.begun, 4),
-            "walked_minutes": round(recorder.walked * robot.dt / 60, 2),
+            "begun": cutter.begun,
+            "fell": cutter.fell,
+            "fell_share": round(cutter.fell / cutter.begun, 4),
+            "walked_minutes": round(cutter.walked * robot.dt / 60, 2),
         }
-        writer.finish({"servoid.yaml": _provenance(args, robot, recorder, settings, sources, result)})
+        writer.finish({"servoid.yaml": _provenance(args, robot, cutter, settings, sources, result)})
     return result | {"out": str(args.out), "seconds": round(time.perf_counter() - begin, 1)}
 
 
@@ -167,7 +169,7 @@ def _source(path: Path) -> dict[str, str]:
 def _provenance(
     args: argparse.Namespace,
     robot: Robot,
-    recorder: Recorder,
+    cutter: EpisodeCutter,
     settings: DisturbanceSettings,
     sources: Mapping[str, Any],
     result: Mapping[str, Any],
@@ -195,7 +197,7 @@ def _provenance(
         "options": options,
         **sources,
         "mirroring": MIRRORING,
-        "episodes": {"ticks": recorder.ticks, "dropped_before_fall": FALL_SECONDS, "shortest": SHORTEST_SECONDS},
+        "episodes": {"ticks": cutter.ticks, "dropped_before_fall": FALL_SECONDS, "shortest": SHORTEST_SECONDS},
         "commands": {
             "segment_seconds": {skill.name: list(skill.seconds) for skill in skills},
             "skills": [

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, Policy
 from servoid.policy.diffusion.features import raw_layout, raw_row
 from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.collect.disturbances import Disturbances, DisturbanceSettings
@@ -20,14 +20,6 @@ SHORTEST_SECONDS = 2.0  # of what is left
 _HOPELESS = 20  # ticks walked for one that is kept: no dataset will come of it
 
 
-class Driver(Protocol):
-    """What gives the joint targets: `servoid.tools.learn.envs.walker.Walker`."""
-
-    def reset(self, where: Array) -> None: ...
-
-    def act(self, command: Array) -> Array: ...
-
-
 @dataclass(frozen=True)
 class Episode:
     """Rows of one episode by column `(ticks, size)` float32, and the number of each tick's skill `(ticks,)`."""
@@ -36,7 +28,7 @@ class Episode:
     skill: Array
 
 
-class Recorder:
+class EpisodeCutter:
     """Records a fleet. Row k of an episode holds the state at tick k, and what was decided and done on it.
 
     `observation.state` is the estimate, `action` the expert's target after the limits (the label), `action_applied`
@@ -44,10 +36,10 @@ class Recorder:
     still walking when the last frame is in count as begun.
     """
 
-    def __init__(self, fleet: Fleet, driver: Driver, settings: DisturbanceSettings, seconds: float) -> None:
-        """Episodes end after `seconds`, or with a fall."""
+    def __init__(self, fleet: Fleet, policy: Policy, settings: DisturbanceSettings, seconds: float) -> None:
+        """Episodes end after `seconds`, or with a fall. `policy` is of shape `(fleet.n,)`."""
         robot = fleet.robot
-        self.fleet, self._driver = fleet, driver
+        self.fleet, self._policy = fleet, policy
         self.ticks = round(seconds * robot.rate)
         self._drop, self._shortest = round(FALL_SECONDS * robot.rate), round(SHORTEST_SECONDS * robot.rate)
         if self.ticks < self._drop + self._shortest:
@@ -103,7 +95,7 @@ class Recorder:
         if not len(ids):
             return
         self.fleet.reset(where)
-        self._driver.reset(where)
+        self._policy.reset(where, self.fleet.seeds)
         self._commands.reset(ids)
         self._disturbances.reset(ids, self.fleet.rngs)
         self._length[ids] = 0
@@ -115,7 +107,8 @@ class Recorder:
         self._commands.advance(rngs)
         fleet.worlds.push(self._disturbances.push(rngs))
         command = self._commands.velocity
-        clean = fleet.step(self._driver.act(command), self._disturbances.noise(rngs))
+        target = self._policy.act(state, fleet.applied, Instruction(command))
+        clean = fleet.step(target, self._disturbances.noise(rngs))
         worlds, at = np.arange(fleet.n), self._length
         values = {"observation.state": raw_row(state), "action": clean, "action_applied": fleet.applied}
         for name, value in (values | {"command": command}).items():

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction
 
 if TYPE_CHECKING:
-    from servoid.stack.control.fleet import Fleet
-    from servoid.tools.learn.collect.episode_cutter import Driver
+    from servoid.hw.contracts.control import Policy
 
-    MakeDriver = Callable[[Fleet], Driver]
+    MakePolicy = Callable[..., Policy]  # takes a shape
 
 _CHUNK = 50  # ticks whose mean error is penalised beside each tick's: the mean is what drifts
 _MEAN_WEIGHT = 20.0
@@ -49,18 +49,18 @@ def main(args: argparse.Namespace) -> int:
 
     robot = load_robot(args.robot)
     names = ["gait", *(name for name in args.policy if name != "gait")]
-    drivers = {name: driver(robot, name) for name in names}
+    makers = {name: maker(robot, name) for name in names}
     if args.measure:
-        _measure(robot, drivers, load_odometry(robot), args.seed)
+        _measure(robot, makers, load_odometry(robot), args.seed)
         return 0
     known = _shipped(robot)
     data: dict[str, Array] | None = None
     for i, name in enumerate(names):  # every way of walking slips in its own way
-        part = record(robot, drivers[name], args.worlds // len(names), args.seconds, args.seed + i, known)
+        part = record(robot, makers[name], args.worlds // len(names), args.seconds, args.seed + i, known)
         data = part if data is None else mixed(data, part, args.seed)
     assert data is not None
     network = fit(data, args.steps, args.seed)
-    results = _measure(robot, drivers, network, args.seed)
+    results = _measure(robot, makers, network, args.seed)
     head = checkpoint.header(
         "odometry",
         robot,
@@ -75,12 +75,12 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _measure(robot: Any, drivers: dict[str, MakeDriver], network: Any, seed: int) -> dict[str, float]:
+def _measure(robot: Any, makers: dict[str, MakePolicy], network: Any, seed: int) -> dict[str, float]:
     """Print the drift of each way of walking, by legs alone and corrected; returns what the checkpoint says of it."""
     results = {}
-    for name, drive in drivers.items():
+    for name, make in makers.items():
         for title, odometry in (("legs alone", None), ("corrected", network)):
-            result = drift(robot, drive, odometry, walks=64, seconds=30.0, seed=seed + 1)
+            result = drift(robot, make, odometry, walks=64, seconds=30.0, seed=seed + 1)
             key = f"drift_p90_{name}" + ("_legs_alone" if odometry is None else "")
             results[key] = round(result.p90, 4)
             print(
@@ -102,22 +102,22 @@ def _shipped(robot: Any) -> Any:
         return None
 
 
-def driver(robot: Any, name: str) -> MakeDriver:
-    """What makes a fleet walk, by the policy's name or a checkpoint's file. Raises ConfigError."""
+def maker(robot: Any, name: str) -> MakePolicy:
+    """What makes a policy for worlds of a `shape`, by the policy's name or a checkpoint's file. Raises ConfigError."""
     from servoid.policy.checkpoint import read_header, resolve
-    from servoid.tools.learn.envs.walker import Walker, load_tracker
+    from servoid.stack.control.gait import GaitPolicy
+    from servoid.stack.control.tracker import ExpertPolicy
 
     if name == "gait":
-        return partial(Walker, tracker=None)
+        return partial(GaitPolicy, robot)
     if read_header(resolve(name))["kind"] == "tracker":
-        return partial(Walker, tracker=load_tracker(robot, name))
-    from servoid.policy.diffusion.runtime import load_runtime
+        return partial(ExpertPolicy, robot, name)
     from servoid.policy.diffusion.settings import load_settings
+    from servoid.stack.control.diffusion import diffusion_policy
     from servoid.stack.tasks import load_task
-    from servoid.tools.learn.envs.planned import PlannedWalker
 
     settings = replace(load_settings(), checkpoint=name)
-    return partial(PlannedWalker, runtime=load_runtime(robot, settings, load_task("walk", {}, robot.dt).cost))
+    return partial(diffusion_policy, robot, settings, load_task("walk", {}, robot.dt).objective)
 
 
 def mixed(a: dict[str, Array], b: dict[str, Array], seed: int) -> dict[str, Array]:
@@ -127,7 +127,7 @@ def mixed(a: dict[str, Array], b: dict[str, Array], seed: int) -> dict[str, Arra
 
 
 def record(
-    robot: Any, drive: MakeDriver, worlds: int, seconds: float, seed: int, odometry: Any = None
+    robot: Any, make: MakePolicy, worlds: int, seconds: float, seed: int, odometry: Any = None
 ) -> dict[str, Array]:
     """Walk randomised worlds; returns rows `(n, ticks, features)`, starts `(n, ticks)` and errors `(n, ticks, 3)`."""
     from tqdm import trange
@@ -135,14 +135,14 @@ def record(
     from servoid.stack.control.fleet import Fleet
 
     fleet = Fleet(robot, worlds, odometry, randomise=0.7, seed=seed + 1000)
-    walker = drive(fleet)
+    policy = make(shape=(fleet.n,))
     ticks = round(seconds * robot.rate)
     rows = np.zeros((worlds, ticks, fleet.estimator.features.size), np.float32)
     errors = np.zeros((worlds, ticks, 3), np.float32)
     starts = np.zeros((worlds, ticks), np.int32)
     everything = np.ones(worlds, bool)
     fleet.reset(everything)
-    walker.reset(everything)
+    policy.reset(None, fleet.seeds)
     rng = np.random.default_rng(seed)
     command, start = np.zeros((worlds, 3)), np.zeros(worlds, np.int32)
     noise = rng.uniform(0.0, 0.1, (worlds, 1))
@@ -157,12 +157,12 @@ def record(
         kicked = rng.random(worlds) < 1 / 100
         angle, size = rng.uniform(-np.pi, np.pi, worlds), rng.uniform(0, 0.3, worlds) * kicked
         fleet.worlds.push(np.stack([size * np.cos(angle), size * np.sin(angle)], -1))
-        target = walker.act(command)
+        target = policy.act(fleet.state, fleet.applied, Instruction(command))
         fleet.step(target, noise * rng.standard_normal(target.shape))
         fallen = fleet.truth.fallen
         if fallen.any():
             fleet.reset(fallen)
-            walker.reset(fallen)
+            policy.reset(fallen, fleet.seeds)
             start[fallen] = k + 1
     return {"rows": rows, "starts": starts, "errors": errors}
 
@@ -231,7 +231,7 @@ class Drift:
 
 
 def drift(
-    robot: Any, drive: MakeDriver, odometry: Any, *, walks: int, seconds: float, seed: int, randomise: float = 0.0
+    robot: Any, make: MakePolicy, odometry: Any, *, walks: int, seconds: float, seed: int, randomise: float = 0.0
 ) -> Drift:
     """Walk with commands changed every 5 s and compare the estimate's end with the truth's.
 
@@ -242,10 +242,10 @@ def drift(
     from servoid.stack.control.fleet import Fleet
 
     fleet = Fleet(robot, walks, odometry, randomise=randomise, seed=seed)
-    walker = drive(fleet)
+    policy = make(shape=(fleet.n,))
     everything = np.ones(walks, bool)
     fleet.reset(everything)
-    walker.reset(everything)
+    policy.reset(None, fleet.seeds)
     alive, path, command = everything.copy(), np.zeros(walks), np.zeros((walks, 3))
     turned, start = np.zeros(walks), fleet.truth.position[:, :2].copy()
     last, heading, state = start, fleet.truth.yaw.copy(), fleet.observe()
@@ -254,7 +254,7 @@ def drift(
         if k % (5 * robot.rate) == 0:
             low, high = [-0.1, -0.1, -0.8], [0.3, 0.1, 0.8]
             command = np.array([rng.uniform(low, high) for rng in fleet.rngs])
-        fleet.step(walker.act(command))
+        fleet.step(policy.act(state, fleet.applied, Instruction(command)))
         state = fleet.observe()
         truth = fleet.truth
         if (k + 1) % cycle == 0 or k == ticks - 1:
