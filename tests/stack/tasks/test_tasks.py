@@ -17,6 +17,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
+from servoid.hw.robot.description import load_robot
 from servoid.policy.text.captions import caption
 from servoid.stack.navigation.go_to_point import SpeedProfile
 from servoid.stack.tasks import find, load_settings, load_task, names
