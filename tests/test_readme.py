@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from servoid.hw.config import ConfigError
+from servoid.hw.plugins import is_file_reference
 from servoid.stack import tasks
 from servoid.stack.control.policies import POLICIES
 from servoid.stack.runtime.backends import BACKENDS
@@ -61,9 +62,8 @@ def check(words: list[str], verbs: dict[str, Verb] = VERBS) -> None:
 def look_up(args: Namespace, verb: Verb) -> None:
     """Names that are not placeholders must exist."""
     task = getattr(args, "task", None)
-    if task and task != "TASK":
+    if task and task != "TASK" and not is_file_reference(task):  # which its page writes, and its test runs
         given = settings(args) if hasattr(args, "set") else {}
-        given.pop("gain", None)  # the run's own, not the task's
         tasks.load_settings(task, given)
     if verb.module in ("servoid.tools.commands.run", "servoid.tools.commands.rollout"):
         assert args.policy in POLICIES

@@ -46,6 +46,17 @@ VERBS: dict[str, Verb] = {
             "watch": Verb("watch temperatures, voltages, loads and the bus", "servoid.tools.bringup.watch"),
         },
     ),
+    "motions": Verb(
+        "clips: import, list, play, check, mirror and blend them",
+        verbs={
+            "import": Verb("make a clip from a file", "servoid.tools.motions.verbs.import_clip"),
+            "list": Verb("list the clips of a library", "servoid.tools.motions.verbs.list_clips"),
+            "play": Verb("play a clip open loop in physics", "servoid.tools.motions.verbs.play"),
+            "check": Verb("check joint ranges, speeds and the feet of clips", "servoid.tools.motions.verbs.check"),
+            "mirror": Verb("swap left and right", "servoid.tools.motions.verbs.mirror"),
+            "blend": Verb("join two clips", "servoid.tools.motions.verbs.blend"),
+        },
+    ),
     "collect": Verb("record demonstrations of the expert as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
         "train a network",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -33,11 +34,63 @@ class Trace:
     touched: bool | None = None  # whether the robot touched an obstacle or another robot; None: it cannot know
 
 
+@dataclass(frozen=True)
+class Episode:
+    """What an episode holds, drawn before it begins: data alone. Tasks that draw more extend it."""
+
+    scene: Scene | None = None  # what a simulated world holds beside the robot
+    goal: Array | None = None  # (2,) m in the frame that the robot starts in: where it shall go, where that is a point
+    pushes: Mapping[int, Array] = field(
+        default_factory=dict
+    )  # by tick: change of planar velocity (2,) m/s, world frame
+
+
+class Behaviour(Protocol):
+    """What is asked of a robot, tick by tick, in one run. It may remember what it asked before.
+
+    `stack.tasks.base.BaseBehaviour` answers all but `instruct`.
+    """
+
+    @property
+    def teammates(self) -> Sequence[Behaviour]:
+        """What is asked of the scene's other robots, in their order."""
+        ...
+
+    def percept(self, state: State) -> Percept:
+        """What the task itself tells the robot about its surroundings, where nobody sees them."""
+        ...
+
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction: ...
+
+    def done(self, state: State) -> bool:
+        """Whether the episode may end before its time."""
+        ...
+
+    def lost(self) -> None:
+        """Told when its robot has ended, maybe before the others of the scene."""
+        ...
+
+    def close(self) -> None:
+        """Let go of devices."""
+        ...
+
+
+class Objective(Protocol):
+    """The guidance cost. It depends on nothing but its arguments, and can be sent to a planner's process (pickle)."""
+
+    def __call__(self, trajectory: Any, instruction: Instruction) -> Any:
+        """Cost `(batch,)` of a predicted trajectory (torch), in the heading frame of now."""
+        ...
+
+
 class Task(Protocol):
-    """What the robot shall do. `success` is pure: `run` applies it to the estimate, evaluation to the truth."""
+    """What the robot shall do, in four parts: scenario, behaviour, objective and scoring.
+
+    Scoring is pure: `run` applies it to the estimate, evaluation to the truth. `episode` is what `scenario` drew.
+    """
 
     name: str
-    seconds: float
+    seconds: float  # length of an episode
     settings: Any  # a frozen dataclass, as the task's file and `--set` say
 
     @property
@@ -46,66 +99,37 @@ class Task(Protocol):
         ...
 
     @property
-    def guides(self) -> bool:
-        """Whether `cost` can guide a plan; where it is zero, planners need no gradient of it, and no samples."""
-        ...
-
-    @property
-    def pushes(self) -> bool:
-        """Whether `disturbance` may answer with a push, which only a simulated body can be given."""
-        ...
-
-    @property
-    def counts_undone(self) -> tuple[str, ...]:
+    def counts_undone(self) -> Sequence[str]:
         """Metrics that hold of a run that never began, too."""
         ...
 
-    @property
-    def goal(self) -> Array | None:
-        """Where the robot shall be `(2,)` m in the frame that it starts in, where that is one place."""
+    def scenario(self, rng: np.random.Generator) -> Episode:
+        """Draw an episode; all that is random in it comes from `rng`. Raises ConfigError where there is none."""
+        ...
+
+    def behaviour(self, episode: Any) -> Behaviour:
+        """What is asked in a run of this episode. It opens the devices that it needs. Raises ConfigError."""
         ...
 
     @property
-    def teammates(self) -> tuple[Task, ...]:
-        """The tasks of the scene's other robots, in their order."""
+    def objective(self) -> Objective | None:
+        """The guidance cost; None where it is zero: planners then need no gradient of it, and no samples."""
         ...
 
-    def steer_by(self, velocities: Array, ended: bool) -> None:
-        """Follow a recorded run's velocities `(ticks, 3)`; `ended`: whether with the last one the person ended it."""
-        ...
+    def success(self, trace: Trace, episode: Any) -> bool: ...
 
-    def lost(self) -> None:
-        """Its robot has ended, maybe before the others of the scene."""
-        ...
+    def metrics(self, trace: Trace, episode: Any) -> dict[str, float]: ...
 
-    def close(self) -> None:
-        """Let go of devices."""
-        ...
 
-    def reset(self, rng: np.random.Generator) -> None:
-        """Draw the episode's goal, commands and disturbances."""
-        ...
+@dataclass(frozen=True)
+class Assignment:
+    """A task and the episode of it that a run does, and is judged by."""
 
-    def scene(self) -> Scene | None:
-        """What a simulated world holds in this episode beside the robot; None for nothing."""
-        ...
+    task: Task
+    episode: Episode
 
-    def percept(self, state: State) -> Percept:
-        """What the task itself tells the robot about its surroundings, where nobody sees them."""
-        ...
+    def success(self, trace: Trace) -> bool:
+        return self.task.success(trace, self.episode)
 
-    def disturbance(self, tick: int) -> Array | None:
-        """Change of the base's planar velocity `(2,)` m/s, world frame, to be applied by a simulated body; or None."""
-        ...
-
-    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction: ...
-
-    def cost(self, trajectory: Any, instruction: Instruction) -> Any:
-        """Guidance cost `(batch,)` of a predicted trajectory (torch), in the heading frame of now."""
-        ...
-
-    def done(self, state: State) -> bool: ...
-
-    def success(self, trace: Trace) -> bool: ...
-
-    def metrics(self, trace: Trace) -> dict[str, float]: ...
+    def metrics(self, trace: Trace) -> dict[str, float]:
+        return self.task.metrics(trace, self.episode)

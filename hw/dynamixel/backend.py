@@ -12,14 +12,14 @@ from contextlib import ExitStack
 from servoid.hw.clock import WallClock
 from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import BackendError, Clock
-from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY, Bus, Counters
 from servoid.hw.dynamixel.guardian_client import Lifeline
 from servoid.hw.dynamixel.motors import DynamixelMotors, TorqueUnproven
-from servoid.hw.dynamixel.port import Port, SerialPort
-from servoid.hw.dynamixel.register_check import Difference, as_table, compare, correct, find_board, find_servos
+from servoid.hw.dynamixel.protocol.units import Units
 from servoid.hw.dynamixel.sensors import DynamixelSensors, present
-from servoid.hw.dynamixel.servo_monitor import ServoMonitor
-from servoid.hw.dynamixel.units import Units
+from servoid.hw.dynamixel.servos.register_check import Difference, as_table, compare, correct, find_board, find_servos
+from servoid.hw.dynamixel.servos.servo_monitor import ServoMonitor
+from servoid.hw.dynamixel.transport.bus import LONGEST_RETURN_DELAY, Bus, Counters
+from servoid.hw.dynamixel.transport.port import Port, SerialPort
 from servoid.hw.imu.serial_imu import SerialImu
 from servoid.hw.robot.description import Robot
 

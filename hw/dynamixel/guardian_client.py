@@ -12,10 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from servoid.hw.contracts.body import BackendError
-from servoid.hw.dynamixel import codec, guardian
-from servoid.hw.dynamixel.codec import ALERT, OVERHEAD
-from servoid.hw.dynamixel.port import SerialPort
-from servoid.hw.dynamixel.tables import ControlTable
+from servoid.hw.dynamixel import guardian
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import ALERT, OVERHEAD
+from servoid.hw.dynamixel.protocol.tables import ControlTable
+from servoid.hw.dynamixel.transport.port import SerialPort
 
 READY_SECONDS = 5.0  # that a busy machine may take to start it; torque waits for that
 CLOSE_SECONDS = guardian.GIVE_UP_SECONDS + 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from servoid.hw.dynamixel.tables import ControlTable
+from servoid.hw.dynamixel.protocol.tables import ControlTable
 from servoid.hw.faults import IMU_DEAD, IMU_FROZEN, IMU_SILENT
 from servoid.hw.imu.mounting import Mounting
 from servoid.hw.imu.reading import Reading

@@ -8,14 +8,15 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from servoid.hw.contracts.body import Array, BackendError, Command, Mode
-from servoid.hw.dynamixel import arming, codec
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.codec import SyncWriter
-from servoid.hw.dynamixel.group_read import GroupRead
 from servoid.hw.dynamixel.guardian_client import Lifeline
-from servoid.hw.dynamixel.register_check import Found
-from servoid.hw.dynamixel.servo_monitor import ServoMonitor
-from servoid.hw.dynamixel.units import Units
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import SyncWriter
+from servoid.hw.dynamixel.protocol.units import Units
+from servoid.hw.dynamixel.servos import arming
+from servoid.hw.dynamixel.servos.register_check import Found
+from servoid.hw.dynamixel.servos.servo_monitor import ServoMonitor
+from servoid.hw.dynamixel.transport.bus import Bus
+from servoid.hw.dynamixel.transport.group_read import GroupRead
 from servoid.hw.faults import describe
 
 WATCHDOG = 4  # of 20 ms: a servo that hears nothing for so long stops by itself
@@ -174,7 +175,7 @@ class DynamixelMotors:
     def _differing(self, values: Sequence[arming.Values], place: tuple[int, int]) -> list[list[str]]:
         """Of each joint, the registers that do not read back; `place` is the address and length of what is read."""
         group = GroupRead([(id, *place) for id in self._ids])
-        self._bus.read_group(group)
+        self._bus.sync_read(group)
         return [
             arming.differing(servo, wanted, data, place[0])
             for servo, wanted, data in zip(self._found, values, group.data, strict=True)
@@ -192,7 +193,7 @@ class DynamixelMotors:
     def _goals_here(self) -> Array:
         """Goal ticks `(n_joints,)` at the position of now, within a turn and the servo's own limits."""
         for _ in self._attempts(ON_SECONDS):
-            self._bus.read_group(self._present)
+            self._bus.sync_read(self._present)
             if all(self._present.fresh):
                 break
         if lost := [i for i, fresh in enumerate(self._present.fresh) if not fresh]:
@@ -223,7 +224,7 @@ class DynamixelMotors:
         start = self._torque.address
         end = self._watchdog.end if watchdog else self._torque.end
         group = GroupRead([(self._ids[i], start, end - start) for i in joints])
-        self._bus.read_group(group)
+        self._bus.sync_read(group)
         return [
             i
             for i, data in zip(joints, group.data, strict=True)

@@ -7,13 +7,13 @@ from collections import deque
 import numpy as np
 
 from servoid.hw.contracts.body import Observation
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.group_read import GroupRead
 from servoid.hw.dynamixel.imu import BUTTONS, BoardImu
-from servoid.hw.dynamixel.register_check import Found
-from servoid.hw.dynamixel.servo_monitor import ServoMonitor
-from servoid.hw.dynamixel.tables import table
-from servoid.hw.dynamixel.units import Units
+from servoid.hw.dynamixel.protocol.tables import table
+from servoid.hw.dynamixel.protocol.units import Units
+from servoid.hw.dynamixel.servos.register_check import Found
+from servoid.hw.dynamixel.servos.servo_monitor import ServoMonitor
+from servoid.hw.dynamixel.transport.bus import Bus
+from servoid.hw.dynamixel.transport.group_read import GroupRead
 from servoid.hw.faults import LATE
 from servoid.hw.imu.mounting import Mounting
 from servoid.hw.imu.serial_imu import SerialImu
@@ -55,7 +55,7 @@ class DynamixelSensors:
         """All joints, the IMU, and a few servos' slow registers. A value that did not come at this tick is NaN."""
         bus, group = self._bus, self._present
         lost, stray = bus.counters.lost, bus.counters.stray
-        bus.read_groups((group, self._board))
+        bus.sync_read(group, self._board)
         position, velocity, current = self._decode()
         fresh = self._board.fresh[0]
         reading = self._block.update(self._board.data[0] if fresh else None, self._board.time_ns[0])

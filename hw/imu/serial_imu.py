@@ -10,7 +10,7 @@ import numpy as np
 
 from servoid.hw.clock import WallClock
 from servoid.hw.contracts.body import BackendError, Clock
-from servoid.hw.dynamixel.port import Port, SerialPort
+from servoid.hw.dynamixel.transport.port import Port, SerialPort
 from servoid.hw.faults import IMU_DEAD, IMU_FROZEN, IMU_SILENT
 from servoid.hw.imu.bno08x import Bno08x
 from servoid.hw.imu.mounting import Mounting

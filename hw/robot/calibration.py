@@ -17,8 +17,8 @@ from urllib.parse import quote
 import yaml
 
 from servoid.hw.config import ConfigError, load_marked, nearest
-from servoid.hw.dynamixel.tables import table
-from servoid.hw.dynamixel.units import Units
+from servoid.hw.dynamixel.protocol.tables import table
+from servoid.hw.dynamixel.protocol.units import Units
 from servoid.hw.robot.description import Robot
 
 

@@ -151,7 +151,7 @@ def diffusion_policy(
 ) -> DiffusionPolicy:
     """The diffusion policy for `robot`, by default as configs/policies/diffusion.yaml says; `shape`: of many worlds.
 
-    `cost` guides its plans, `Task.cost` for one; with `process`, which is for real time, it must be picklable and
+    `cost` guides its plans, `Task.objective` for one; with `process`, which is for real time, it must be picklable and
     depend on nothing but its arguments. Raises ConfigError, also where checkpoint, settings and robot do not fit.
     """
     settings = settings or load_settings()

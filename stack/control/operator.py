@@ -146,22 +146,6 @@ class Keyboard:
                 self._way[part] = np.clip(self._way[part] + change, -1.0, 1.0)
 
 
-class Recorded:
-    """Wishes of a recorded run, one a tick. `ended`: whether with the last one the person ended the run."""
-
-    def __init__(self, ways: Array, ended: bool) -> None:
-        self._ways, self._ended, self._next = ways, ended, 0
-
-    def read(self) -> Wish:
-        if self._next >= len(self._ways):
-            return Wish(np.zeros(3), self._ended)
-        self._next += 1
-        return Wish(self._ways[self._next - 1], self._ended and self._next == len(self._ways))
-
-    def close(self) -> None:
-        self._next = len(self._ways)
-
-
 def open_steering(device: str) -> Steering:
     """The device of that kind: gamepad, keyboard, or auto for the first that is there. Raises ConfigError."""
     if device == "keyboard":

@@ -1,4 +1,7 @@
-"""Policies by name, imported when they are asked for; or from a file of one's own."""
+"""Policies by name, imported when they are asked for; of a checkpoint or a file of settings; or a user's own.
+
+Those are found like tasks: by an entry point of the group `servoid.policies`, or as `FILE.py:Class`.
+"""
 
 from __future__ import annotations
 
@@ -10,18 +13,21 @@ from typing import TYPE_CHECKING, Any
 from servoid.hw.config import ConfigError, nearest
 from servoid.hw.contracts.control import Policy
 from servoid.hw.contracts.task import Task
+from servoid.hw.plugins import Plugin, Portable, installed, load_plugin
 from servoid.hw.robot.description import Robot
+from servoid.stack.control.base import BasePolicy
 
 if TYPE_CHECKING:
     from servoid.policy.diffusion.settings import DiffusionSettings
 
 Maker = Callable[[str, Robot, Task, bool], Policy]
+GROUP = "servoid.policies"  # of entry points
 
 
 def _diffusion(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     from servoid.stack.control.diffusion import diffusion_policy
 
-    cost = task.cost if task.guides else None
+    cost: Any = Portable(task.objective) if realtime else task.objective
     return diffusion_policy(robot, _planner(source), cost, process=realtime)
 
 
@@ -51,6 +57,21 @@ POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "gait"
 _KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert}  # of checkpoints
 
 
+def _own(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
+    """A policy of a user's own. Raises ConfigError with file and line where it cannot be made so."""
+    plugin = _plugin(source)
+    assert plugin is not None
+    try:
+        policy: Policy = plugin.cls(robot)
+    except TypeError as error:
+        raise plugin.error(f"{plugin.cls.__name__}(robot): {error}") from error
+    return policy
+
+
+def _plugin(name: str) -> Plugin | None:
+    return load_plugin(name, GROUP, BasePolicy, "policy")
+
+
 def check_policy(name: str) -> None:
     """Raises ConfigError, for an unknown name with the nearest one."""
     _maker(name)
@@ -59,27 +80,33 @@ def check_policy(name: str) -> None:
 def make_policy(name: str, robot: Robot, task: Task, realtime: bool) -> Policy:
     """A policy for a robot and a task. Raises ConfigError for an unknown name, or for a checkpoint that does not fit.
 
-    `name` is one of POLICIES, the .safetensors file of a diffusion model or a tracker, or a .yaml file of diffusion
-    settings. With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is for.
+    `name` is one of POLICIES, the .safetensors file of a diffusion model or a tracker, a .yaml file of diffusion
+    settings, an installed package's, or `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it
+    answers at the tick that its plan is for.
     """
     return _maker(name)(name, robot, task, realtime)
 
 
 def policy_fingerprint(name: str) -> dict[str, Any]:
     """Name of a policy and what it is made of, for the flight log: its checkpoint and that of odometry by their hashes,
-    settings of the planner or of the gait. None for what it has not. Raises ConfigError."""
+    settings of the planner or of the gait, and the file of a user's own. None for what it has not. Raises ConfigError.
+    """
     from servoid.policy.checkpoint import resolve
     from servoid.policy.references.gait import load_gait
     from servoid.stack.log.provenance import described, sha256
 
-    planner = _planner(name) if _maker(name) is _diffusion else None
-    checkpoint = None if name == "gait" else resolve(name if planner is None else planner.checkpoint)
+    maker = _maker(name)
+    planner = _planner(name) if maker is _diffusion else None
+    own = _plugin(name) if maker is _own else None
+    named = name if maker is _expert else None if planner is None else planner.checkpoint
+    checkpoint = None if named is None else resolve(named)
     return {
         "name": name,
         "checkpoint_sha256": None if checkpoint is None else sha256(checkpoint),
         "odometry_sha256": sha256(resolve("odometry")),
         "planner": None if planner is None else described(planner),
-        "gait": described(load_gait()) if planner is None else None,
+        "gait": described(load_gait()) if maker in (_gait, _expert) else None,
+        "source": None if own is None else own.source(),
     }
 
 
@@ -95,4 +122,6 @@ def _maker(name: str) -> Maker:
         if kind not in _KINDS:
             raise ConfigError(f"{name}: a checkpoint of kind '{kind}' is no policy; there are {', '.join(_KINDS)}")
         return _KINDS[kind]
-    raise ConfigError(f"unknown policy '{name}': {nearest(name, POLICIES)}")
+    if _plugin(name) is not None:
+        return _own
+    raise ConfigError(f"unknown policy '{name}': {nearest(name, (*POLICIES, *installed(GROUP)))}")

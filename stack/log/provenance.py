@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from servoid.hw.contracts.task import Task
+from servoid.hw.contracts.task import Assignment
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import git_commit
 from servoid.stack.log.format import FORMAT, plain
@@ -18,20 +18,28 @@ from servoid.stack.log.format import FORMAT, plain
 PACKAGES = ("servoid", "numpy", "mujoco", "torch", "mcap")
 
 
-def header(settings: Any, robot: Robot, task: Task, body: str, policy: dict[str, Any]) -> dict[str, Any]:
+def header(
+    settings: Any,
+    robot: Robot,
+    assignment: Assignment,
+    source: dict[str, Any] | None,
+    body: str,
+    policy: dict[str, Any],
+) -> dict[str, Any]:
     """Everything that repeating a run needs, and what the repetition is checked against.
 
-    `body` is the backend's name; `policy` holds at least a name. Both may be others than the settings say, where a
-    program brought its own.
+    `source` says where a task of a user's own came from. `body` is the backend's name; `policy` holds at least a name.
+    Both may be others than the settings say, where a program brought its own.
     """
     return {
         "format": FORMAT,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "settings": plain(dataclasses.asdict(settings)),
         "seed": settings.seed,
-        "task": {"name": task.name} | described(task.settings),
-        "task_files": files(task.settings),
-        "scene": described(task.scene()) or None,
+        "task": {"name": assignment.task.name} | described(assignment.task.settings),
+        "task_files": files(assignment.task.settings),
+        "task_source": source,
+        "scene": described(assignment.episode.scene) or None,
         **fingerprint(robot),
         "backend": body,
         "policy": policy,

@@ -4,30 +4,29 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.setting import Setting, check
 
 _WAYS = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 25)  # rad to the left of the goal
 
 
 @dataclass(frozen=True)
-class Passing:
-    apart: float = 0.42  # m between the middles of two robots that pass
-    fade: float = 0.04  # m nearer than that which is as bad as turning by 90 degrees
-    horizon: float = 4.0  # s that the robot looks ahead
-    window: float = 0.96  # s over which the others' velocity is taken: two cycles of the gait, which sways
-    right: float = 0.1  # how much worse it is to pass on the left: who meets head-on must not choose alike
-    steady: float = 0.1  # how much worse it is to turn by a radian from the way that was chosen before
+class AvoidanceSettings:
+    apart: Annotated[float, Setting("distance between the middles of two robots that pass", "m", above=0)] = 0.42
+    fade: Annotated[float, Setting("nearer than that which is as bad as a detour of 90 degrees", "m", above=0)] = 0.04
+    horizon: Annotated[float, Setting("how far ahead the robot looks", "s", above=0)] = 4.0
+    # Two cycles of the gait, which sways.
+    window: Annotated[float, Setting("time over which the others' velocity is measured", "s", above=0)] = 0.96
+    # Two who meet head-on must not choose alike.
+    right: Annotated[float, Setting("how much worse it is to pass on the left", least=0)] = 0.1
+    steady: Annotated[float, Setting("how much worse it is to change the way by a radian", least=0)] = 0.1
 
     def __post_init__(self) -> None:
-        for key in ("apart", "fade", "horizon", "window"):
-            if getattr(self, key) <= 0.0:
-                raise ValueError(f"{key}: must be positive")
-        for key in ("right", "steady"):
-            if getattr(self, key) < 0.0:
-                raise ValueError(f"{key}: must not be negative")
+        check(self)
 
 
 class Motion:
@@ -45,7 +44,7 @@ class Motion:
         return result
 
 
-def way(goal: Array, others: Array, speed: float, before: float, passing: Passing) -> float:
+def bearing_past(goal: Array, others: Array, speed: float, before: float, passing: AvoidanceSettings) -> float:
     """Bearing [rad] to walk at, past `others` `(n, 4)`, x, y m and their velocity m/s, to `goal` `(2,)` m.
 
     All are in one frame with the robot at its origin, and so is `before`, the bearing that was chosen last. Of straight

@@ -1,39 +1,36 @@
-"""The speed profile toward a point: turn to it, walk ahead, and take small steps in any direction when it is near."""
+"""The velocity that goes to a point: turn to it, walk ahead, and take small steps in any direction when it is near."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.setting import Setting, check
 
 
 @dataclass(frozen=True)
-class Approach:
-    speed: float = 0.25  # m/s forward, far from the goal
-    creep: float = 0.12  # m/s that a walking robot keeps to until it stops: slower steps hardly move it
-    reverse: float = 0.08  # m/s backward at most, near the goal
-    lateral: float = 0.08  # m/s to either side at most, near the goal
-    yaw_rate: float = 0.8  # rad/s at most
-    turn_gain: float = 1.5  # rad/s per rad of bearing
-    turn_first: float = 1.0  # rad of bearing from which the robot turns on the spot
-    brake: float = 0.4  # m from the goal at which to slow down
-    near: float = 0.0  # m from the goal within which steps go in any direction
+class SpeedProfile:
+    speed: Annotated[float, Setting("forward speed far from the goal", "m/s", above=0)] = 0.25
+    creep: Annotated[float, Setting("slowest walk before the stop: slower steps hardly move it", "m/s", above=0)] = 0.12
+    reverse: Annotated[float, Setting("fastest step backward, near the goal", "m/s", least=0)] = 0.08
+    lateral: Annotated[float, Setting("fastest step to either side, near the goal", "m/s", least=0)] = 0.08
+    yaw_rate: Annotated[float, Setting("fastest turn", "rad/s", above=0)] = 0.8
+    turn_gain: Annotated[float, Setting("turning rate for each rad of bearing", "1/s", above=0)] = 1.5
+    turn_first: Annotated[float, Setting("bearing from which the robot turns on the spot", "rad", above=0)] = 1.0
+    brake: Annotated[float, Setting("distance from the goal at which to slow down", "m", above=0)] = 0.4
+    near: Annotated[float, Setting("distance within which steps go in any direction", "m", least=0)] = 0.0
 
     def __post_init__(self) -> None:
-        for key in ("speed", "creep", "yaw_rate", "turn_gain", "turn_first", "brake"):
-            if getattr(self, key) <= 0.0:
-                raise ValueError(f"{key}: must be positive")
-        for key in ("reverse", "lateral", "near"):
-            if getattr(self, key) < 0.0:
-                raise ValueError(f"{key}: must not be negative")
+        check(self)
         if self.creep > self.speed:
             raise ValueError(f"creep: {self.creep:g} m/s is faster than speed ({self.speed:g} m/s)")
 
 
-def approach(goal: Array, profile: Approach) -> Array:
+def go_to_point(goal: Array, profile: SpeedProfile) -> Array:
     """Velocity command `(3,)` m/s forward, m/s left, rad/s toward `goal` `(2,)` m, both in the heading frame."""
     distance, bearing = math.hypot(goal[0], goal[1]), math.atan2(goal[1], goal[0])
     speed = max(profile.speed * min(distance / profile.brake, 1.0), profile.creep)

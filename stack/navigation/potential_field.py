@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.setting import Setting, check
 
 _CELL = 0.05  # m
 _ROOM = 0.5  # m around everything
@@ -16,18 +18,16 @@ _NEIGHBOURS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 
 @dataclass(frozen=True)
 class FieldSettings:
-    body: float = 0.17  # m from the middle of the robot to its side
-    strength: float = 4.0  # times dearer is a cell beside an obstacle than one far off
-    fade: float = 0.08  # m over which that falls to 1/e
-    step: float = 0.2  # m that the robot looks down the field
+    body: Annotated[float, Setting("distance from the middle of the robot to its side", "m", above=0)] = 0.17
+    strength: Annotated[float, Setting("how many times dearer a way beside an obstacle is", above=0)] = 4.0
+    fade: Annotated[float, Setting("distance over which that falls to 1/e", "m", above=0)] = 0.08
+    step: Annotated[float, Setting("how far the robot looks down the field", "m", above=0)] = 0.2
 
     def __post_init__(self) -> None:
-        for key in ("body", "strength", "fade", "step"):
-            if getattr(self, key) <= 0.0:
-                raise ValueError(f"{key}: must be positive")
+        check(self)
 
 
-class Field:
+class PotentialField:
     """The cost of the cheapest way to `goal` `(2,)` m from each cell of a grid, among `obstacles` `(n, 3)` m.
 
     A metre costs `1 + strength exp(-(d - body) / fade)`, d being the distance from the nearest obstacle. The grid

@@ -1,12 +1,19 @@
-"""What the robot is asked to do. A task is a small class and a file of settings, `configs/tasks/<name>.yaml`."""
+"""What the robot is asked to do: a class, and settings in `configs/tasks/<name>.yaml` or in the class's defaults alone.
+
+Others come from installed packages, by entry points of the group `servoid.tasks`, or from a file: `FILE.py:Class`.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
 
 from servoid.hw.config import ConfigError, load_yaml, nearest, resolve
 from servoid.hw.contracts.task import Task
 from servoid.hw.overrides import override
+from servoid.hw.plugins import Plugin, installed, load_plugin
 from servoid.hw.robot.description import Robot
-from servoid.stack.tasks.base import BaseTask, Settings
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 from servoid.stack.tasks.cross import Cross
 from servoid.stack.tasks.forest import Forest
 from servoid.stack.tasks.goal import Goal
@@ -20,53 +27,86 @@ from servoid.stack.tasks.text import Text
 from servoid.stack.tasks.velocity import Velocity
 from servoid.stack.tasks.walk import Walk
 
+GROUP = "servoid.tasks"  # of entry points
+
+
+@dataclass(frozen=True)
+class Known:
+    """A task that can be run: its class, by what name, and where it came from."""
+
+    name: str
+    cls: type[BaseTask]
+    description: str
+    plugin: Plugin | None = None  # None: one of Servoid's own
+
+
 _CLASSES: tuple[type[BaseTask], ...] = (
     Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Cross, Inbetween, Survive, Text, Steer,
 )  # fmt: skip
-_TASKS: dict[str, tuple[type[BaseTask], str]] = {
-    **{task.name: (task, task.description) for task in _CLASSES},
-    # The same classes by other files of settings.
-    "goal-near": (Goal, "walk to a near point"),
-    "goal-far": (Goal, "walk to a far point"),
-    "perturb": (Walk, "walk ahead while being pushed once a second"),
+_OWN: dict[str, Known] = {
+    **{cls.name: Known(cls.name, cls, cls.description) for cls in _CLASSES},
+    # The same classes with other files of settings.
+    "goal-near": Known("goal-near", Goal, "walk to a near point"),
+    "goal-far": Known("goal-far", Goal, "walk to a far point"),
+    "perturb": Known("perturb", Walk, "walk ahead while being pushed once a second"),
 }
 
 
 def names() -> tuple[str, ...]:
-    """Names of all tasks, in the order in which they are best tried."""
-    return tuple(_TASKS)
+    """Names of all tasks, Servoid's own first, in the order in which they are best tried."""
+    return (*_OWN, *(name for name in installed(GROUP) if name not in _OWN))
 
 
-def task_class(name: str) -> type[BaseTask]:
-    """The class of a task. Raises ConfigError with the nearest name."""
-    if name not in _TASKS:
-        raise ConfigError(f"unknown task '{name}': {nearest(name, _TASKS)}")
-    return _TASKS[name][0]
+def find(name: str) -> Known:
+    """The task of that name, or of a file: `FILE.py:Class`. Servoid's own hide others of their names.
+
+    Raises ConfigError with the nearest name, or with what is wrong with a class of a user's own.
+    """
+    if name in _OWN:
+        return _OWN[name]
+    plugin = load_plugin(name, GROUP, BaseTask, "task")
+    if plugin is None:
+        raise ConfigError(f"unknown task '{name}': {nearest(name, names())}")
+    own = {key: getattr(plugin.cls, key, None) for key in ("name", "description")}
+    for key, text in own.items():
+        if not isinstance(text, str):
+            raise plugin.error(f'{plugin.cls.__name__}: no {key}: add a line such as {key} = "..."')
+    return Known(str(own["name"]), plugin.cls, str(own["description"]), plugin)
 
 
-def description(name: str) -> str:
-    """What a task asks, in a few words. Raises ConfigError with the nearest name."""
-    task_class(name)
-    return _TASKS[name][1]
+def source(name: str) -> dict[str, Any] | None:
+    """Where a task of a user's own came from, for the flight log; None for one of Servoid's. Raises ConfigError."""
+    known = find(name)
+    return None if known.plugin is None else known.plugin.source()
 
 
-def load_settings(name: str, settings: dict[str, str] | None = None) -> Settings:
-    """A task's settings from its file, overridden by text as given to `--set key=value`. Raises ConfigError."""
-    cls = task_class(name)
-    base = load_yaml(resolve("tasks", name), cls.settings_type)
-    return override(base, cls.complete(settings or {}), beside=("gain",))  # which a run takes for the servos
+def load_settings(name: str, settings: dict[str, str] | None = None) -> Any:
+    """A task's settings, from its file or its class, with those changed that `--set key=value` gives as text.
+
+    Raises ConfigError.
+    """
+    known = find(name)
+    base: Settings
+    if known.plugin is None:
+        base = load_yaml(resolve("tasks", name), known.cls.settings_type)
+    else:
+        try:
+            base = known.cls.settings_type()
+        except (TypeError, ValueError) as error:
+            raise known.plugin.error(f"the defaults of {known.cls.settings_type.__name__}: {error}") from error
+    typed = known.cls.settings_type.completed(settings or {})
+    return override(base, typed)
 
 
 def load_task(name: str, settings: dict[str, str] | None = None, dt: float = 0.02, robot: Robot | None = None) -> Task:
-    """A task for one robot, to be `reset` before each episode. `dt` is the length of a control tick [s].
+    """A task for one robot. `dt` is the length of a control tick [s].
 
     Raises ConfigError for an unknown task or setting, a value that does not parse, or what `robot` cannot do.
     """
-    task = task_class(name)(load_settings(name, settings), dt)
-    task.name = name
-    if robot is not None:
-        task.check(robot)
+    known = find(name)
+    task = known.cls(load_settings(name, settings), dt, robot)
+    task.name = known.name
     return task
 
 
-__all__ = ["BaseTask", "Settings", "description", "load_settings", "load_task", "names", "task_class"]
+__all__ = ["BaseBehaviour", "BaseTask", "Known", "Settings", "find", "load_settings", "load_task", "names", "source"]

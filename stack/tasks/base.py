@@ -1,119 +1,96 @@
-"""What all tasks share: settings, and a body that no disturbance touches and that perceives nothing."""
+"""What tasks are made of: settings, and a task whose robot is given a goal at most, that nothing pushes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Task, Trace
-from servoid.hw.contracts.world import Percept, Scene
+from servoid.hw.contracts.task import Behaviour, Episode, Objective, Trace
+from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot
-from servoid.stack.tasks.guidance import Trajectory, Weights, total_cost
-
-Range = tuple[float, float]
+from servoid.hw.setting import Setting, check
+from servoid.stack.tasks.guidance import Weights, total_cost
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of every task. The text beside a field is what `servoid tasks` shows."""
+    """Settings of every task; `servoid tasks` shows what is said beside them. Raises ValueError outside a range."""
 
-    seconds: Annotated[float, "s, length of the episode"]
-    cost: Annotated[Weights, "weights of the guidance cost"] = field(default_factory=Weights)
+    seconds: Annotated[float, Setting("length of an episode", "s", above=0)] = 60.0
+    cost: Weights = field(default_factory=Weights)  # of the guidance cost
 
     def __post_init__(self) -> None:
-        require_positive(self, "seconds")
+        check(self)
+
+    @staticmethod
+    def completed(typed: dict[str, str]) -> dict[str, str]:
+        """Settings as typed on a command line, with those that follow from them."""
+        return typed
 
 
 class BaseTask:
-    """One robot's task over one episode at a time. Implements the Task protocol but for what is asked and `success`."""
+    """A task but for what is asked and how a run is judged."""
 
     name: str
     description: str
     settings_type: ClassVar[type[Settings]] = Settings
     steered: ClassVar[bool] = False  # by a person, who needs real time
     counts_undone: ClassVar[tuple[str, ...]] = ()  # metrics that hold of a run that never began, too
-    goal: Array | None = None  # (2,) m in the frame that the robot starts in, where it shall be in one place
-    teammates: tuple[Task, ...] = ()  # the tasks of the scene's other robots
+    guided_by_velocity_alone: ClassVar[bool] = False  # whether no other term of the cost is about its instructions
 
-    def __init__(self, settings: Any, dt: float) -> None:
-        self.settings = settings
-        self.dt = dt
+    def __init__(self, settings: Any, dt: float, robot: Robot | None = None) -> None:
+        """`dt` is the length of a control tick [s]. Raises ConfigError for what cannot be done, or not by `robot`."""
+        self.settings, self.dt, self.robot = settings, dt, robot
         self.seconds: float = settings.seconds
 
-    @staticmethod
-    def complete(settings: dict[str, str]) -> dict[str, str]:
-        """Settings as typed, with those that follow from them."""
-        return settings
+    def ticks(self, seconds: float) -> int:
+        """The nearest number of ticks, at least one."""
+        return max(round(seconds / self.dt), 1)
 
-    def steer_by(self, velocities: Array, ended: bool) -> None:
-        """Follow a recorded run's velocities `(ticks, 3)`; `ended`: whether with the last one the person ended it."""
+    def scenario(self, rng: np.random.Generator) -> Episode:
+        """Draw an episode; all that is random in it comes from `rng`."""
+        return Episode()
 
-    def reset(self, rng: np.random.Generator) -> None:
-        """Draw the episode. All randomness of a task comes from `rng`."""
-
-    def lost(self) -> None:
-        """The task's robot has ended, maybe before the others of the scene."""
-
-    def close(self) -> None:
-        """Let go of devices."""
-
-    def check(self, robot: Robot) -> None:
-        """Raise ConfigError where the settings ask for what `robot` cannot do."""
-
-    def scene(self) -> Scene | None:
-        """What a simulated world holds in this episode beside the robot; None for nothing."""
-        return None
-
-    def percept(self, state: State) -> Percept:
-        """What the task itself tells the robot about its surroundings at `state`."""
-        return Percept(source="task", age=0.0)
-
-    def disturbance(self, tick: int) -> Array | None:
-        """Change of the base's planar velocity `(2,)` m/s in the world frame at `tick`, or None."""
-        return None
-
-    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
+    def behaviour(self, episode: Any) -> Behaviour:
         raise NotImplementedError(f"task {self.name} asks for nothing")
 
-    def cost(self, trajectory: Trajectory, instruction: Instruction) -> Any:
-        """Guidance cost `(batch,)`: the weighted sum of what the instruction holds (see `guidance.total_cost`)."""
-        return total_cost(trajectory, instruction, self.settings.cost)
-
     @property
-    def guides(self) -> bool:
-        """Whether its cost can guide a plan; where it is zero, planners need no gradient of it, and no samples."""
-        return True
+    def objective(self) -> Objective | None:
+        """The weighted sum of what an instruction holds (`guidance.total_cost`); None where it is always zero."""
+        weights: Weights = self.settings.cost
+        return None if self.guided_by_velocity_alone and not weights.twist else partial(total_cost, weights=weights)
 
-    @property
-    def pushes(self) -> bool:
-        """Whether `disturbance` may answer with a push, which only a simulated body can be given."""
-        return False
+    def success(self, trace: Trace, episode: Any) -> bool:
+        raise NotImplementedError(f"task {self.name} does not say what success is")
 
-    def done(self, state: State) -> bool:
-        """Whether the episode may end before its time."""
-        return False
-
-    def success(self, trace: Trace) -> bool:
-        raise NotImplementedError(f"task {self.name} has no measure of success")
-
-    def metrics(self, trace: Trace) -> dict[str, float]:
+    def metrics(self, trace: Trace, episode: Any) -> dict[str, float]:
         return {}
 
 
-def require_positive(settings: Any, *keys: str) -> None:
-    """Raise ValueError for the first setting that is not positive."""
-    for key in keys:
-        if getattr(settings, key) <= 0.0:
-            raise ValueError(f"{key}: must be positive, not {getattr(settings, key):g}")
+class BaseBehaviour:
+    """Knows the goal of its episode, and goes on until the time is over. Implements Behaviour but for `instruct`."""
 
+    teammates: tuple[Behaviour, ...] = ()
 
-def require_ranges(settings: Any, *keys: str) -> None:
-    """Raise ValueError for the first range whose low end is above its high end."""
-    for key in keys:
-        low, high = getattr(settings, key)
-        if low > high:
-            raise ValueError(f"{key}: upside down: {low:g} is above {high:g}; write low before high")
+    def __init__(self, episode: Episode) -> None:
+        self.episode: Any = episode
+
+    def percept(self, state: State) -> Percept:
+        goal = self.episode.goal
+        return Percept(source="task", age=0.0, goal=None if goal is None else goal.copy())
+
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
+        raise NotImplementedError("a behaviour says what is asked")
+
+    def done(self, state: State) -> bool:
+        return False
+
+    def lost(self) -> None:
+        """Its robot has ended; nobody else waits for it."""
+
+    def close(self) -> None:
+        """There is nothing to let go of."""

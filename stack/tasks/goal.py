@@ -12,40 +12,33 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
+from servoid.hw.robot.description import Robot
+from servoid.hw.setting import Range, Setting
 from servoid.policy.text.captions import twist_of
-from servoid.stack.navigation.go_to_point import Approach, approach
+from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.tasks import metrics as measures
-from servoid.stack.tasks.base import BaseTask, Range, Settings, require_positive, require_ranges
-from servoid.stack.tasks.sentences import require_words, understood
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.text import understood
 
 
 @dataclass(frozen=True)
 class GoalSettings(Settings):
-    distance: Annotated[Range, "m to the goal, one value or low:high; its bearing is drawn from the full circle"] = (
-        0.5,
-        1.5,
-    )
-    x: Annotated[float | None, "m ahead of the start: fixes the goal (y is 0 unless given)"] = None
-    y: Annotated[float | None, "m to the left of the start: fixes the goal (x is 0 unless given)"] = None
-    radius: Annotated[float, "m from the goal that count as reached"] = 0.1
-    stand: Annotated[bool, "whether it must also stand there, or coming there is enough"] = True
-    seen: Annotated[bool, "whether the robot sees the goal, as by a camera, or goes by its odometry alone"] = False
-    arrive: Annotated[float, "m from the goal at which to stop"] = 0.05
-    leave: Annotated[float, "m from the goal at which to start again"] = 0.1
-    text: Annotated[str | None, "a sentence on how to go there, beside the cost (else one that names the velocity)"] = (
-        None
-    )
-    approach: Annotated[Approach, "speed profile"] = field(default_factory=Approach)
+    distance: Annotated[Range, Setting("distance of the goal; it is drawn at any bearing", "m", least=0)] = (0.5, 1.5)
+    x: Annotated[float | None, Setting("ahead of the start: fixes the goal (y is 0 unless given)", "m")] = None
+    y: Annotated[float | None, Setting("to the left of the start: fixes the goal (x is 0 unless given)", "m")] = None
+    radius: Annotated[float, Setting("distance from the goal that counts as reached", "m", above=0)] = 0.1
+    stand: Annotated[bool, Setting("whether it must also stand there: else coming there is enough")] = True
+    seen: Annotated[bool, Setting("whether the robot sees the goal, as by a camera: else odometry tells it")] = False
+    arrive: Annotated[float, Setting("distance from the goal at which to stop", "m", above=0)] = 0.05
+    leave: Annotated[float, Setting("distance from the goal at which to start again", "m")] = 0.1
+    text: Annotated[str | None, Setting("sentence on how to walk (none: one that names the velocity)")] = None
+    approach: SpeedProfile = field(default_factory=SpeedProfile)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive(self, "radius", "arrive")
-        require_ranges(self, "distance")
-        if self.distance[0] < 0.0:
-            raise ValueError("distance: must not be negative")
         if self.leave < self.arrive:
             raise ValueError(f"leave: {self.leave:g} must not be below arrive ({self.arrive:g})")
 
@@ -55,55 +48,31 @@ class Goal(BaseTask):
     description = "walk to a point, drawn anywhere around the robot, and stand there"
     settings_type = GoalSettings
 
-    def __init__(self, settings: GoalSettings, dt: float) -> None:
+    def __init__(self, settings: GoalSettings, dt: float, robot: Robot | None = None) -> None:
         """Raises ConfigError for a text that names no motion, or none that goes anywhere."""
-        super().__init__(settings, dt)
+        super().__init__(settings, dt, robot)
         if settings.text is not None and not twist_of(understood("text", settings.text)).any():
             raise ConfigError(f"--set text={settings.text}: a robot that stands reaches no goal; say how to walk")
 
-    @staticmethod
-    def complete(settings: dict[str, str]) -> dict[str, str]:
-        """Raises ConfigError for a text without a word."""
-        require_words(settings, "text")
-        return settings
+    def scenario(self, rng: np.random.Generator) -> Episode:
+        """Draw the goal, fixed in the odometry frame; a mark on the floor, where it shall be seen."""
+        s = self.settings
+        distance, bearing = rng.uniform(*s.distance), rng.uniform(-math.pi, math.pi)
+        goal = distance * np.array([math.cos(bearing), math.sin(bearing)])
+        if s.x is not None or s.y is not None:
+            goal = np.array([s.x or 0.0, s.y or 0.0])
+        return Episode(Scene(np.zeros((0, 3)), np.zeros((0, 4)), goal.copy()) if s.seen else None, goal)
 
-    def reset(self, rng: np.random.Generator) -> None:
-        """Draw the goal, fixed in the odometry frame."""
-        distance, bearing = rng.uniform(*self.settings.distance), rng.uniform(-math.pi, math.pi)
-        self.goal: Array = distance * np.array([math.cos(bearing), math.sin(bearing)])
-        if self.settings.x is not None or self.settings.y is not None:
-            self.goal = np.array([self.settings.x or 0.0, self.settings.y or 0.0])
-        self._stopped = False
-        self._standing = _Standing()
+    def behaviour(self, episode: Episode) -> BaseBehaviour:
+        return _GoAndStand(episode, self.settings)
 
-    def scene(self) -> Scene | None:
-        """The goal as a mark on the floor, where it shall be seen."""
-        return Scene(np.zeros((0, 3)), np.zeros((0, 4)), self.goal.copy()) if self.settings.seen else None
-
-    def percept(self, state: State) -> Percept:
-        return Percept(source="task", age=0.0, goal=self.goal.copy())
-
-    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
-        """The velocity of the speed profile; zero once arrived, until the robot has drifted off."""
-        ahead = to_heading(self.goal if percept.goal is None else percept.goal, state)
-        distance = float(np.linalg.norm(ahead))
-        self._stopped = distance <= (self.settings.leave if self._stopped else self.settings.arrive)
-        velocity = np.zeros(3) if self._stopped else approach(ahead, self.settings.approach)
-        text = None if self._stopped else self.settings.text  # whoever has arrived is told to stand
-        return Instruction(velocity=velocity, goal=ahead, text=text)
-
-    def done(self, state: State) -> bool:
-        """Arrived, and standing for 1 s where that is asked."""
-        standing = self._standing.update(state) or not self.settings.stand
-        return standing and self._stopped
-
-    def success(self, trace: Trace) -> bool:
+    def success(self, trace: Trace, episode: Episode) -> bool:
         """Within the radius of the goal, and standing there, at the end. The trace is in the odometry frame."""
-        there = not trace.fallen and bool(self._distances(trace)[-1] <= self.settings.radius)
+        there = not trace.fallen and bool(_distances(trace, episode)[-1] <= self.settings.radius)
         return there and (not self.settings.stand or measures.standing(trace))
 
-    def metrics(self, trace: Trace) -> dict[str, float]:
-        distances = self._distances(trace)
+    def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
+        distances = _distances(trace, episode)
         outside = np.flatnonzero(distances > self.settings.radius)
         arrival = int(outside[-1]) + 1 if len(outside) else 0  # the tick from which it stayed within the radius
         return {
@@ -112,11 +81,33 @@ class Goal(BaseTask):
             "seconds_to_goal": arrival * trace.dt if arrival < len(trace.displacement) else float("nan"),
         }
 
-    def _distances(self, trace: Trace) -> Array:
-        """Distance to the goal [m] at each tick; infinite for a run that never started."""
-        if len(trace.displacement) == 0:
-            return np.array([np.inf])
-        return np.linalg.norm(trace.displacement[:, :2] - (self.goal if trace.goal is None else trace.goal), axis=1)
+
+def _distances(trace: Trace, episode: Episode) -> Array:
+    """Distance to the goal [m] at each tick; infinite for a run that never started."""
+    if len(trace.displacement) == 0:
+        return np.array([np.inf])
+    return np.linalg.norm(trace.displacement[:, :2] - (episode.goal if trace.goal is None else trace.goal), axis=1)
+
+
+class _GoAndStand(BaseBehaviour):
+    def __init__(self, episode: Episode, settings: GoalSettings) -> None:
+        super().__init__(episode)
+        self._settings, self._stopped, self._standing = settings, False, _Standing()
+
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
+        """The velocity of the speed profile; zero once arrived, until the robot has drifted off."""
+        s = self._settings
+        ahead = to_heading(self.episode.goal if percept.goal is None else percept.goal, state)
+        distance = float(np.linalg.norm(ahead))
+        self._stopped = distance <= (s.leave if self._stopped else s.arrive)
+        velocity = np.zeros(3) if self._stopped else go_to_point(ahead, s.approach)
+        text = None if self._stopped else s.text  # a robot that has arrived is told to stand
+        return Instruction(velocity=velocity, goal=ahead, text=text)
+
+    def done(self, state: State) -> bool:
+        """Arrived, and standing for 1 s where that is asked."""
+        standing = self._standing.update(state) or not self._settings.stand
+        return standing and self._stopped
 
 
 class _Standing:

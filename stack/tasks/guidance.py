@@ -5,13 +5,14 @@ Works on torch tensors through their own methods, so that tasks load without tor
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction
+from servoid.hw.setting import Setting, check
 
 _STANDING = 1e-3  # m/s and rad/s: an instructed twist below it means to stand
 _SLOW = 0.05  # m/s below which the direction of a motion says little
@@ -20,32 +21,27 @@ _NEAR = 0.1  # m from a goal within which its bearing says little
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the terms of a cost, and the two lengths that shape those about obstacles."""
+    """Weights of the terms of the guidance cost, and the two lengths that shape those about obstacles."""
 
-    velocity: float = 1.0  # per (m/s)^2
-    yaw_rate: float = 0.1  # per (rad/s)^2
-    displacement: float = 1.0  # per m^2
-    yaw: float = 0.1  # per rad^2
-    stand: float = 10.0  # per (m/s)^2 of each tick's velocity, where nothing but standing is asked
-    speed: float = 0.0  # per (m/s)^2 of the speed over the ground, whatever its direction
-    steering: float = 0.0  # of 1 - cos of the angle between the velocity over the ground and the one asked
-    heading: float = 0.0  # of 1 - cos of the angle between where each tick's robot faces and the velocity asked
-    goal: float = 0.0  # per m of each tick's distance from the goal
-    facing: float = 0.0  # of 1 - cos of each tick's bearing of the goal, less within 0.1 m of it
-    waypoint: float = 0.0  # per m^2 of each tick's distance from the goal
-    path: float = 10.0  # per m^2 of each tick's distance from where the path wants it
-    repulsion: float = 0.1  # of exp(-sharpness * distance) from each obstacle, at each tick
-    sharpness: float = 15.0  # per m
-    avoidance: float = 0.0  # of softplus(1 - distance / margin) from each obstacle, at each tick
-    margin: float = 0.275  # m
+    velocity: Annotated[float, Setting("squared error of the mean velocity", "1/(m/s)^2", least=0)] = 1.0
+    yaw_rate: Annotated[float, Setting("squared error of the mean turning rate", "1/(rad/s)^2", least=0)] = 0.1
+    displacement: Annotated[float, Setting("squared error of where the motion ends", "1/m^2", least=0)] = 1.0
+    yaw: Annotated[float, Setting("squared error of the heading at the end", "1/rad^2", least=0)] = 0.1
+    stand: Annotated[float, Setting("squared velocity, where it shall stand", "1/(m/s)^2", least=0)] = 10.0
+    speed: Annotated[float, Setting("squared error of the speed over the ground", "1/(m/s)^2", least=0)] = 0.0
+    steering: Annotated[float, Setting("1 - cos(angle between velocity and the one asked)", least=0)] = 0.0
+    heading: Annotated[float, Setting("1 - cos(angle between heading and velocity asked)", least=0)] = 0.0
+    goal: Annotated[float, Setting("distance from the goal", "1/m", least=0)] = 0.0
+    facing: Annotated[float, Setting("1 - cos(bearing of the goal), less within 0.1 m of it", least=0)] = 0.0
+    waypoint: Annotated[float, Setting("squared distance from the goal", "1/m^2", least=0)] = 0.0
+    path: Annotated[float, Setting("squared distance from the place on the path", "1/m^2", least=0)] = 10.0
+    repulsion: Annotated[float, Setting("exp(-sharpness distance), for each obstacle", least=0)] = 0.1
+    sharpness: Annotated[float, Setting("how steeply repulsion falls", "1/m", above=0)] = 15.0
+    avoidance: Annotated[float, Setting("softplus(1 - distance / margin), for each obstacle", least=0)] = 0.0
+    margin: Annotated[float, Setting("distance at which avoidance sets in", "m", above=0)] = 0.275
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            if getattr(self, f.name) < 0.0:
-                raise ValueError(f"{f.name}: a weight must not be negative")
-        for key in ("sharpness", "margin"):
-            if getattr(self, key) == 0.0:
-                raise ValueError(f"{key}: must be positive")
+        check(self)
 
     @property
     def twist(self) -> bool:

@@ -10,11 +10,12 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
+from servoid.hw.setting import Setting
 from servoid.stack.tasks import metrics as measures
-from servoid.stack.tasks.base import BaseTask, Settings, require_positive
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 
 Point = tuple[float, float]
 _SPACING = 0.01  # m between the points of a path
@@ -22,23 +23,34 @@ _SPACING = 0.01  # m between the points of a path
 
 @dataclass(frozen=True)
 class PathSettings(Settings):
-    shape: Annotated[Literal["s", "circle", "waypoints"], "s, circle or waypoints"] = "s"
-    radius: Annotated[float, "m, of the arcs of an S or a circle"] = 0.4
-    waypoints: Annotated[tuple[Point, ...], "m, points after the start: x,y:x,y:..."] = ((0.8, 0.0), (0.8, 0.8))
-    speed: Annotated[float, "m/s along the path"] = 0.15
-    lookahead: Annotated[float, "m along the path, of the point that the asked velocity heads for"] = 0.15
-    horizon: Annotated[int, "ticks ahead for which places on the path are given to a planner"] = 64
-    yaw_rate: Annotated[float, "rad/s at most"] = 0.8
-    seen: Annotated[bool, "whether the robot sees the path's end, as by a camera, or goes by its odometry alone"] = True
-    tolerance: Annotated[float, "m of mean distance from the path, and from its end, that count as followed"] = 0.1
+    shape: Annotated[Literal["s", "circle", "waypoints"], Setting("s, circle or waypoints")] = "s"
+    radius: Annotated[float, Setting("radius of the arcs of an S, or of the circle", "m", above=0)] = 0.4
+    waypoints: Annotated[tuple[Point, ...], Setting("points after the start: x,y:x,y:...", "m")] = (
+        (0.8, 0.0),
+        (0.8, 0.8),
+    )
+    speed: Annotated[float, Setting("speed along the path", "m/s", above=0)] = 0.15
+    lookahead: Annotated[float, Setting("how far along the path the robot heads", "m", above=0)] = 0.15
+    horizon: Annotated[int, Setting("how far ahead a planner is given places on the path", "ticks", above=0)] = 64
+    yaw_rate: Annotated[float, Setting("fastest turn", "rad/s", above=0)] = 0.8
+    seen: Annotated[bool, Setting("whether the robot sees the path's end, as by a camera: else odometry tells it")] = (
+        True
+    )
+    tolerance: Annotated[
+        float, Setting("largest mean distance from the path, and from its end, of a success", "m", above=0)
+    ] = 0.1
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive(self, "radius", "speed", "lookahead", "horizon", "yaw_rate", "tolerance")
         if self.shape == "waypoints":
             points = np.vstack([np.zeros(2), np.reshape(self.waypoints, (-1, 2))])
             if len(points) < 2 or (np.linalg.norm(np.diff(points, axis=0), axis=1) < _SPACING).any():
                 raise ValueError("waypoints: give one or more, each away from the one before (the start is 0,0)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Course(Episode):
+    points: Array  # (n, 2) m of the path, a centimetre apart, from the robot on
 
 
 class Path(BaseTask):
@@ -46,18 +58,58 @@ class Path(BaseTask):
     description = "walk along a path: an S, a circle, or a line through points"
     settings_type = PathSettings
 
-    def reset(self, rng: np.random.Generator) -> None:
-        """Lay out the path, which starts at the robot."""
-        self.points: Array = _layout(self.settings)
+    def scenario(self, rng: np.random.Generator) -> Course:
+        """Lay out the path, which starts at the robot; its end is a mark on the floor, where it shall be seen."""
+        points = _layout(self.settings)
+        scene = Scene(np.zeros((0, 3)), np.zeros((0, 4)), points[-1].copy()) if self.settings.seen else None
+        return Course(scene, points[-1], points=points)
+
+    def behaviour(self, episode: Course) -> BaseBehaviour:
+        return _Follow(episode, self.settings, self.dt)
+
+    def success(self, trace: Trace, episode: Course) -> bool:
+        """Never fallen, near the path on average, and at its end by way of it. The trace is in the odometry frame."""
+        error, end, left = self._errors(trace, episode.points)
+        return not trace.fallen and max(error, end, left) <= self.settings.tolerance
+
+    def metrics(self, trace: Trace, episode: Course) -> dict[str, float]:
+        error, end, left = self._errors(trace, episode.points)
+        return {
+            "path_error_m": error,
+            "final_distance_m": end,
+            "left_m": left,
+            "length_m": _SPACING * (len(episode.points) - 1),
+            "path_m": measures.path_length(trace, step=0.48),
+        }
+
+    def _errors(self, trace: Trace, points: Array) -> tuple[float, float, float]:
+        """Mean distance from the nearest point of the path; at the end, distance from its end, and what is left [m]."""
+        if len(trace.displacement) == 0:
+            return float("inf"), float("inf"), float("inf")
+        places = trace.displacement[:, :2]
+        if trace.goal is not None:
+            places = places - (trace.goal - points[-1])
+        nearest = [float(np.linalg.norm(points - place, axis=1).min()) for place in places]
+        at = 0
+        for place in places:
+            at = _walked(at, points, place, self.settings.lookahead)
+        left = _SPACING * (len(points) - 1 - at)
+        return float(np.mean(nearest)), float(np.linalg.norm(places[-1] - points[-1])), left
+
+
+class _Follow(BaseBehaviour):
+    def __init__(self, episode: Course, settings: PathSettings, dt: float) -> None:
+        super().__init__(episode)
+        self._settings, self._dt = settings, dt
         self._at = 0  # index of the point that the robot has come to
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
         """Where to be at the next ticks, and a velocity toward a point ahead on the path (pure pursuit)."""
-        s, points = self.settings, self.points
+        s, points = self._settings, self.episode.points
         if percept.goal is not None:
             points = points + (percept.goal - points[-1])  # odometry has drifted by so much
-        self._at = self._walked(self._at, points, state.displacement[:2])
-        along = self._at + np.round(s.speed * self.dt * np.arange(1, s.horizon + 1) / _SPACING).astype(int)
+        self._at = _walked(self._at, points, state.displacement[:2], s.lookahead)
+        along = self._at + np.round(s.speed * self._dt * np.arange(1, s.horizon + 1) / _SPACING).astype(int)
         path = to_heading(points[np.minimum(along, len(points) - 1)], state)
         target = to_heading(points[min(self._at + round(s.lookahead / _SPACING), len(points) - 1)], state)
         distance, bearing = float(np.linalg.norm(target)), math.atan2(target[1], target[0])
@@ -68,53 +120,18 @@ class Path(BaseTask):
         turn = min(max(turn, -s.yaw_rate), s.yaw_rate)
         return Instruction(velocity=np.array([forward, 0.0, turn]), goal=to_heading(points[-1], state), path=path)
 
-    def scene(self) -> Scene | None:
-        """The end of the path as a mark on the floor, where it shall be seen."""
-        return Scene(np.zeros((0, 3)), np.zeros((0, 4)), self.points[-1].copy()) if self.settings.seen else None
-
-    def percept(self, state: State) -> Percept:
-        return Percept(source="task", age=0.0, goal=self.points[-1].copy())
-
     def done(self, state: State) -> bool:
         """At the end of the path."""
-        return self._at >= len(self.points) - max(round(0.4 * self.settings.tolerance / _SPACING), 1)
+        return self._at >= len(self.episode.points) - max(round(0.4 * self._settings.tolerance / _SPACING), 1)
 
-    def success(self, trace: Trace) -> bool:
-        """Never fallen, near the path on average, and at its end by way of it. The trace is in the odometry frame."""
-        error, end, left = self._errors(trace)
-        return not trace.fallen and max(error, end, left) <= self.settings.tolerance
 
-    def metrics(self, trace: Trace) -> dict[str, float]:
-        error, end, left = self._errors(trace)
-        return {
-            "path_error_m": error,
-            "final_distance_m": end,
-            "left_m": left,
-            "length_m": _SPACING * (len(self.points) - 1),
-            "path_m": measures.path_length(trace, step=0.48),
-        }
+def _walked(at: int, points: Array, place: Array, lookahead: float) -> int:
+    """Index of the point that a robot at `place` `(2,)` m has come to, from that with index `at`.
 
-    def _walked(self, at: int, points: Array, place: Array) -> int:
-        """Index of the point that a robot at `place` `(2,)` m has come to, from that with index `at`.
-
-        It is the nearest one of the stretch that comes next: a path may cross itself, or end where it began.
-        """
-        stretch = points[at : at + round(2.0 * self.settings.lookahead / _SPACING) + 1]
-        return at + int(np.argmin(np.linalg.norm(stretch - place, axis=1)))
-
-    def _errors(self, trace: Trace) -> tuple[float, float, float]:
-        """Mean distance from the nearest point of the path; at the end, distance from its end, and what is left [m]."""
-        if len(trace.displacement) == 0:
-            return float("inf"), float("inf"), float("inf")
-        places = trace.displacement[:, :2]
-        if trace.goal is not None:
-            places = places - (trace.goal - self.points[-1])
-        nearest = [float(np.linalg.norm(self.points - place, axis=1).min()) for place in places]
-        at = 0
-        for place in places:
-            at = self._walked(at, self.points, place)
-        left = _SPACING * (len(self.points) - 1 - at)
-        return float(np.mean(nearest)), float(np.linalg.norm(places[-1] - self.points[-1])), left
+    It is the nearest one of the stretch that comes next: a path may cross itself, or end where it began.
+    """
+    stretch = points[at : at + round(2.0 * lookahead / _SPACING) + 1]
+    return at + int(np.argmin(np.linalg.norm(stretch - place, axis=1)))
 
 
 def _layout(settings: PathSettings) -> Array:

@@ -8,18 +8,15 @@ from typing import Annotated
 import numpy as np
 
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept
-from servoid.stack.tasks.base import BaseTask, Settings, require_positive
+from servoid.hw.setting import Setting
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 
 
 @dataclass(frozen=True)
 class StandSettings(Settings):
-    radius: Annotated[float, "m that the base may wander"] = 0.1
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive(self, "radius")
+    radius: Annotated[float, Setting("how far the base may wander", "m", above=0)] = 0.1
 
 
 class Stand(BaseTask):
@@ -27,14 +24,19 @@ class Stand(BaseTask):
     description = "stand still"
     settings_type = StandSettings
 
-    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
-        return Instruction(velocity=np.zeros(3))
+    def behaviour(self, episode: Episode) -> BaseBehaviour:
+        return _Still(episode)
 
-    def success(self, trace: Trace) -> bool:
+    def success(self, trace: Trace, episode: Episode) -> bool:
         return not trace.fallen and len(trace.displacement) > 0 and _wandered(trace) <= self.settings.radius
 
-    def metrics(self, trace: Trace) -> dict[str, float]:
+    def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
         return {"wandered_m": _wandered(trace)}
+
+
+class _Still(BaseBehaviour):
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
+        return Instruction(velocity=np.zeros(3))
 
 
 def _wandered(trace: Trace) -> float:

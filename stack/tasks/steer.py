@@ -3,83 +3,82 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept
-from servoid.stack.control.operator import Recorded, Steering, Wish, open_steering
+from servoid.hw.setting import Setting
+from servoid.stack.control.operator import Steering, open_steering
 from servoid.stack.tasks import metrics as measures
-from servoid.stack.tasks.base import BaseTask, Settings, require_positive
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 
 
 @dataclass(frozen=True)
 class SteerSettings(Settings):
-    device: Annotated[Literal["auto", "gamepad", "keyboard"], "auto, gamepad or keyboard (of the terminal)"] = "auto"
-    forward: Annotated[float, "m/s at the end of the stick's way"] = 0.25
-    backward: Annotated[float, "m/s"] = 0.1
-    sideways: Annotated[float, "m/s"] = 0.1
-    turning: Annotated[float, "rad/s"] = 0.8
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive(self, "forward", "backward", "sideways", "turning")
+    device: Annotated[Literal["auto", "gamepad", "keyboard"], Setting("auto, gamepad or keyboard")] = "auto"
+    forward: Annotated[float, Setting("forward, with the stick pushed all the way", "m/s", above=0)] = 0.25
+    backward: Annotated[float, Setting("backward, the same", "m/s", above=0)] = 0.1
+    sideways: Annotated[float, Setting("to either side, the same", "m/s", above=0)] = 0.1
+    turning: Annotated[float, Setting("turning, the same", "rad/s", above=0)] = 0.8
 
 
 class Steer(BaseTask):
-    """Velocities are rounded to float32, as the flight log holds them: a replay steers by the log."""
-
     name = "steer"
     description = "walk as a person steers, with a gamepad or by keys"
     settings_type = SteerSettings
     steered = True
 
-    def __init__(self, settings: SteerSettings, dt: float) -> None:
-        super().__init__(settings, dt)
-        self._device: Steering | None = None
-        self._recorded: Recorded | None = None
-        self._wish = Wish(np.zeros(3))
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the device: a planner's process needs the cost alone."""
-        return {**self.__dict__, "_device": None}
-
-    def steer_by(self, velocities: Array, ended: bool) -> None:
-        """Follow a recorded run's velocities `(ticks, 3)`; `ended`: whether with the last one the person ended it."""
-        self._recorded = Recorded(velocities, ended)
-
-    def reset(self, rng: np.random.Generator) -> None:
+    def behaviour(self, episode: Episode) -> BaseBehaviour:
         """Find the device. Raises ConfigError where there is none."""
-        if self._device is None:
-            self._device = self._recorded or open_steering(self.settings.device)
+        return Steered(episode, open_steering(self.settings.device), self.settings)
 
-    def close(self) -> None:
-        """Let go of the device."""
-        if self._device is not None:
-            self._device.close()
-            self._device = None
+    def success(self, trace: Trace, episode: Episode) -> bool:
+        return not trace.fallen and len(trace.displacement) > 0
+
+    def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
+        return {
+            "top_speed_mps": measures.top_speed(trace),
+            "distance_m": measures.path_length(trace, step=0.48),
+        }
+
+
+class Steered(BaseBehaviour):
+    """Velocities are rounded to float32, as the flight log holds them: a replay steers by the log."""
+
+    def __init__(self, episode: Episode, device: Steering, settings: SteerSettings) -> None:
+        super().__init__(episode)
+        self._device, self._settings, self._ends = device, settings, False
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
-        if self._device is not None:
-            self._wish = self._device.read()
-        if self._recorded is not None:
-            return Instruction(velocity=self._wish.way.astype(float))
-        s, (forward, left, turn) = self.settings, self._wish.way
+        wish, s = self._device.read(), self._settings
+        forward, left, turn = wish.way
+        self._ends = wish.ends
         velocity = [forward * (s.forward if forward > 0.0 else s.backward), left * s.sideways, turn * s.turning]
         return Instruction(velocity=np.array(velocity, dtype=np.float32).astype(float))
 
     def done(self, state: State) -> bool:
         """The person has had enough."""
-        return self._wish.ends
+        return self._ends
 
-    def success(self, trace: Trace) -> bool:
-        return not trace.fallen and len(trace.displacement) > 0
+    def close(self) -> None:
+        self._device.close()
 
-    def metrics(self, trace: Trace) -> dict[str, float]:
-        return {
-            "top_speed_mps": measures.top_speed(trace),
-            "distance_m": measures.path_length(trace, step=0.48),
-        }
+
+class SteeredAgain(BaseBehaviour):
+    """Repeats the velocities `(ticks, 3)` of a recorded run. `ended`: whether with the last one the person ended it."""
+
+    def __init__(self, velocities: Array, ended: bool) -> None:
+        super().__init__(Episode())
+        self._velocities, self._ended, self._tick = velocities, ended, 0
+
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
+        self._tick = tick
+        over = tick >= len(self._velocities)
+        return Instruction(velocity=np.zeros(3) if over else self._velocities[tick].astype(float))
+
+    def done(self, state: State) -> bool:
+        return self._ended and self._tick >= len(self._velocities) - 1

@@ -6,41 +6,46 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept
+from servoid.hw.setting import Setting
 from servoid.policy.text.captions import caption
-from servoid.stack.tasks.walk import Walk, WalkSettings
+from servoid.stack.tasks.base import BaseBehaviour
+from servoid.stack.tasks.walk import Commands, FollowCommands, Walk, WalkSettings
 
 
 @dataclass(frozen=True)
 class SurviveSettings(WalkSettings):
     told: Annotated[
-        float, "s at the start in which a sentence says how to walk: left alone at rest, a robot may rest on"
+        float,
+        Setting("time at the start in which a sentence says how to walk: at rest, a robot may rest on", "s", least=0),
     ] = 3.0
-    tolerance: Annotated[float | None, "m/s of mean error; none: not falling is enough"] = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.told < 0.0:
-            raise ValueError("told: must not be negative")
+    tolerance: Annotated[
+        float | None, Setting("largest mean velocity error of a success; none: not falling is enough", "m/s", above=0)
+    ] = None
 
 
 class Survive(Walk):
     """A planner is left to itself, for its weights are zero; policies that go by a velocity walk as in `walk`."""
 
     name = "survive"
-    description = "stay up for a minute without guidance, from a walk that a sentence began"
+    description = "stay up for a minute without guidance; a sentence starts the walk"
     settings_type = SurviveSettings
+    guided_by_velocity_alone = True
+
+    def behaviour(self, episode: Commands) -> BaseBehaviour:
+        return _ToldAtFirst(episode, self.ticks(self.settings.every), self.settings.told, self.dt)
+
+    def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
+        return {"episode_ticks": float(len(trace.yaw)), **super().metrics(trace, episode)}
+
+
+class _ToldAtFirst(FollowCommands):
+    def __init__(self, episode: Commands, ticks: int, told: float, dt: float) -> None:
+        """`told`: s for which a sentence says how to walk."""
+        super().__init__(episode, ticks)
+        self._told, self._dt = told, dt
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
         instruction = super().instruct(tick, state, percept)
-        told = tick * self.dt < self.settings.told
-        return replace(instruction, text=caption(instruction.velocity) if told else "")
-
-    @property
-    def guides(self) -> bool:
-        """By the velocity alone, there being nothing else in its instructions."""
-        return self.settings.cost.twist
-
-    def metrics(self, trace: Trace) -> dict[str, float]:
-        return {"episode_ticks": float(len(trace.yaw)), **super().metrics(trace)}
+        return replace(instruction, text=caption(instruction.velocity) if tick * self._dt < self._told else "")

@@ -8,28 +8,37 @@ from typing import Annotated, Literal
 
 import numpy as np
 
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Trace
+from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept
+from servoid.hw.robot.description import Robot
+from servoid.hw.setting import Setting
 from servoid.policy.text.captions import MOTIONS, followed, twist_of
 from servoid.stack.tasks import metrics as measures
-from servoid.stack.tasks.base import BaseTask, Settings, require_positive
-from servoid.stack.tasks.sentences import require_words, understood
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 
 
 @dataclass(frozen=True)
 class TextSettings(Settings):
-    every: Annotated[float, "s between changes of the sentence"] = 5.0
-    settle: Annotated[float, "s after each change that do not count"] = measures.SETTLING
-    phrasings: Annotated[Literal["held_out", "training"], "held_out, which no training saw, or training"] = "held_out"
-    sentence: Annotated[str | None, "says what to do all the time, instead of sentences that are drawn"] = None
-    cycle: Annotated[float, "s, length of a gait cycle, over whole ones of which motion is measured"] = 0.48
+    every: Annotated[float, Setting("time between changes of the sentence", "s", above=0)] = 5.0
+    settle: Annotated[float, Setting("time after each change that does not count", "s", least=0)] = measures.SETTLING
+    phrasings: Annotated[Literal["held_out", "training"], Setting("held_out (which no training saw) or training")] = (
+        "held_out"
+    )
+    sentence: Annotated[str | None, Setting("what to do all the time, instead of sentences drawn")] = None
+    cycle: Annotated[float, Setting("length of a gait cycle: motion is measured over whole ones", "s", above=0)] = 0.48
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive(self, "every", "cycle")
-        if not 0.0 <= self.settle <= self.every - self.cycle:
+        if self.settle > self.every - self.cycle:
             raise ValueError(f"settle: {self.settle:g} leaves no gait cycle of every ({self.every:g})")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sentences(Episode):
+    motions: tuple[int, ...]  # numbers in MOTIONS
+    sentences: tuple[str, ...]
 
 
 class Text(BaseTask):
@@ -37,50 +46,39 @@ class Text(BaseTask):
     description = "do what a sentence says; it changes every few seconds"
     settings_type = TextSettings
     counts_undone = ("followed_share",)
+    guided_by_velocity_alone = True
 
-    def __init__(self, settings: TextSettings, dt: float) -> None:
+    def __init__(self, settings: TextSettings, dt: float, robot: Robot | None = None) -> None:
         """Raises ConfigError for a sentence that names no motion."""
-        super().__init__(settings, dt)
-        self._asked: int | None = None if settings.sentence is None else understood("sentence", settings.sentence)
+        super().__init__(settings, dt, robot)
+        self._asked = None if settings.sentence is None else understood("sentence", settings.sentence)
 
-    @staticmethod
-    def complete(settings: dict[str, str]) -> dict[str, str]:
-        """Raises ConfigError for a sentence without a word."""
-        require_words(settings, "sentence")
-        return settings
-
-    def reset(self, rng: np.random.Generator) -> None:
+    def scenario(self, rng: np.random.Generator) -> Sentences:
         """Draw motions, each another one than before, and a sentence for each."""
-        self._motions: list[int] = []
-        self._sentences: list[str] = []
+        motions: list[int] = []
+        sentences: list[str] = []
         for _ in range(math.ceil(self.seconds / self.settings.every)):
-            others = [i for i in range(len(MOTIONS)) if not self._motions or i != self._motions[-1]]
+            others = [i for i in range(len(MOTIONS)) if not motions or i != motions[-1]]
             motion = others[int(rng.integers(len(others)))]
             choices = MOTIONS[motion].held_out if self.settings.phrasings == "held_out" else MOTIONS[motion].phrasings
             sentence = choices[rng.integers(len(choices))]
             if self._asked is not None:
                 motion, sentence = self._asked, self.settings.sentence
-            self._motions.append(motion)
-            self._sentences.append(sentence)
+            motions.append(motion)
+            sentences.append(sentence)
+        return Sentences(motions=tuple(motions), sentences=tuple(sentences))
 
-    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
-        """The sentence; with it the motion's typical velocity, for policies that do not read."""
-        number = min(tick // max(round(self.settings.every / self.dt), 1), len(self._motions) - 1)
-        return Instruction(velocity=twist_of(self._motions[number]), text=self._sentences[number])
+    def behaviour(self, episode: Sentences) -> BaseBehaviour:
+        return _Tell(episode, self.ticks(self.settings.every))
 
-    @property
-    def guides(self) -> bool:
-        """By the velocity alone, there being nothing else in its instructions."""
-        return self.settings.cost.twist
-
-    def success(self, trace: Trace) -> bool:
+    def success(self, trace: Trace, episode: Sentences) -> bool:
         """Never fallen, and every sentence followed."""
-        return not trace.fallen and self._followed(trace) == 1.0
+        return not trace.fallen and self._followed(trace, episode) == 1.0
 
-    def metrics(self, trace: Trace) -> dict[str, float]:
-        return {"followed_share": self._followed(trace)}
+    def metrics(self, trace: Trace, episode: Sentences) -> dict[str, float]:
+        return {"followed_share": self._followed(trace, episode)}
 
-    def _followed(self, trace: Trace) -> float:
+    def _followed(self, trace: Trace, episode: Sentences) -> float:
         """Share of the sentences that the mean measured motion followed; NaN where the task is too short to tell.
 
         A sentence that got no gait cycle was not followed, but where the run ended by its time.
@@ -88,7 +86,7 @@ class Text(BaseTask):
         every, cycle = round(self.settings.every / self.dt), round(self.settings.cycle / self.dt)
         in_time = not trace.fallen and len(trace.yaw) >= round(self.seconds / self.dt)
         verdicts = []
-        for number, motion in enumerate(self._motions):
+        for number, motion in enumerate(episode.motions):
             first = number * every + round(self.settings.settle / self.dt)
             cycles = (min((number + 1) * every, len(trace.yaw)) - first) // cycle
             if cycles >= 1:
@@ -98,3 +96,25 @@ class Text(BaseTask):
             elif not in_time:
                 verdicts.append(False)
         return float(np.mean(verdicts)) if verdicts else float("nan")
+
+
+class _Tell(BaseBehaviour):
+    def __init__(self, episode: Sentences, ticks: int) -> None:
+        super().__init__(episode)
+        self._ticks = ticks
+
+    def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
+        """The sentence; with it the motion's typical velocity, for policies that do not read."""
+        number = min(tick // self._ticks, len(self.episode.motions) - 1)
+        return Instruction(velocity=twist_of(self.episode.motions[number]), text=self.episode.sentences[number])
+
+
+def understood(name: str, sentence: str) -> int:
+    """Number of the motion that the setting `name` asks for. Raises ConfigError where that is in no known words."""
+    from servoid.policy.text.encoder import load_encoder
+    from servoid.policy.text.nearest_phrase import Phrasebook
+
+    try:
+        return Phrasebook(load_encoder()).understand(sentence)
+    except ConfigError as error:
+        raise ConfigError(f"--set {name}={sentence}: {error}") from None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,3 +37,16 @@ def moves(places: Array, yaw: float = 0.0, velocity: tuple[float, float] = (0.0,
     zeros = torch.zeros(1, horizon, dtype=torch.float64)
     moving = torch.zeros(1, horizon, 2, dtype=torch.float64) + torch.tensor(velocity, dtype=torch.float64)
     return SimpleNamespace(displacement=displacement, yaw=zeros + yaw, velocity=moving, yaw_rate=zeros, dt=DT)
+
+
+class Drawn:
+    """A task with an episode drawn and what is asked in it, so that a test says `task.instruct` and `task.success`."""
+
+    def __init__(self, task: Any, seed: int = 0) -> None:
+        self.episode = task.scenario(np.random.default_rng(seed))
+        self.behaviour = task.behaviour(self.episode)
+        self.name, self.settings, self.objective = task.name, task.settings, task.objective
+        self.scene, self.goal = self.episode.scene, self.episode.goal
+        self.percept, self.instruct, self.done = self.behaviour.percept, self.behaviour.instruct, self.behaviour.done
+        self.success = partial(task.success, episode=self.episode)
+        self.metrics = partial(task.metrics, episode=self.episode)

@@ -10,10 +10,10 @@ import numpy as np
 
 from servoid.hw.clock import WallClock
 from servoid.hw.contracts.body import Array
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.codec import SyncWriter
-from servoid.hw.dynamixel.group_read import GroupRead
-from servoid.hw.dynamixel.port import SerialPort
+from servoid.hw.dynamixel.protocol.codec import SyncWriter
+from servoid.hw.dynamixel.transport.bus import Bus
+from servoid.hw.dynamixel.transport.group_read import GroupRead
+from servoid.hw.dynamixel.transport.port import SerialPort
 
 GOAL, GOAL_BYTES = 116, 4
 PRESENT, PRESENT_BYTES = 126, 10  # current, velocity, position
@@ -42,7 +42,7 @@ class Servoid:
         self._goals = SyncWriter(ids, GOAL, GOAL_BYTES, signed=True)
 
     def cycle(self, goals: Sequence[int]) -> Array | None:
-        if self._bus.read_groups((self._present, self._board), self._goals.packet(goals)):
+        if self._bus.sync_read(self._present, self._board, before=self._goals.packet(goals)):
             return None
         raw = np.frombuffer(b"".join(self._present.data), _FIELDS)  # type: ignore[arg-type]
         return np.array([raw["current"], raw["velocity"], raw["position"]])

@@ -148,7 +148,7 @@ def _time(
     from servoid.policy.diffusion.runtime import Runtime
     from servoid.stack.tasks import load_task
 
-    cost = load_task("walk", dt=robot.dt).cost
+    cost = load_task("walk", dt=robot.dt).objective
     request = _request(robot, network.model, settings.delay)
     rows = []
     for gradient in (NONE, "analytic", "network") if engine == REFERENCE else (NONE, "analytic"):

@@ -17,9 +17,9 @@ import struct
 import sys
 import time
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.bus import BITS
-from servoid.hw.dynamixel.codec import Instruction
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Instruction
+from servoid.hw.dynamixel.transport.bus import BITS
 from servoid.sim.rig.process.pty import Pty
 from servoid.stack.runtime.realtime import undisturbed
 

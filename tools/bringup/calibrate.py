@@ -23,10 +23,10 @@ from servoid.tools.common.output import Report, reporting
 from servoid.tools.common.prompt import confirm
 
 if TYPE_CHECKING:
-    from servoid.hw.dynamixel.register_check import Found
+    from servoid.hw.dynamixel.servos.register_check import Found
     from servoid.hw.robot.calibration import Calibration, JointCalibration
-    from servoid.tools.bringup.encoders import Encoders
-    from servoid.tools.bringup.hands import Hands
+    from servoid.tools.bringup.calibration.encoders import Encoders
+    from servoid.tools.bringup.calibration.hands import Hands
 
 MOVED = 0.15  # rad that a joint has to be turned by
 BEYOND = 0.1  # rad beyond its range at which a joint cannot be
@@ -104,11 +104,11 @@ def _measure(
     """Zeros [rad] and directions `(n_joints,)`."""
     import numpy as np
 
-    from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY
-    from servoid.hw.dynamixel.bus_scan import BAUDS, power_on
-    from servoid.hw.dynamixel.register_check import find_servos
-    from servoid.tools.bringup.encoders import Encoders, short
-    from servoid.tools.bringup.hands import Person, VirtualHands
+    from servoid.hw.dynamixel.servos.bus_scan import BAUDS, power_on
+    from servoid.hw.dynamixel.servos.register_check import find_servos
+    from servoid.hw.dynamixel.transport.bus import LONGEST_RETURN_DELAY
+    from servoid.tools.bringup.calibration.encoders import Encoders, short
+    from servoid.tools.bringup.calibration.hands import Person, VirtualHands
 
     power_on(line.bus, robot.bus.board_id, [robot.bus.baud, *BAUDS])
     if line.bus.port.baud != robot.bus.baud:
@@ -149,7 +149,7 @@ def directions_of(
     """Direction of each chosen joint, by number, from turns by hand, each away from the nearer end of its range."""
     import numpy as np
 
-    from servoid.tools.bringup.turning import describe_turns
+    from servoid.tools.bringup.calibration.turning import describe_turns
 
     signs = np.where(robot.upper - reference >= reference - robot.lower, 1, -1)
     texts = describe_turns(robot, reference, signs)
@@ -176,7 +176,7 @@ def turned(encoders: Encoders, start: Array, i: int, robot: Robot) -> float | No
     """
     import numpy as np
 
-    from servoid.tools.bringup.encoders import PERIOD_NS, short
+    from servoid.tools.bringup.calibration.encoders import PERIOD_NS, short
 
     ticks, others = round(PATIENCE * 1e9 / PERIOD_NS), 0
     for _ in range(ticks):

@@ -21,8 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
-        from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY
-        from servoid.hw.dynamixel.register_check import as_table, compare, correct, find_board, find_servos
+        from servoid.hw.dynamixel.servos.register_check import as_table, compare, correct, find_board, find_servos
+        from servoid.hw.dynamixel.transport.bus import LONGEST_RETURN_DELAY
 
         robot = assembled(args, report)
         with open_line(args, robot) as line:

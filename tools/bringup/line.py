@@ -15,7 +15,7 @@ from servoid.hw.robot.description import Robot, load_robot
 from servoid.tools.common.output import Report, add_json_argument
 
 if TYPE_CHECKING:
-    from servoid.hw.dynamixel.bus import Bus
+    from servoid.hw.dynamixel.transport.bus import Bus
     from servoid.sim.rig.factory_state import FactoryState
     from servoid.sim.rig.process.control import Control
 
@@ -76,9 +76,9 @@ def open_line(
     `factory_state` is of a virtual rig. Raises BackendError with the remedy.
     """
     from servoid.hw.clock import WallClock
-    from servoid.hw.dynamixel.bus import MARGIN, Bus
-    from servoid.hw.dynamixel.bus_scan import PATIENCE
-    from servoid.hw.dynamixel.port import SerialPort
+    from servoid.hw.dynamixel.servos.bus_scan import PATIENCE
+    from servoid.hw.dynamixel.transport.bus import MARGIN, Bus
+    from servoid.hw.dynamixel.transport.port import SerialPort
 
     with ExitStack() as stack:
         clock: Clock = WallClock()

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
-        from servoid.hw.dynamixel.bus_scan import census, let_go
+        from servoid.hw.dynamixel.servos.bus_scan import census, let_go
 
         robot = load_robot(args.robot)
         baud = robot.bus.baud if args.baud is None else args.baud

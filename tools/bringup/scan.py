@@ -18,7 +18,7 @@ from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, reporting
 
 if TYPE_CHECKING:
-    from servoid.hw.dynamixel.bus_scan import Census, Device
+    from servoid.hw.dynamixel.servos.bus_scan import Census, Device
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
-        from servoid.hw.dynamixel.bus_scan import BAUDS, census, power_on
+        from servoid.hw.dynamixel.servos.bus_scan import BAUDS, census, power_on
 
         robot = load_robot(args.robot)
         for baud in args.baud:
@@ -75,7 +75,7 @@ def main(args: argparse.Namespace) -> int:
 
 def check_baud(baud: int) -> None:
     """Raise ConfigError for a baud that no servo has."""
-    from servoid.hw.dynamixel.bus_scan import BAUDS
+    from servoid.hw.dynamixel.servos.bus_scan import BAUDS
 
     if baud not in BAUDS:
         raise ConfigError(f"--baud {baud}: Dynamixel servos have {', '.join(map(str, BAUDS))} bit/s")

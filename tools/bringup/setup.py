@@ -21,8 +21,8 @@ from servoid.tools.common.output import Report, reporting
 from servoid.tools.common.prompt import confirm
 
 if TYPE_CHECKING:
-    from servoid.hw.dynamixel.bus import Bus
-    from servoid.hw.dynamixel.bus_scan import Device
+    from servoid.hw.dynamixel.servos.bus_scan import Device
+    from servoid.hw.dynamixel.transport.bus import Bus
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
                 report.line(f"will be written: {', '.join(changes)}")
                 if not args.yes:
                     confirm("It is kept without power")
-                from servoid.hw.dynamixel.bus_scan import assign
+                from servoid.hw.dynamixel.servos.bus_scan import assign
 
                 after = assign(line.bus, device, id, baud)
                 report.line(f"done: {after} answers and reads back")
@@ -78,7 +78,7 @@ def main(args: argparse.Namespace) -> int:
 
 def find_one(bus: Bus, robot: Robot, baud: int, report: Report) -> Device:
     """The only servo on the bus. Raises BackendError when there is none, or more than one."""
-    from servoid.hw.dynamixel.bus_scan import BAUDS, FACTORY_BAUD, census, power_on
+    from servoid.hw.dynamixel.servos.bus_scan import BAUDS, FACTORY_BAUD, census, power_on
 
     power = power_on(bus, robot.bus.board_id, [robot.bus.baud, *BAUDS])
     report.line(power or f"no board with ID {robot.bus.board_id}: the servo needs a supply of its own")

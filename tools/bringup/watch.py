@@ -20,7 +20,7 @@ from servoid.tools.common.output import Report, reporting
 
 if TYPE_CHECKING:
     from servoid.hw.contracts.body import Observation
-    from servoid.hw.dynamixel.bus import Counters
+    from servoid.hw.dynamixel.transport.bus import Counters
     from servoid.hw.imu.serial_imu import SerialImu
 
 RATE = 20  # reads a second
@@ -59,11 +59,11 @@ class Watched:
 
     def __init__(self, line: Line, robot: Robot, imu: SerialImu | None = None) -> None:
         """Raises BackendError when a servo or the board does not answer."""
-        from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY
-        from servoid.hw.dynamixel.register_check import find_board, find_servos
+        from servoid.hw.dynamixel.protocol.units import Units
         from servoid.hw.dynamixel.sensors import DynamixelSensors, present
-        from servoid.hw.dynamixel.servo_monitor import ServoMonitor
-        from servoid.hw.dynamixel.units import Units
+        from servoid.hw.dynamixel.servos.register_check import find_board, find_servos
+        from servoid.hw.dynamixel.servos.servo_monitor import ServoMonitor
+        from servoid.hw.dynamixel.transport.bus import LONGEST_RETURN_DELAY
         from servoid.stack.estimation.sample_hold import SampleHold
         from servoid.stack.runtime.clock import RealTime, WallClock
 

@@ -72,7 +72,7 @@ def replay(log: FlightLog) -> tuple[int, Difference | None]:
         raise ConfigError(f"{log.path}: recorded on '{body}': only simulated runs can be repeated")
     if body != settings.backend:
         raise ConfigError(f"{log.path}: recorded with a program's own backend: only that program can repeat it")
-    if log.header["policy"]["name"] != settings.policy:
+    if log.header["policy"]["name"] != log.header["settings"]["policy"]:
         raise ConfigError(f"{log.path}: recorded with a program's own policy: only that program can repeat it")
     stops = [Event(**event) for event in log.messages["/event"] if event["kind"] in ("interrupt", "record")]
     plans = {int(message["requested"]): int(message["adopted"]) for message in log.messages["/plan"]}
@@ -122,6 +122,8 @@ def changes(log: FlightLog) -> list[str]:
         "policy.gait": "the gait's settings",
         "task": "the task's settings",
         "task_files": "a file that the task's settings name",
+        "task_source": "the task's file",
+        "policy.source": "the policy's file",
         "versions": "installed packages",
         "git_commit": "the source",
     }
@@ -135,18 +137,23 @@ def _part(name: str, values: dict[str, Any]) -> dict[str, Any]:
 def _task(settings: RunSettings) -> dict[str, Any]:
     """The task as a log's header has it, by the files of today."""
     from servoid.stack.log.provenance import described, files
-    from servoid.stack.tasks import load_settings
+    from servoid.stack.tasks import find, load_settings, source
 
-    chosen = {key: value for key, value in settings.set.items() if key != "gain"}  # which is the servos'
+    chosen = dict(settings.set)
     if settings.seconds is not None:
         chosen["seconds"] = repr(settings.seconds)
     task = load_settings(settings.task, chosen)
-    return {"task": {"name": settings.task} | described(task), "task_files": files(task)}
+    named = {"name": find(settings.task).name} | described(task)
+    return {"task": named, "task_files": files(task), "task_source": source(settings.task)}
 
 
 def _settings(log: FlightLog) -> RunSettings:
     known = {f.name for f in fields(RunSettings)}
     values = {name: value for name, value in log.header["settings"].items() if name in known}
+    own = {"task": log.header.get("task_source"), "policy": log.header["policy"].get("source")}
+    for name, source in own.items():  # a file's name may have been typed in another folder
+        if source is not None and source["package"] is None:
+            values[name] = f"{source['file']}:{source['class']}"
     return RunSettings(**(values | {"record": None, "realtime": False}))
 
 

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.backend import Backend, Simulation
-from servoid.hw.contracts.task import Task, Trace
+from servoid.hw.contracts.task import Assignment, Trace
 from servoid.tools.common.confidence import wilson
 from servoid.tools.common.exit_codes import exit_code, explain
 from servoid.tools.common.output import add_json_argument, reporting
-from servoid.tools.common.parser import add_set_argument, check_seed, settings
+from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, settings
 from servoid.tools.common.worker_pool import each
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ ENDED = ("succeeded", "failed", "timed_out")  # outcomes of runs whose task ende
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("task", help="see `servoid tasks`")
+    parser.add_argument("task", metavar="TASK", help="a name (servoid tasks), or FILE.py:Class")
     parser.add_argument("--episodes", type=int, default=50, help="(default: %(default)s)")
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one a core)")
     parser.add_argument("--backend", default="sim", help="sim or virtual (default: %(default)s)")
@@ -45,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, help="instead of the task's own")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode's stream (default: %(default)s)")
     add_set_argument(parser)
+    add_gain_argument(parser)
     add_json_argument(parser)
 
 
@@ -73,24 +74,17 @@ def main(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     from servoid.stack.runtime.backends import backend_kind
-    from servoid.stack.tasks import task_class
+    from servoid.stack.tasks import find
 
     if args.episodes < 1:
         raise ConfigError(f"--episodes: {args.episodes} is not a number of episodes; give 1 or more")
     if args.workers < 0:
         raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
     check_seed(args.seed)
-    if task_class(args.task).steered:
+    if find(args.task).cls.steered:
         raise ConfigError(f"task '{args.task}' is steered by a person: use `servoid run {args.task}`")
     if not backend_kind(args.backend).simulated:
         raise ConfigError(f"backend '{args.backend}' has no truth to judge by: use a simulated one, or `servoid run`")
-
-
-def episode_seed(seed: int, episode: int) -> int:
-    """The seed that repeats episode `episode` with `servoid run`."""
-    import numpy as np
-
-    return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
 
 
 def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -100,6 +94,7 @@ def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[
     """
     from tqdm import tqdm
 
+    from servoid.hw.seeds import episode_seed
     from servoid.stack.runtime.run import RunSettings
 
     seeds = [episode_seed(args.seed, i) for i in range(args.episodes)]
@@ -112,6 +107,7 @@ def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[
             randomise=args.randomise,
             seconds=args.seconds,
             seed=seed,
+            gain=args.gain,
             set=values,
         )
         for seed in seeds
@@ -141,7 +137,7 @@ class Judged:
     """One run as the truth saw it."""
 
     row: dict[str, Any]  # what a rollout keeps of it
-    task: Task
+    assignment: Assignment
     trace: Trace
     ground_truth: GroundTruth
 
@@ -162,20 +158,20 @@ def judge(job: RunSettings) -> Judged:
     from servoid.stack.runtime.run import prepare, run
     from servoid.tools.common.ground_truth import GroundTruth
 
-    task, backend = prepare(job)
+    assignment, backend = prepare(job)
     ground_truth = GroundTruth(simulation(backend), load_robot(job.robot).dt)
     result = run(job, backend=backend, on_tick=ground_truth)
     _give_memory_back()
     if result.interrupted:
         raise KeyboardInterrupt
     trace = ground_truth.trace()
-    began, undone = len(trace.yaw) > 0, task.counts_undone
-    metrics = task.metrics(trace) if began or undone else {}
+    began, undone = len(trace.yaw) > 0, assignment.task.counts_undone
+    metrics = assignment.metrics(trace) if began or undone else {}
     fell = trace.fallen or result.outcome == "fell"
     row = {
         "seed": job.seed,
         "outcome": result.outcome,
-        "success": result.outcome in ENDED and bool(task.success(trace)),
+        "success": result.outcome in ENDED and bool(assignment.success(trace)),
         "fell": fell,
         "aborted": not fell and result.outcome not in ENDED,
         "fell_ending": ground_truth.fell_ending,
@@ -183,7 +179,7 @@ def judge(job: RunSettings) -> Judged:
         "metrics": {name: value for name, value in metrics.items() if began or name in undone},
         "odometry_error_m": ground_truth.odometry_error(result.trace),
     }
-    return Judged(row, task, trace, ground_truth)
+    return Judged(row, assignment, trace, ground_truth)
 
 
 def _give_memory_back() -> None:

@@ -1,59 +1,78 @@
-"""List the tasks with their settings, to be changed with --set key=value."""
+"""List the tasks; with a task, explain its settings, to be changed with --set key=value."""
 
 from __future__ import annotations
 
 import argparse
-import typing
-from dataclasses import fields, is_dataclass
+import shutil
+import textwrap
+from dataclasses import asdict
 from typing import Any
 
+from servoid.hw.config import ConfigError
+from servoid.hw.setting import explain
 from servoid.stack import tasks
 from servoid.tools.common import exit_codes
-from servoid.tools.common.output import add_json_argument, reporting
+from servoid.tools.common.output import Report, add_json_argument, reporting
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("task", nargs="?", help="only this one")
+    parser.add_argument("task", nargs="?", metavar="TASK", help="explain this one: a name or FILE.py:Class")
     add_json_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
-        names = tasks.names() if args.task is None else (args.task,)
-        described = [describe(name) for name in names]
-        for task in described:
-            report.line(f"{task['name']}: {task['description']}")
-            rows = [(f"  {row['key']}", row["value"], row["help"]) for row in task["settings"]]
-            report.table(("  setting", "value", ""), rows)
+        if args.task is not None:
+            described = [describe(args.task)]
+            _explain(report, described[0])
+        else:
+            described = [_describe_if_possible(name) for name in tasks.names()]
+            width = max(len(task["name"]) for task in described)
+            for task in described:
+                report.line(f"{task['name']:{width}}  {task['description']}")
             report.line()
+            report.line("servoid tasks TASK explains a task's settings; servoid run TASK runs it")
         report.result({"tasks": described})
     return exit_codes.DONE
 
 
 def describe(name: str) -> dict[str, Any]:
-    """Name, description and settings of a task. Raises ConfigError."""
-    return {"name": name, "description": tasks.description(name), "settings": _settings(tasks.load_settings(name))}
+    """Name, description, source and settings of a task. Raises ConfigError."""
+    return {
+        "name": name,
+        "description": tasks.find(name).description,
+        "source": tasks.source(name),
+        "settings": [asdict(setting) for setting in explain(tasks.load_settings(name))],
+    }
 
 
-def _settings(value: Any, prefix: str = "") -> list[dict[str, str]]:
-    """Rows of key, value as it is typed, and help; parts with settings of their own are listed with dots."""
-    hints = typing.get_type_hints(type(value), include_extras=True)
-    rows = []
-    for f in fields(value):
-        item = getattr(value, f.name)
-        if is_dataclass(item):
-            rows += _settings(item, f"{prefix}{f.name}.")
-        else:
-            help_text = getattr(hints[f.name], "__metadata__", ("",))[0]
-            rows.append({"key": prefix + f.name, "value": _text(item), "help": help_text})
-    return rows
+def _describe_if_possible(name: str) -> dict[str, Any]:
+    """An installed package whose task cannot be loaded does not hide the others."""
+    try:
+        return describe(name)
+    except ConfigError as error:
+        return {"name": name, "description": f"cannot be used: {error}", "source": None, "settings": []}
 
 
-def _text(value: Any) -> str:
-    """A value as it is typed after `key=`."""
-    if isinstance(value, tuple):
-        nested = any(isinstance(item, tuple) for item in value)
-        return ":".join(_text(item).replace(":", ",") if nested else _text(item) for item in value)
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "" if value is None else f"{value:g}" if isinstance(value, (int, float)) else str(value)
+def _explain(report: Report, task: dict[str, Any]) -> None:
+    """A task's settings in lines of the terminal's width, at most 100."""
+    report.line(f"{task['name']}: {task['description']}")
+    report.line()
+    rows = [(row["key"], row["value"], row["unit"], _sentence(row)) for row in task["settings"]]
+    head = ("setting", "value", "unit", "")
+    widths = [min(max(len(row[i]) for row in (head, *rows)), most) for i, most in enumerate((20, 15, 11))]
+    room = max(min(shutil.get_terminal_size().columns, 100) - sum(widths) - 8, 20)
+    for key, value, unit, text in (head, *rows):
+        first, *rest = textwrap.wrap(text, room) or [""]
+        if len(key) > widths[0] or len(value) > widths[1]:
+            report.line(f"  {key}  {value}")
+            key = value = ""
+        report.line(f"  {key:{widths[0]}}  {value:{widths[1]}}  {unit:{widths[2]}}  {first}".rstrip())
+        for more in rest:
+            report.line(" " * (sum(widths) + 8) + more)
+    report.line()
+    report.line("change one with --set SETTING=VALUE; a range is typed low:high")
+
+
+def _sentence(row: dict[str, str]) -> str:
+    return "; ".join(part for part in (row["text"], row["range"]) if part)

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from servoid.stack.runtime.run import RunSettings
 
 PATH_STEP = 0.2  # s between the points of a path that is kept
-_STREAM = 20_250_417  # any number but 0: the episodes are not those of `servoid rollout`, on which settings are tried
 
 
 @dataclass(frozen=True)
@@ -40,11 +39,6 @@ class EpisodeResult:
     wall_seconds: float = 0.0
 
 
-def episode_seed(seed: int, episode: int) -> int:
-    """The seed of an episode, which repeats it with `servoid run`."""
-    return int(np.random.SeedSequence([seed, episode, _STREAM]).generate_state(1)[0])
-
-
 def do_episode(job: EpisodeJob) -> EpisodeResult:
     """Do an episode. One that cannot be done, for whatever reason, is an answer too: the other rows go on."""
     begun = time.monotonic()
@@ -63,9 +57,9 @@ def record(settings: RunSettings) -> dict[str, Any]:
     from servoid.tools.common.motion_quality import quality
 
     judged = judge(settings)
-    trace, task = judged.trace, judged.task
-    limit = round(task.seconds / trace.dt)
-    goal = task.goal if trace.goal is None else trace.goal[-1]
+    trace, assignment = judged.trace, judged.assignment
+    limit = round(assignment.task.seconds / trace.dt)
+    goal = assignment.episode.goal if trace.goal is None else trace.goal[-1]
     return {
         **judged.row,
         "ticks": min(judged.ground_truth.upright, limit),

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
+from servoid.hw.seeds import evaluation_seed
 from servoid.tools.common.exit_codes import explain
 from servoid.tools.common.worker_pool import each
 from servoid.tools.evaluate.cache import EpisodeCache, key
 from servoid.tools.evaluate.code_hash import read_anew
-from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult, do_episode, episode_seed
+from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult, do_episode
 from servoid.tools.evaluate.policies import Policies, dependencies
 from servoid.tools.evaluate.progress import EpisodeBar, Forecast
 from servoid.tools.evaluate.report import Measured
@@ -200,4 +201,4 @@ def _jobs(prepared: Sequence[_Prepared], seed: int) -> Iterator[EpisodeJob]:
     for episode in range(max((one.episodes for one in prepared), default=0)):
         for number, one in enumerate(prepared):
             if episode < one.episodes and episode not in one.cache.records and one.refused is None:
-                yield EpisodeJob(number, episode, replace(one.settings, seed=episode_seed(seed, episode)))
+                yield EpisodeJob(number, episode, replace(one.settings, seed=evaluation_seed(seed, episode)))

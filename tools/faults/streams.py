@@ -7,8 +7,8 @@ import struct
 from collections.abc import Callable
 from itertools import pairwise
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import Instruction, Reset
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Instruction, Reset
 from servoid.hw.imu import bno08x, witmotion
 
 IDS = tuple(range(1, 21))

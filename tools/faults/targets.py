@@ -12,10 +12,10 @@ from typing import Protocol
 
 import numpy as np
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.codec import MAX_LENGTH, Parser
-from servoid.hw.dynamixel.group_read import GroupRead
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import MAX_LENGTH, Parser
+from servoid.hw.dynamixel.transport.bus import Bus
+from servoid.hw.dynamixel.transport.group_read import GroupRead
 from servoid.hw.imu.bno08x import Bno08x
 from servoid.hw.imu.reading import Decoder
 from servoid.hw.imu.witmotion import WitMotion
@@ -137,7 +137,7 @@ class DriverTarget:
         began = self._line.time
         for group in self._groups:
             self._line.answer(pieces)
-            self._bus.read_group(group)
+            self._bus.sync_read(group)
         self._line.answer(pieces)
         self._bus.ping(1, tries=1)
         if self._line.time - began > 200_000_000:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from servoid.hw.robot.description import load_robot
+from servoid.tools.learn.progress import counted
 
 if TYPE_CHECKING:
     from servoid.hw.contracts.control import Policy
@@ -38,7 +39,7 @@ def closed_loop_survival(
     robot, head = load_robot(robot_name), read_header(checkpoint)
     settings = planning(check_fit(checkpoint, head, robot), head["training"])
     settings = replace(settings, checkpoint=str(checkpoint))
-    policy = diffusion_policy(robot, settings, load_task("walk", {}, robot.dt).cost, shape=(worlds,))
+    policy = diffusion_policy(robot, settings, load_task("walk", {}, robot.dt).objective, shape=(worlds,))
     return survival_of(policy, measured_fleet(robot, worlds, seed), seconds)
 
 
@@ -80,7 +81,7 @@ def survival_of(policy: Policy, fleet: Fleet, seconds: float) -> dict[str, float
     command = np.zeros((worlds, 3))
     alive, errors = everything.copy(), []
     smooth = np.zeros((worlds, 2))
-    for tick in range(round(seconds * robot.rate)):
+    for tick in counted(round(seconds * robot.rate), "walking"):
         if tick % _CHANGE == 25:
             command = np.array([rng.uniform(low, high) for rng in fleet.rngs])
         if tick % _PUSH_EVERY == 0 and tick:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from servoid.hw.dynamixel.codec import HEADER
+from servoid.hw.dynamixel.protocol.codec import HEADER
 
 NOTICED_NS = 500_000  # behind by more, nobody can say when the host wrote what is there now
 NAMED_NS = 3_000_000  # behind by more, clients may have given an answer up

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from servoid.hw.dynamixel.codec import StatusError
-from servoid.hw.dynamixel.tables import Item, table
+from servoid.hw.dynamixel.protocol.codec import StatusError
+from servoid.hw.dynamixel.protocol.tables import Item, table
 from servoid.hw.imu.mounting import Mounting
 from servoid.sim.rig.servo.device import VirtualDevice
 from servoid.sim.rig.servo.motor_bank import MotorBank

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import struct
 
-from servoid.hw.dynamixel.codec import BROADCAST, CLEAR_REVOLUTIONS, Instruction, Reset, Status, StatusError
-from servoid.hw.dynamixel.tables import ControlTable, Item
+from servoid.hw.dynamixel.protocol.codec import BROADCAST, CLEAR_REVOLUTIONS, Instruction, Reset, Status, StatusError
+from servoid.hw.dynamixel.protocol.tables import ControlTable, Item
 from servoid.sim.rig.servo.registers import Registers
 
 BACKUP = 0x20  # the instruction: control table backup

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from servoid.hw.dynamixel.codec import StatusError
-from servoid.hw.dynamixel.tables import Item, table
+from servoid.hw.dynamixel.protocol.codec import StatusError
+from servoid.hw.dynamixel.protocol.tables import Item, table
 from servoid.sim.rig.servo.device import VirtualDevice
 from servoid.sim.rig.servo.virtual_servo import FIRMWARE
 

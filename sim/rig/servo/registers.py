@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from servoid.hw.dynamixel.codec import StatusError
-from servoid.hw.dynamixel.tables import ControlTable, Item
+from servoid.hw.dynamixel.protocol.codec import StatusError
+from servoid.hw.dynamixel.protocol.tables import ControlTable, Item
 
 
 class Registers:

@@ -6,8 +6,8 @@ import math
 import struct
 from collections.abc import Callable
 
-from servoid.hw.dynamixel.codec import StatusError
-from servoid.hw.dynamixel.tables import Item, table
+from servoid.hw.dynamixel.protocol.codec import StatusError
+from servoid.hw.dynamixel.protocol.tables import Item, table
 from servoid.sim.rig.factory_state import ticks_per_turn
 from servoid.sim.rig.servo.device import VirtualDevice
 from servoid.sim.rig.servo.firmware import CURRENT, CURRENT_POSITION, EXTENDED, FULL_PWM, POSITION, PWM

@@ -10,9 +10,9 @@ import operator
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import HEADER, Instruction, Packet, Parser, Status, StatusError
-from servoid.hw.dynamixel.crc import crc16
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import HEADER, Instruction, Packet, Parser, Status, StatusError
+from servoid.hw.dynamixel.protocol.crc import crc16
 from servoid.sim.rig.faults import MISSPOKEN, STATUS_KINDS, Chunk, FaultInjector
 from servoid.sim.rig.servo.device import VirtualDevice
 from servoid.sim.rig.wire import protocol1

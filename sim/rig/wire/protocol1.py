@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 
-from servoid.hw.dynamixel.codec import MAX_ID, Instruction, Packet, Reset, StatusError
+from servoid.hw.dynamixel.protocol.codec import MAX_ID, Instruction, Packet, Reset, StatusError
 
 _HEADER = b"\xff\xff"
 _BROADCAST = 0xFE

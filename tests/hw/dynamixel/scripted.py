@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from servoid.hw.contracts.body import BackendError
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import BROADCAST, Instruction, Packet, Parser
-from servoid.hw.dynamixel.tables import ControlTable, table
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import BROADCAST, Instruction, Packet, Parser
+from servoid.hw.dynamixel.protocol.tables import ControlTable, table
 
 BYTE_NS = 5000  # at 2 Mbit/s
 

@@ -10,11 +10,12 @@ import pytest
 from sdk_tables import shipped
 
 from servoid.hw.contracts.body import BackendError, Command, Mode
-from servoid.hw.dynamixel import arming, codec
 from servoid.hw.dynamixel.backend import DynamixelBackend
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.register_check import GRAVE, UNCOMPARED, compare, correct, find_servos
-from servoid.hw.dynamixel.tables import models, table
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.tables import models, table
+from servoid.hw.dynamixel.servos import arming
+from servoid.hw.dynamixel.servos.register_check import GRAVE, UNCOMPARED, compare, correct, find_servos
+from servoid.hw.dynamixel.transport.bus import Bus
 from servoid.hw.robot.description import load_robot
 from servoid.sim.rig.in_process import InProcessLine
 from servoid.sim.rig.rig import Rig

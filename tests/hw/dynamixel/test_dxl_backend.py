@@ -12,10 +12,10 @@ from scripted_op3 import ROBOT, Robot, active, run
 
 from servoid.hw.config import CONFIGS
 from servoid.hw.contracts.body import BackendError, Command, Mode
-from servoid.hw.dynamixel import codec
 from servoid.hw.dynamixel.backend import DynamixelBackend
-from servoid.hw.dynamixel.codec import Instruction
-from servoid.hw.dynamixel.register_check import as_table
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Instruction
+from servoid.hw.dynamixel.servos.register_check import as_table
 
 
 @pytest.fixture

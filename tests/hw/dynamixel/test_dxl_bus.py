@@ -8,10 +8,10 @@ import pytest
 from scripted import BYTE_NS, Memory, ScriptedBus
 
 from servoid.hw.contracts.body import BackendError
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.bus import GAP_NS, Bus
-from servoid.hw.dynamixel.codec import Instruction
-from servoid.hw.dynamixel.group_read import GroupRead
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Instruction
+from servoid.hw.dynamixel.transport.bus import GAP_NS, Bus
+from servoid.hw.dynamixel.transport.group_read import GroupRead
 
 IDS = list(range(1, 21))
 PRESENT = [(id, 126, 10) for id in IDS]
@@ -38,7 +38,7 @@ def test_a_cycle_is_one_write_and_ends_on_time(fast: bool) -> None:
     bus.send(b"")
     began = line.time
     before = codec.sync_write(116, 4, {id: bytes(4) for id in IDS})
-    assert bus.read_group(group, before) == 0
+    assert bus.sync_read(group, before=before) == 0
     assert positions(group) == [1000 + id for id in IDS]
     request, answer = 14 + len(IDS), 8 + 14 * 20 if fast else 21 * 20
     assert line.time - began == (len(before) + request + answer) * BYTE_NS + GAP_NS * (1 if fast else 20)
@@ -56,8 +56,8 @@ def test_groups_follow_each_other_without_a_pause() -> None:
     groups = GroupRead(PRESENT, fast=True), GroupRead([(200, 30, 20)])
     bus.send(b"")
     began = line.time
-    count = sum(len(group.begin().packet) + group.begin().answer for group in groups)
-    assert bus.read_groups(groups) == 0
+    count = sum(len(group.request_all().packet) + group.request_all().answer for group in groups)
+    assert bus.sync_read(*groups) == 0
     assert line.time - began == count * BYTE_NS + 2 * GAP_NS
 
     def corrupt(id: int, data: bytes) -> list[tuple[bytes, int]]:
@@ -65,13 +65,13 @@ def test_groups_follow_each_other_without_a_pause() -> None:
 
     line.fault = corrupt
     line.sent.clear()
-    assert bus.read_groups(groups) == 0
+    assert bus.sync_read(*groups) == 0
     assert [p.id for p in line.sent] == [codec.BROADCAST, 200, 5], "the damaged one is asked again, last"
     assert groups[0].data[4] == bytes(line.servos[5].bytes[126:136])
     assert (bus.counters.lost, bus.counters.recovered, line.collisions) == (1, 1, 0)
     line.fault = lambda id, data: [] if id == codec.BROADCAST else [(data, 0)]
     line.sent.clear()
-    assert bus.read_groups(groups) == 0
+    assert bus.sync_read(*groups) == 0
     asked = [p.instruction for p in line.sent]
     assert asked == [Instruction.FAST_SYNC_READ, Instruction.READ, Instruction.SYNC_READ]
     assert line.collisions == 0
@@ -88,7 +88,7 @@ def test_who_was_lost_in_a_fast_read_is_asked_again_in_the_same_tick() -> None:
         return [(bytes(damaged), 0)]
 
     line.fault = corrupt
-    assert bus.read_group(group) == 0
+    assert bus.sync_read(group) == 0
     assert positions(group) == [1000 + id for id in IDS]
     assert [p.instruction for p in line.sent] == [Instruction.FAST_SYNC_READ, Instruction.READ]
     assert line.sent[1].id == 5
@@ -103,7 +103,7 @@ def test_a_dead_servo_costs_only_its_own_values() -> None:
     group = GroupRead(PRESENT, fast=True)
     for _ in range(8):
         began = line.time
-        assert bus.read_group(group) == 1
+        assert bus.sync_read(group) == 1
         assert positions(group) == [None if id == 3 else 1000 + id for id in IDS]
         assert line.time - began < 12_000_000, "a tick of 20 ms still holds it"
         line.sleep_until(began + 20_000_000)
@@ -113,7 +113,7 @@ def test_a_dead_servo_costs_only_its_own_values() -> None:
     assert last.params[4:][-1] == 3, "it is asked last, so that nobody waits for it"
     assert line.sent[-1] is last, "and no longer asked twice"
     line.servos[3].answers = True
-    assert bus.read_group(group) == 0
+    assert bus.sync_read(group) == 0
     assert positions(group)[2] == 1003
 
 
@@ -121,7 +121,7 @@ def test_an_answer_that_comes_late_is_not_the_next_one() -> None:
     """The servo has moved since: its old answer, arriving in the next tick, must not pass as the new one."""
     line, bus = rig(2)
     group = GroupRead([(1, 126, 10), (2, 126, 10)])
-    bus.read_group(group)
+    bus.sync_read(group)
     held: list[bytes] = []
 
     def hold(id: int, data: bytes) -> list[tuple[bytes, int]]:
@@ -131,7 +131,7 @@ def test_an_answer_that_comes_late_is_not_the_next_one() -> None:
         return [(data, 0)]
 
     line.fault = hold
-    assert bus.read_group(group) == 1
+    assert bus.sync_read(group) == 1
     line.servos[2].put("present_position", 2222)
     assert len(held) == 2, "asked, and asked again"
 
@@ -140,10 +140,10 @@ def test_an_answer_that_comes_late_is_not_the_next_one() -> None:
 
     line.fault = deliver  # in place of the true answers, which would be the worst
     while held:
-        bus.read_group(group)
+        bus.sync_read(group)
         assert positions(group)[1] in (None, 2222)
     line.fault = None
-    bus.read_group(group)
+    bus.sync_read(group)
     assert positions(group) == [1001, 2222]
     assert bus.counters.unexpected > 0
 
@@ -151,18 +151,18 @@ def test_an_answer_that_comes_late_is_not_the_next_one() -> None:
 def test_after_a_fault_the_line_is_drained_before_the_next_packet() -> None:
     line, bus = rig(3)
     group = GroupRead([(i, 126, 10) for i in (1, 2, 3)])
-    bus.read_group(group)
+    bus.sync_read(group)
     line.fault = lambda id, data: [(data, 3_600_000)] if len(line.sent) == 2 else [(data, 0)]  # just too late
-    assert bus.read_group(group) == 0
+    assert bus.sync_read(group) == 0
     assert positions(group) == [1001, 1002, 1003]
     assert line.collisions == 0
     assert bus.counters.stray > 0
     line.fault = lambda id, data: [(data, 9_000_000)]  # later than the tick waits
-    bus.read_group(group)
+    bus.sync_read(group)
     before = line.collisions
     line.fault = None
     line.sleep_until(line.time + 20_000_000)
-    assert bus.read_group(group) == 0
+    assert bus.sync_read(group) == 0
     assert positions(group) == [1001, 1002, 1003]
     assert line.collisions == before
 
@@ -171,14 +171,14 @@ def test_duplicates_are_harmless_and_conflicts_are_not_believed() -> None:
     line, bus = rig(3)
     group = GroupRead([(i, 126, 10) for i in (1, 2, 3)])
     line.fault = lambda id, data: [(data, 0), (data, len(data) * BYTE_NS)] if id == 1 else [(data, 22 * BYTE_NS)]
-    assert bus.read_group(group) == 0
+    assert bus.sync_read(group) == 0
     assert positions(group) == [1001, 1002, 1003]
     assert bus.counters.duplicates == 1
     line, bus = rig(3)
     group = GroupRead([(i, 126, 10) for i in (1, 2, 3)])
     other = codec.status(1, 0, bytes(10))
     line.fault = lambda id, data: [(data, 0), (other, len(data) * BYTE_NS)] if id == 1 else [(data, 22 * BYTE_NS)]
-    bus.read_group(group)
+    bus.sync_read(group)
     assert bus.counters.conflicts >= 1
 
 
@@ -187,7 +187,7 @@ def test_a_wrong_id_is_not_taken() -> None:
     group = GroupRead([(i, 126, 10) for i in (1, 2)])
     stranger = codec.status(9, 0, bytes(10))
     line.fault = lambda id, data: [(stranger, 0)] if id == 1 else [(data, 0)]
-    assert bus.read_group(group) == 1
+    assert bus.sync_read(group) == 1
     assert positions(group) == [None, 1002]
     assert bus.counters.unexpected > 0
 
@@ -197,7 +197,7 @@ def test_an_error_without_data_is_an_answer_without_a_value() -> None:
     group = GroupRead([(1, 126, 10), (2, 126, 10)])
     refusal = codec.status(1, codec.ALERT | codec.StatusError.RESULT)
     line.fault = lambda id, data: [(refusal, 0)] if id == 1 else [(data, 0)]
-    assert bus.read_group(group) == 1
+    assert bus.sync_read(group) == 1
     assert (group.error[0], group.alert[0], group.data[0]) == (codec.StatusError.RESULT, True, None)
     assert positions(group)[1] == 1002
 
@@ -214,7 +214,7 @@ def test_an_alert_comes_with_valid_data() -> None:
         line, bus = rig(3)
         line.servos[2].put("hardware_error_status", 4)
         group = GroupRead([(i, 126, 10) for i in (1, 2, 3)], fast=fast)
-        assert bus.read_group(group) == 0
+        assert bus.sync_read(group) == 0
         assert group.alert == [False, True, False]
         assert positions(group) == [1001, 1002, 1003]
 
@@ -223,19 +223,19 @@ def test_an_echo_is_no_answer() -> None:
     line, bus = rig(3)
     line.echo = True
     group = GroupRead([(i, 126, 10) for i in (1, 2, 3)], fast=True)
-    assert bus.read_group(group) == 0
+    assert bus.sync_read(group) == 0
     assert bus.ping(2) == (2, 1020, 48, False)
 
 
 def test_a_babbling_line_does_not_hold_a_tick() -> None:
     line, bus = rig(3)
     group = GroupRead([(i, 126, 10) for i in (1, 2, 3)])
-    bus.read_group(group)
+    bus.sync_read(group)
     line.fault = lambda id, data: []
-    bus.read_group(group)
+    bus.sync_read(group)
     line.babble(bytes(range(256)) * 40)  # 51 ms of it
     began = line.time
-    bus.read_group(group)
+    bus.sync_read(group)
     assert line.time - began < 20_000_000
     assert bus.counters.babble > 0
 
@@ -246,7 +246,7 @@ def test_mixed_models_are_read_in_bulk() -> None:
     line.servos[200].put("gyro_z", -77)
     for fast in (False, True):
         group = GroupRead([(1, 126, 10), (200, 30, 20)], fast=fast)
-        assert bus.read_group(group) == 0
+        assert bus.sync_read(group) == 0
         assert len(group.data[0] or b"") == 10
         assert struct.unpack_from("<h", group.data[1] or b"", 6) == (-77,)
     assert {p.instruction for p in line.sent} == {Instruction.BULK_READ, Instruction.FAST_BULK_READ}
@@ -286,11 +286,11 @@ def test_a_return_delay_moves_the_deadline() -> None:
     delay = 500_000
     line.fault = lambda id, data: [(data, delay * id)]
     group = GroupRead(PRESENT)
-    assert bus.read_group(group) > 0
+    assert bus.sync_read(group) > 0
     line, bus = rig(20)
     bus.return_delay = delay * 1e-9
     line.fault = lambda id, data: [(data, delay * id)]
-    assert bus.read_group(GroupRead(PRESENT)) == 0
+    assert bus.sync_read(GroupRead(PRESENT)) == 0
 
 
 def test_an_interruption_in_mid_cycle_leaves_a_bus_that_works() -> None:
@@ -313,13 +313,13 @@ def test_an_interruption_in_mid_cycle_leaves_a_bus_that_works() -> None:
         line.sleep_until = interrupted  # type: ignore[method-assign]
         try:
             line.fault = (lambda id, data: []) if calls % 2 else None
-            bus.read_group(group)
+            bus.sync_read(group)
         except KeyboardInterrupt:
             pass
         line.sleep_until = lambda time_ns: sleep(line, time_ns)  # type: ignore[method-assign]
         line.fault = None
         bus.send(off)
-        assert bus.read_group(GroupRead([(id, 64, 1) for id in IDS])) == 0
+        assert bus.sync_read(GroupRead([(id, 64, 1) for id in IDS])) == 0
         assert all(line.servos[id].get("torque_enable") == 0 for id in IDS)
 
 
@@ -329,7 +329,7 @@ def test_a_port_that_is_gone_is_said_at_once() -> None:
     with pytest.raises(BackendError, match="gone"):
         bus.ping(1)
     with pytest.raises(BackendError, match="gone"):
-        bus.read_group(GroupRead([(1, 126, 10)]))
+        bus.sync_read(GroupRead([(1, 126, 10)]))
 
 
 def test_an_id_cannot_be_in_a_group_twice() -> None:

@@ -10,9 +10,9 @@ from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import BROADCAST, HEADER, Instruction, Packet, Parser, Status
-from servoid.hw.dynamixel.crc import crc16
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import BROADCAST, HEADER, Instruction, Packet, Parser, Status
+from servoid.hw.dynamixel.protocol.crc import crc16
 
 SDK = Protocol2PacketHandler()
 IDS = st.integers(0, 252)

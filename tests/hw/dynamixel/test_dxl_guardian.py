@@ -18,11 +18,12 @@ import pytest
 from scripted import Memory
 
 from servoid.hw.contracts.body import BackendError
-from servoid.hw.dynamixel import codec, guardian
-from servoid.hw.dynamixel.codec import Instruction, Packet, Parser
+from servoid.hw.dynamixel import guardian
 from servoid.hw.dynamixel.guardian_client import Lifeline
-from servoid.hw.dynamixel.port import SerialPort
-from servoid.hw.dynamixel.tables import table
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Instruction, Packet, Parser
+from servoid.hw.dynamixel.protocol.tables import table
+from servoid.hw.dynamixel.transport.port import SerialPort
 
 IDS = (1, 2, 3, 14)
 TORQUE = table("xm430-w350").item("torque_enable").address
@@ -258,8 +259,8 @@ def test_a_guardian_that_cannot_be_replaced_does_not_keep_torque_on(
 CONTROLLER = """
 import os, sys, time
 from servoid.hw.dynamixel.guardian_client import Lifeline
-from servoid.hw.dynamixel.port import SerialPort
-from servoid.hw.dynamixel.tables import table
+from servoid.hw.dynamixel.transport.port import SerialPort
+from servoid.hw.dynamixel.protocol.tables import table
 line = Lifeline(SerialPort(sys.argv[1], 2_000_000), (1, 2, 3, 14), table("xm430-w350"), 0.0)
 line.hold()
 if os.fork() == 0:  # a child that keeps everything open, the pipe among it

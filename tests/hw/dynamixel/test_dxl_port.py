@@ -13,7 +13,7 @@ import pytest
 
 from servoid.hw.clock import WallClock
 from servoid.hw.contracts.body import BackendError
-from servoid.hw.dynamixel.port import SerialPort, drain
+from servoid.hw.dynamixel.transport.port import SerialPort, drain
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 from sdk_tables import SHIPPED, shipped
 
 from servoid.hw.config import ConfigError
-from servoid.hw.dynamixel.tables import models, table
+from servoid.hw.dynamixel.protocol.tables import models, table
 
 SERVOS = [name for name in models() if name != "opencr"]
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servoid.hw.dynamixel.tables import table
-from servoid.hw.dynamixel.units import Units
+from servoid.hw.dynamixel.protocol.tables import table
+from servoid.hw.dynamixel.protocol.units import Units
 from servoid.hw.robot.description import Robot, load_robot
 
 ROBOT = load_robot("op3")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from servoid.hw.config import ConfigError
-from servoid.hw.dynamixel.tables import table
-from servoid.hw.dynamixel.units import Units
+from servoid.hw.dynamixel.protocol.tables import table
+from servoid.hw.dynamixel.protocol.units import Units
 from servoid.hw.robot.calibration import (
     Calibration,
     JointCalibration,

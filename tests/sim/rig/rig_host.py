@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import Instruction, Parser, Status, StatusError
-from servoid.hw.dynamixel.tables import table
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Instruction, Parser, Status, StatusError
+from servoid.hw.dynamixel.protocol.tables import table
 from servoid.hw.robot.description import Robot
 from servoid.sim.rig.rig import Rig
 

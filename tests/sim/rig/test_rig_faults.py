@@ -8,8 +8,8 @@ import pytest
 from rig_host import BOARD, Host
 
 from servoid.hw.config import ConfigError
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import parse_fast
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import parse_fast
 from servoid.hw.robot.description import Robot
 from servoid.sim.rig.faults import EXPECTED, KINDS, Fault, Outcome, load_scenario
 from servoid.sim.rig.rig import Rig

@@ -10,8 +10,8 @@ import pytest
 from rig_host import BOARD, Host
 
 from servoid.hw.contracts.body import Array, Command, Mode
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.tables import table
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.tables import table
 from servoid.hw.imu.mounting import Mounting
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs

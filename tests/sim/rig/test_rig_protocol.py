@@ -9,9 +9,9 @@ import pytest
 from rig_host import BOARD, Host
 
 from servoid.hw.config import CONFIGS
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import Reset, StatusError
-from servoid.hw.dynamixel.tables import table
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Reset, StatusError
+from servoid.hw.dynamixel.protocol.tables import table
 from servoid.hw.robot.description import Robot
 from servoid.sim.rig.rig import Rig
 from servoid.sim.rig.servo.virtual_servo import VirtualServo

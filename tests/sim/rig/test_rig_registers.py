@@ -8,9 +8,9 @@ import pytest
 from rig_host import BOARD, XM430, Host
 
 import servoid.sim.rig.rig
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import Reset, StatusError
-from servoid.hw.dynamixel.tables import models
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Reset, StatusError
+from servoid.hw.dynamixel.protocol.tables import models
 from servoid.hw.robot.description import Robot
 from servoid.sim.rig.process import control_requests
 from servoid.sim.rig.rig import Rig

@@ -16,7 +16,7 @@ import serial
 from rig_host import BOARD, XM430
 
 from servoid.hw.contracts.body import BackendError
-from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.protocol import codec
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.sim.rig.process.control import Control, LockedClock, RigProcess
 from servoid.sim.rig.process.server import Server

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from rig_host import BOARD, XM430, Host
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import parse_fast
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import parse_fast
 from servoid.sim.rig.rig import Rig
 from servoid.sim.rig.wire.dispatcher import TURNAROUND_NS
 from servoid.sim.rig.wire.half_duplex import Wire

@@ -62,9 +62,9 @@ class Walk:
 
 def walk(first: int) -> Walk:
     job = RunSettings("walk", seconds=(first + STALL + AFTER) * ROBOT.dt, seed=1, set={"vx": str(SPEED)})
-    task, backend = prepare(job)
+    assignment, backend = prepare(job)
     body: Any = backend
-    policy = diffusion_policy(ROBOT, cost=task.cost)
+    policy = diffusion_policy(ROBOT, cost=assignment.task.objective)
     stalled = Stalled(policy.plans.planner, first)
     stalled.policy = policy
     plans = policy.plans

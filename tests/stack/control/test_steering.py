@@ -15,12 +15,14 @@ import numpy as np
 import pytest
 
 from servoid.hw.config import ConfigError
+from servoid.hw.contracts.task import Episode
 from servoid.hw.contracts.world import Percept
 from servoid.stack.control import operator as steering
-from servoid.stack.control.operator import Gamepad, Keyboard, Recorded, open_steering
+from servoid.stack.control.operator import Gamepad, Keyboard, open_steering
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.tasks import load_task
+from servoid.stack.tasks.steer import Steered, SteeredAgain
 from servoid.tools.commands import replay
 
 NOTHING = Percept("task", 0.0)
@@ -184,19 +186,19 @@ def test_a_run_is_steered_by_the_gamepad_and_can_be_replayed(pad: VirtualPad, tm
 def test_recorded_steering_ends_as_the_person_did() -> None:
     ways = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
     for ended in (True, False):
-        device = Recorded(ways, ended)
-        wishes = [device.read() for _ in range(3)]
-        assert [wish.ends for wish in wishes] == [False, ended, ended]
-        assert [wish.way[0] for wish in wishes] == [0.1, 0.2, 0.0]
+        again = SteeredAgain(ways, ended)
+        for tick, (forward, done) in enumerate([(0.1, False), (0.2, ended), (0.0, ended)]):
+            assert again.instruct(tick, None, NOTHING).velocity[0] == forward  # type: ignore[arg-type]
+            assert again.done(None) == done  # type: ignore[arg-type]
 
 
 def test_steering_is_held_as_the_log_holds_it(terminal: tuple[Keyboard, Callable[[str], None], int]) -> None:
     keyboard, press, _ = terminal
     task = load_task("steer", {"forward": "0.3"})
-    task._device = keyboard  # type: ignore[attr-defined]
+    steered = Steered(Episode(), keyboard, task.settings)
     press("www")
-    velocity = task.instruct(0, None, NOTHING).velocity  # type: ignore[arg-type]
+    velocity = steered.instruct(0, None, NOTHING).velocity  # type: ignore[arg-type]
     assert velocity[0] == float(np.float32(0.18))
     press("ssssss")
-    assert task.instruct(1, None, NOTHING).velocity[0] == float(np.float32(-0.06))  # type: ignore[arg-type]
-    pickle.loads(pickle.dumps(task.cost))  # for a planner's process, which gets no terminal
+    assert steered.instruct(1, None, NOTHING).velocity[0] == float(np.float32(-0.06))  # type: ignore[arg-type]
+    pickle.loads(pickle.dumps(task.objective))  # for a planner's process, which gets no terminal

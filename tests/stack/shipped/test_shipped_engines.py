@@ -36,7 +36,7 @@ def requests() -> Sequence[PlanRequest]:
 
 
 def planner(engine: str) -> Runtime:
-    cost = load_task("walk", {}, ROBOT.dt, ROBOT).cost
+    cost = load_task("walk", {}, ROBOT.dt, ROBOT).objective
     return load_runtime(ROBOT, replace(SETTINGS, engine=engine), cost)
 
 

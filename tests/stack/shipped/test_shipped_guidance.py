@@ -42,7 +42,7 @@ def walking() -> Sequence[PlanRequest]:
 
 
 def planner(settings: DiffusionSettings) -> Runtime:
-    return load_runtime(ROBOT, settings, load_task("walk", {}, ROBOT.dt, ROBOT).cost)
+    return load_runtime(ROBOT, settings, load_task("walk", {}, ROBOT.dt, ROBOT).objective)
 
 
 def actions(runtime: Runtime, requests: Sequence[PlanRequest], velocity: Sequence[float]) -> Array:
@@ -90,10 +90,15 @@ class Told(BasePolicy):
 def walk(settings: DiffusionSettings, chosen: Mapping[str, str], seconds: float = 2.5) -> Trace:
     """A run by the truth."""
     job = RunSettings("walk", seconds=seconds, seed=1, set=chosen)
-    task, backend = prepare(job)
+    assignment, backend = prepare(job)
     body: Any = backend
     ground_truth = GroundTruth(body.simulation, ROBOT.dt)
-    run(job, backend=body, on_tick=ground_truth, policy=Told(diffusion_policy(ROBOT, settings, task.cost)))
+    run(
+        job,
+        backend=body,
+        on_tick=ground_truth,
+        policy=Told(diffusion_policy(ROBOT, settings, assignment.task.objective)),
+    )
     trace = ground_truth.trace()
     assert not trace.fallen
     assert len(trace.yaw) == 1 + round(seconds / ROBOT.dt)

@@ -10,8 +10,6 @@ import torch
 from task_bodies import DT, moves
 
 from servoid.hw.contracts.control import Instruction
-from servoid.hw.robot.description import load_robot
-from servoid.stack.control.policies import make_policy
 from servoid.stack.tasks import load_settings, load_task
 from servoid.stack.tasks.guidance import Weights, goal_cost, ground_cost, obstacle_cost, path_cost, total_cost
 
@@ -152,12 +150,7 @@ def test_weights_choose_the_terms_and_zero_leaves_the_planner_to_itself() -> Non
         ("goal", dict.fromkeys(TWIST, "0") | {"cost.goal": "1"}, True),
     ],
 )
-def test_a_task_whose_cost_is_zero_makes_a_policy_without_guidance(
-    monkeypatch: pytest.MonkeyPatch, task: str, settings: dict[str, str], guides: bool
+def test_a_task_whose_cost_is_zero_leaves_a_planner_without_guidance(
+    task: str, settings: dict[str, str], guides: bool
 ) -> None:
-    costs: list[object] = []
-    monkeypatch.setattr(
-        "servoid.stack.control.diffusion.diffusion_policy", lambda robot, s, cost, process: costs.append(cost)
-    )
-    make_policy("diffusion", load_robot(), load_task(task, settings), realtime=False)
-    assert [cost is not None for cost in costs] == [guides]
+    assert (load_task(task, settings).objective is not None) == guides

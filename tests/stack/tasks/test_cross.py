@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from task_bodies import moves, state
+from task_bodies import Drawn, moves, state
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
-from servoid.stack.navigation.collision_avoidance import Motion, Passing, way
+from servoid.stack.navigation.collision_avoidance import AvoidanceSettings, Motion, bearing_past
 from servoid.stack.tasks import load_settings, load_task
 
 DT = 0.02
@@ -22,13 +22,11 @@ GOAL = np.array([2.0, 0.0])
 
 
 def cross(seed: int = 0, **settings: str) -> Any:
-    task = load_task("cross", settings, DT)
-    task.reset(np.random.default_rng(seed))
-    return task
+    return Drawn(load_task("cross", settings, DT), seed)
 
 
 def bearing(*others: tuple[float, float, float, float]) -> float:
-    return way(GOAL, np.array(others).reshape(-1, 4), 0.25, 0.0, Passing())
+    return bearing_past(GOAL, np.array(others).reshape(-1, 4), 0.25, 0.0, AvoidanceSettings())
 
 
 # --- the way past others
@@ -49,7 +47,8 @@ def test_who_comes_head_on_is_passed_on_the_right() -> None:
 
 def test_a_way_once_chosen_is_kept() -> None:
     other = np.array([[1.0, -0.05, 0.0, 0.0]])
-    ways = [way(GOAL, other, 0.25, before, replace(Passing(), right=0.0, steady=1.0)) for before in (-0.5, 0.5)]
+    settings = replace(AvoidanceSettings(), right=0.0, steady=1.0)
+    ways = [bearing_past(GOAL, other, 0.25, before, settings) for before in (-0.5, 0.5)]
     assert ways[0] < 0.0 < ways[1]
 
 
@@ -67,17 +66,17 @@ def test_velocity_is_the_mean_over_the_window() -> None:
 
 def walk(first: Any, seconds: float) -> Trace:
     """Bodies that at once do what they are told, and see each other."""
-    tasks = [first, *first.teammates]
-    scene = first.scene()
+    asked = [first.behaviour, *first.behaviour.teammates]
+    scene = first.scene
     poses = np.vstack([np.zeros(3), scene.robots[:, :3]])
     goals = np.vstack([scene.goal, scene.robots[:, 3:]])
     rows = []
     for tick in range(round(seconds / DT)):
         rows.append(poses.copy())
         moved = poses.copy()
-        for i, task in enumerate(tasks):
+        for i, behaviour in enumerate(asked):
             percept = Percept("test", 0.0, goal=goals[i], robots=np.delete(poses, i, 0))
-            forward, left, turn = task.instruct(tick, state(*poses[i]), percept).velocity
+            forward, left, turn = behaviour.instruct(tick, state(*poses[i]), percept).velocity
             cos, sin = np.cos(poses[i, 2]), np.sin(poses[i, 2])
             moved[i] += DT * np.array([cos * forward - sin * left, sin * forward + cos * left, turn])
         if first.done(state(*poses[0])):
@@ -140,12 +139,12 @@ def test_the_cost_keeps_a_distance_from_where_the_others_will_be() -> None:
         )
         for speed in (0.5, -0.5)
     )
-    assert float(task.cost(ahead, met).detach()) > float(task.cost(ahead, free).detach())
+    assert float(task.objective(ahead, met).detach()) > float(task.objective(ahead, free).detach())
 
 
 def test_who_has_arrived_stands_and_the_first_is_done_when_all_have() -> None:
     task = cross(robots="2")
-    there, other = state(2.2, 0.0, 0.0), task.teammates[0]
+    there, other = state(2.2, 0.0, 0.0), task.behaviour.teammates[0]
     alone = Percept("scene", 0.0, robots=np.array([[1.0, 0.0, math.pi]]))
     assert not task.instruct(0, there, alone).velocity.any()
     assert not task.done(there)
@@ -159,7 +158,7 @@ def test_who_has_arrived_stands_and_the_first_is_done_when_all_have() -> None:
 
 def test_success_needs_all_there_none_fallen_and_none_touched() -> None:
     task = cross()
-    scene = task.scene()
+    scene = task.scene
     ends = np.column_stack([np.vstack([scene.goal, scene.robots[:, 3:]]), np.zeros(3)])
     starts = np.vstack([np.zeros(3), scene.robots[:, :3]])
     poses = np.stack([starts, ends])
@@ -177,7 +176,7 @@ def test_success_needs_all_there_none_fallen_and_none_touched() -> None:
 
 def test_starts_lie_on_the_circle_and_goals_opposite() -> None:
     for seed in range(5):
-        scene = cross(seed, robots="4").scene()
+        scene = cross(seed, robots="4").scene
         assert scene.robots.shape == (3, 5)
         middle = np.array([1.1, 0.0])
         np.testing.assert_allclose(np.linalg.norm(scene.robots[:, :2] - middle, axis=1), 1.1)
@@ -189,8 +188,8 @@ def test_starts_lie_on_the_circle_and_goals_opposite() -> None:
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"robots": "1"}, "robots: 1 cannot cross: give 2 to 4"),
-        ({"robots": "5"}, "robots: 5 cannot cross: give 2 to 4"),
+        ({"robots": "1"}, "robots: must be 2 to 4, not 1"),
+        ({"robots": "5"}, "robots: must be 2 to 4, not 5"),
         ({"circle": "0.3"}, "circle: 0.3 m is too small a radius for 3 robots, 0.7 m apart: give 0.47 or more"),
         ({"spread": "1.1"}, "spread: 1.1 rad: give 0 to less than 1.047"),
         ({"passing.fade": "0"}, "fade: must be positive"),

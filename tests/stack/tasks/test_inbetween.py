@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from task_bodies import state
+from task_bodies import Drawn, state
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.task import Trace
@@ -37,9 +37,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def drawn(clip: Path, robot: Robot) -> Any:
-    task = load_task("inbetween", {"clips": str(clip)}, DT, robot)
-    task.reset(np.random.default_rng(0))
-    return task
+    return Drawn(load_task("inbetween", {"clips": str(clip)}, DT, robot))
 
 
 def test_keyframes_are_told_with_the_ticks_that_are_left(clip: Path, robot: Robot) -> None:
@@ -59,7 +57,7 @@ def test_clips_begin_where_the_one_before_ended(clip: Path, robot: Robot) -> Non
     """Moved over the ground alone: joints, heights and velocities stay as they were recorded."""
     log = read_log(clip)
     layout = raw_layout(20)
-    frames = drawn(clip, robot)._frames
+    frames = drawn(clip, robot).episode.frames
     recorded = log.column("/state", "position")
     for frame in frames:
         assert np.abs(recorded - frame[layout.slice("position")]).max(1).min() < 1e-6
@@ -71,7 +69,7 @@ def test_clips_begin_where_the_one_before_ended(clip: Path, robot: Robot) -> Non
 
 def test_the_asked_velocity_comes_to_the_next_keyframe_in_time(clip: Path, robot: Robot) -> None:
     task = drawn(clip, robot)
-    frame = task._frames[0]
+    frame = task.episode.frames[0]
     layout = raw_layout(20)
     velocity = task.instruct(0, state(), NOTHING).velocity
     np.testing.assert_allclose(velocity[:2] * 26 * DT, frame[layout.slice("displacement")][:2], atol=1e-9)
@@ -82,7 +80,7 @@ def test_errors_are_zero_on_the_keyframes_and_in_metres(clip: Path, robot: Robot
     task = drawn(clip, robot)
     layout, last = raw_layout(20), 26 * 9
     ticks = np.arange(last + 1)
-    frames = task._frames[np.clip((ticks + 12) // 26 - 1, 0, 8)]
+    frames = task.episode.frames[np.clip((ticks + 12) // 26 - 1, 0, 8)]
     none = np.zeros((last + 1, 3))
     perfect = Trace(
         dt=DT,
@@ -112,7 +110,7 @@ def test_joints_are_where_the_robot_s_file_has_them(robot: Robot) -> None:
 
 def test_clips_that_cannot_be_used_are_refused(clip: Path, robot: Robot, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no clips: record some"):
-        load_task("inbetween", {}, DT).reset(np.random.default_rng(0))
+        load_task("inbetween", {}, DT).scenario(np.random.default_rng(0))
     with pytest.raises(ConfigError, match=r"gone\.mcap: cannot be read"):
         load_task("inbetween", {"clips": str(tmp_path / "gone.mcap")}, DT)
     with pytest.raises(ConfigError, match=r"its task lasted 15\d ticks; keyframes need more than 260"):

@@ -1,20 +1,16 @@
-"""The example of docs/new-task.md, as a reader would type it in."""
+"""docs/new-task.md, done to the letter in a folder of its own: its files are written, its commands are typed."""
 
 from __future__ import annotations
 
 import re
-import shutil
+import shlex
+import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
-import servoid.hw.config
-import servoid.stack.tasks
-from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.tasks.guidance import Weights
-from servoid.tools.commands.tasks import describe
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = (ROOT / "docs" / "new-task.md").read_text()
@@ -25,27 +21,34 @@ def block(language: str) -> str:
     return text
 
 
-@pytest.fixture
-def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The example in place: its module, its file of settings, its line in the table."""
-    configs = tmp_path / "configs"
-    shutil.copytree(servoid.hw.config.CONFIGS, configs)
-    (configs / "tasks" / "return.yaml").write_text(block("yaml"))
-    monkeypatch.setattr(servoid.hw.config, "CONFIGS", configs)
-    module = ModuleType("return_task")
-    monkeypatch.setitem(sys.modules, "return_task", module)
-    exec(compile("from __future__ import annotations\n" + block("python"), "new-task.md", "exec"), module.__dict__)
-    monkeypatch.setitem(servoid.stack.tasks._TASKS, "return", (module.Return, module.Return.description))
-    return module
+def servoid(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "servoid", *arguments], cwd=folder, capture_output=True, text=True)
 
 
-def test_the_example_walks_there_and_back(written: ModuleType) -> None:
-    described = describe("return")
-    assert described["description"] == "walk to a point ahead and come back"
-    assert {row["key"]: row["value"] for row in described["settings"]}["distance"] == "0.6"
-    result = run(RunSettings("return", policy="gait", set={"distance": "0.3"}))
-    assert result.outcome == "succeeded"
-    assert 0.15 < result.metrics["farthest_m"] < 0.7
+@pytest.mark.slow
+def test_what_the_page_says_works_in_a_fresh_folder(tmp_path: Path) -> None:
+    (file,) = re.findall(r"Write this into a file `(.*?)`", PAGE)
+    (tmp_path / file).write_text(block("python"))
+    told = []
+    for line in block("sh").splitlines():
+        program, *arguments = shlex.split(line)
+        assert program == "servoid"
+        done = servoid(tmp_path, *arguments)
+        assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+        told.append(done.stdout)
+    explained, ran, replayed, rolled = told
+    assert "come_back.py:ComeBack: walk to a point ahead and come back" in explained
+    assert re.search(r"distance +0\.6 +m +distance of the point to walk", explained)
+    assert "goal met" in ran
+    assert re.search(r"farthest_m: 0\.\d+", ran)
+    assert "identical over" in replayed
+    assert "not as it was recorded" not in replayed
+    assert re.search(r"success_rate +1", rolled)
+    (tmp_path / file).write_text(block("python") + "\n# Another one, which does the same.\n")
+    (tmp_path / "elsewhere").mkdir()
+    replayed = servoid(tmp_path / "elsewhere", "replay", "../there.mcap").stdout
+    assert "not as it was recorded: the task's file" in replayed
+    assert "identical over" in replayed
 
 
 def test_every_weight_of_the_cost_is_on_the_page() -> None:

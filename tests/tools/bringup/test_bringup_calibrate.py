@@ -29,9 +29,9 @@ from servoid.sim.rig.factory_state import FactoryState
 from servoid.sim.rig.process.control import LockedClock, RigProcess
 from servoid.tools.bringup import calibrate
 from servoid.tools.bringup.calibrate import MOVED, check_range, directions_of, turned
-from servoid.tools.bringup.encoders import Encoders
-from servoid.tools.bringup.hands import Person
-from servoid.tools.bringup.turning import describe_turns
+from servoid.tools.bringup.calibration.encoders import Encoders
+from servoid.tools.bringup.calibration.hands import Person
+from servoid.tools.bringup.calibration.turning import describe_turns
 from servoid.tools.common.output import Report
 
 ROBOT = load_robot()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from servoid.hw.contracts.body import Observation
-from servoid.hw.dynamixel.bus import Bus
+from servoid.hw.dynamixel.transport.bus import Bus
 from servoid.hw.robot.description import load_robot
 from servoid.sim.model import build
 from servoid.sim.rig.in_process import InProcessLine

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from test_bringup_scan import AT_2M, VIRTUAL, bus_of, write
 
-from servoid.hw.dynamixel.tables import table
+from servoid.hw.dynamixel.protocol.tables import table
 from servoid.sim.rig.process.control import RigProcess
 
 XM430 = table("xm430-w350")

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.bus_scan import power_on
-from servoid.hw.dynamixel.port import SerialPort
-from servoid.hw.dynamixel.tables import table
+from servoid.hw.dynamixel.protocol.tables import table
+from servoid.hw.dynamixel.servos.bus_scan import power_on
+from servoid.hw.dynamixel.transport.bus import Bus
+from servoid.hw.dynamixel.transport.port import SerialPort
 from servoid.hw.robot.description import load_robot
 from servoid.sim.rig.factory_state import FactoryState
 from servoid.sim.rig.process.control import LockedClock, RigProcess

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from servoid.hw.dynamixel import codec
+from servoid.hw.dynamixel.protocol import codec
 from servoid.stack.log.flightlog import read_log
 from servoid.tools.cli import main
 

@@ -12,6 +12,7 @@ import pytest
 
 from servoid.hw.config import CONFIGS, ConfigError
 from servoid.hw.contracts.body import BackendError
+from servoid.hw.seeds import episode_seed
 from servoid.policy.checkpoint import resolve
 from servoid.stack.runtime.run import RunSettings
 from servoid.tools.cli import main
@@ -120,7 +121,7 @@ def test_episodes_are_not_those_that_settings_are_tried_on(tmp_path: Path, done:
         run: [job.settings.seed for job in done.jobs if job.settings.task == run] for run in ("goal-near", "goal-far")
     }
     assert seeds["goal-near"][:2] == seeds["goal-far"]  # the same for every row
-    assert not set(seeds["goal-near"]) & {rollout.episode_seed(0, episode) for episode in range(100)}
+    assert not set(seeds["goal-near"]) & {episode_seed(0, episode) for episode in range(100)}
 
 
 def test_what_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

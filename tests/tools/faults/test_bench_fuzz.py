@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import Parser
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import Parser
 from servoid.tools.cli import main
 from servoid.tools.faults import fuzz, targets
 from servoid.tools.faults.streams import IDS, WIDTH, stream

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import BackendError
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.codec import MAX_ID
-from servoid.hw.dynamixel.tables import ControlTable, table
-from servoid.hw.dynamixel.units import Units
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import MAX_ID
+from servoid.hw.dynamixel.protocol.tables import ControlTable, table
+from servoid.hw.dynamixel.protocol.units import Units
+from servoid.hw.dynamixel.transport.bus import Bus
 from servoid.hw.robot.description import Joint, Robot, Servo
 
 POSITION_MODE = 3

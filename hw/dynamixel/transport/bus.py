@@ -7,18 +7,18 @@ can be left at any moment by an exception (Ctrl-C): the next call finds the mark
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
 from servoid.hw.clock import WallClock
 from servoid.hw.contracts.body import Clock
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import MAX_ID, OVERHEAD, Packet, Parser, Reset, Status, as_status, parse_fast
-from servoid.hw.dynamixel.group_read import GroupRead, Request
-from servoid.hw.dynamixel.port import Port, SerialPort, drain
-from servoid.hw.dynamixel.tables import Item
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import MAX_ID, OVERHEAD, Packet, Parser, Reset, Status, as_status, parse_fast
+from servoid.hw.dynamixel.protocol.tables import Item
+from servoid.hw.dynamixel.transport.group_read import GroupRead, Request
+from servoid.hw.dynamixel.transport.port import Port, SerialPort, drain
 
 MARGIN = 0.0035  # s after the predicted end: a USB adapter's latency timer of 1 ms, and what may hold up host or servo
 LONGEST_RETURN_DELAY = 254 * 2e-6  # s that a servo may be set to wait before it answers
@@ -89,29 +89,25 @@ class Bus:
         self._busy_until = self._write(packet)
         self._dirty = False
 
-    def read_group(self, group: GroupRead, before: bytes = b"", *, again: bool = True) -> int:
-        """Read a group; those that are lost are asked once more, by a plain read, unless `again` is False. `before`
-        goes out ahead, in the same write: a packet that nobody answers. Returns how many did not answer."""
-        return self.read_groups((group,), before, again=again)
-
-    def read_groups(self, groups: Sequence[GroupRead], before: bytes = b"", *, again: bool = True) -> int:
-        """Read groups one after the other, as `read_group` does; those that are lost are asked once more at the end.
-        What came whole is looked into while the next answer is on its way."""
+    def sync_read(self, *groups: GroupRead, before: bytes = b"", again: bool = True) -> int:
+        """Read groups, one after the other. Answers that are lost are asked for once more at the end, by a plain read,
+        unless `again` is False. `before` goes out ahead, in the same write: a packet that nobody answers. What came
+        whole is looked into while the next answer is on its way. Returns how many did not answer."""
         later: Callable[[], None] | None = None
         for group in groups:
-            later = self._exchange_group(group, group.begin(), before, later)
+            later = self._exchange_group(group, group.request_all(), before, later)
             before = b""
         if later is not None:
             later()
         lost = 0
         for group in groups:
             came = sum(group.fresh)
-            if came < len(group.ids) and again and (request := group.again()) is not None:
+            if came < len(group.ids) and again and (request := group.request_missing()) is not None:
                 later = self._exchange_group(group, request)
                 if later is not None:
                     later()
                 self.counters.recovered += sum(group.fresh) - came
-            group.settle()
+            group.queue_silent_last()
             lost += len(group.ids) - sum(group.fresh)
         return lost
 
@@ -140,7 +136,7 @@ class Bus:
         return None
 
     def _take_whole(self, group: GroupRead, request: Request, stream: bytes, sampled: int) -> None:
-        if not group.accept_all(request, stream, sampled):
+        if not group.take_all(request, stream, sampled):
             seen: dict[int, Status] = {}
             self._parser.reset()  # nothing of the exchange that goes on is in it yet
             for status in self._answers(request, stream):
@@ -155,13 +151,13 @@ class Bus:
         if request.fast:
             stream = bytearray()
             self._collect(predicted, lambda data: _fast_missing(stream, data, request), came=first)
-            if not group.accept_all(request, bytes(stream), sampled):
+            if not group.take_all(request, bytes(stream), sampled):
                 for status in self._answers(request, bytes(stream)):
                     self._take(group, request, status, sampled, seen)
         else:
 
             def missing(data: bytes) -> int:
-                if len(data) == request.answer and not seen and group.accept_all(request, data, sampled):
+                if len(data) == request.answer and not seen and group.take_all(request, data, sampled):
                     return 0
                 for status in self._answers(request, data):
                     self._take(group, request, status, sampled, seen)
@@ -178,7 +174,7 @@ class Bus:
 
     def _close(self, group: GroupRead, request: Request) -> int:
         """Count on how many a request was lost."""
-        lost = len(group.end(request))
+        lost = len(group.close(request))
         self.counters.lost += lost
         return lost
 
@@ -188,8 +184,8 @@ class Bus:
                 self.counters.duplicates += 1
             else:
                 self.counters.conflicts += 1
-                group.reject(status.id)
-        elif group.accept(request, status, sampled):
+                group.doubt(status.id)
+        elif group.take(request, status, sampled):
             seen[status.id] = status
             self.counters.refused += status.error != 0
         else:

@@ -1,11 +1,20 @@
-"""A set of registers that is read from many servos tick after tick, and what each of them answered last."""
+"""A set of registers that is read from many servos tick after tick, and what each of them answered last.
+
+    positions = GroupRead.of("present_position", {servo.id: servo.table for servo in servos})
+    bus.sync_read(positions)
+    positions.data[0]      # bytes of the first servo's newest answer; positions.fresh[0]: whether it came now
+
+The rest of the class is for the bus: `request_all` and `request_missing` say what to send, `take` and `take_all` what
+to believe of what comes, `close` and `queue_silent_last` what to remember of what did not.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.codec import FAST_BLOCK, FAST_HEAD, OVERHEAD, STUFFED, Status
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.codec import FAST_BLOCK, FAST_HEAD, OVERHEAD, STUFFED, Status
+from servoid.hw.dynamixel.protocol.tables import ControlTable
 
 SHAPES = 8  # lengths that requests rotate through after a loss: more than are sent in the time an answer may be late
 PATIENCE = 3  # reads in a row that a servo may miss before it is no longer asked twice in a tick
@@ -79,19 +88,24 @@ class GroupRead:
         if len(self._index) != n:
             raise ValueError(f"an ID is asked twice: {sorted(self.ids)}")
 
-    def begin(self) -> Request:
+    @classmethod
+    def of(cls, register: str, tables: Mapping[int, ControlTable]) -> GroupRead:
+        """A register of many servos: `tables` by ID. Raises KeyError where a model has no such register."""
+        return cls([(id, table.item(register).address, table.item(register).width) for id, table in tables.items()])
+
+    def request_all(self) -> Request:
         """The request of a new read, to all."""
         self.fresh = [False] * len(self.ids)
         return self._request(tuple(self._order), self.fast)
 
-    def again(self) -> Request | None:
+    def request_missing(self) -> Request | None:
         """A plain request to those that did not answer, or None if there is nobody worth asking again."""
         if not any(self.fresh) and all(self.misses):
             return None  # nobody there, again: it is the line
         lost = tuple(i for i in self._order if not self.fresh[i] and self.misses[i] <= PATIENCE)
         return self._request(lost, False) if lost else None
 
-    def accept(self, request: Request, status: Status, time_ns: int) -> bool:
+    def take(self, request: Request, status: Status, time_ns: int) -> bool:
         """Take an answer to `request`; False if it is none."""
         i = self._index.get(status.id)
         expected = request.expected.get(status.id)
@@ -106,7 +120,7 @@ class GroupRead:
         self.error[i], self.alert[i], self.misses[i] = 0, status.alert, 0
         return True
 
-    def accept_all(self, request: Request, stream: bytes, time_ns: int) -> bool:
+    def take_all(self, request: Request, stream: bytes, time_ns: int) -> bool:
         """Take the answers of everybody at once, if `stream` is exactly that; the usual case, and the quickest."""
         if not request.same or len(request.ids) != len(self.ids):
             return False
@@ -125,18 +139,18 @@ class GroupRead:
         self.error, self.alert = [0] * n, [False] * n
         return True
 
-    def reject(self, id: int) -> None:
+    def doubt(self, id: int) -> None:
         """Two different answers came from `id`: neither is believed."""
         self.fresh[self._index[id]] = False
 
-    def end(self, request: Request) -> list[int]:
+    def close(self, request: Request) -> list[int]:
         """Close a request; returns the IDs that it was lost on."""
         lost = [id for id in request.ids if not self.fresh[self._index[id]]]
         if lost:
             self._shape = (self._shape + 1) % SHAPES
         return lost
 
-    def settle(self) -> None:
+    def queue_silent_last(self) -> None:
         """Close a read: who did not answer goes to the end of the line."""
         if all(self.fresh):
             return

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import BackendError
-from servoid.hw.dynamixel.bus import LONGEST_RETURN_DELAY, Bus, Ping
-from servoid.hw.dynamixel.codec import MAX_ID, OVERHEAD
-from servoid.hw.dynamixel.register_check import RAM_BYTES, SERVO_BLOCKS, read_memory
-from servoid.hw.dynamixel.tables import ControlTable, Item, table
+from servoid.hw.dynamixel.protocol.codec import MAX_ID, OVERHEAD
+from servoid.hw.dynamixel.protocol.tables import ControlTable, Item, table
+from servoid.hw.dynamixel.servos.register_check import RAM_BYTES, SERVO_BLOCKS, read_memory
+from servoid.hw.dynamixel.transport.bus import LONGEST_RETURN_DELAY, Bus, Ping
 
 BAUDS = table("xm430-w350").bauds  # bit/s; the same for every model
 FACTORY_BAUD = 57600

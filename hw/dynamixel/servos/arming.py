@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from servoid.hw.dynamixel import codec
-from servoid.hw.dynamixel.register_check import Found
-from servoid.hw.dynamixel.tables import ControlTable
+from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.dynamixel.protocol.tables import ControlTable
+from servoid.hw.dynamixel.servos.register_check import Found
 
 # Writable RAM that shapes nothing here.
 IDLE = {

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.group_read import GroupRead
-from servoid.hw.dynamixel.register_check import Found
-from servoid.hw.dynamixel.units import Units
+from servoid.hw.dynamixel.protocol.units import Units
+from servoid.hw.dynamixel.servos.register_check import Found
+from servoid.hw.dynamixel.transport.bus import Bus
+from servoid.hw.dynamixel.transport.group_read import GroupRead
 from servoid.hw.faults import REBOOTED, STOP_BUTTON, STOP_BUTTON_AGAIN, TORQUE_LOST, WATCHDOG
 
 BLOCK = 4  # servos looked at in a tick
@@ -56,7 +56,7 @@ class ServoMonitor:
 
     def _monitor(self) -> None:
         block, group = self._monitors[self._turn]
-        self._bus.read_group(group, again=False)
+        self._bus.sync_read(group, again=False)
         for i, data, fresh in zip(block, group.data, group.fresh, strict=True):
             if fresh and data is not None:
                 self._judge(i, data)
@@ -64,7 +64,7 @@ class ServoMonitor:
     def _measure(self) -> None:
         block, group = self._slow[self._turn]
         self._turn = (self._turn + 1) % len(self._slow)
-        self._bus.read_group(group, again=False)
+        self._bus.sync_read(group, again=False)
         for i, data, fresh in zip(block, group.data, group.fresh, strict=True):
             if fresh and data is not None:
                 self.voltage[i] = self._voltage.decode(data)

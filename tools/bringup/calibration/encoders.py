@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from servoid.hw.contracts.body import Array, BackendError, Clock
-from servoid.hw.dynamixel.bus import Bus
-from servoid.hw.dynamixel.group_read import GroupRead
-from servoid.hw.dynamixel.register_check import Found
+from servoid.hw.dynamixel.servos.register_check import Found
+from servoid.hw.dynamixel.transport.bus import Bus
+from servoid.hw.dynamixel.transport.group_read import GroupRead
 from servoid.hw.robot.description import Robot
 
 STILL = 0.02  # rad that an angle may change by within WINDOW samples and yet be still: above a hand's tremor
@@ -22,8 +22,7 @@ class Encoders:
 
     def __init__(self, bus: Bus, clock: Clock, robot: Robot, found: Sequence[Found]) -> None:
         self.names, self._bus, self._clock = robot.names, bus, clock
-        parts = [(s.joint.id, s.table.item("present_position").address, 4) for s in found]
-        self._group = GroupRead(parts)
+        self._group = GroupRead.of("present_position", {servo.joint.id: servo.table for servo in found})
         self._items = [s.table.item("present_position") for s in found]
         self._center = np.array([servo.center_tick for servo in robot.servos])
         self._tick = 2.0 * np.pi / np.array([servo.ticks_per_turn for servo in robot.servos])
@@ -32,7 +31,7 @@ class Encoders:
         """One sample. Raises BackendError naming a servo that does not answer three times in a row."""
         for _ in range(3):
             self._clock.sleep_until(self._clock.now_ns() + PERIOD_NS)
-            self._bus.read_group(self._group)
+            self._bus.sync_read(self._group)
             if all(self._group.fresh):
                 ticks = [item.decode(data or b"") for item, data in zip(self._items, self._group.data, strict=True)]
                 return short((np.array(ticks) - self._center) * self._tick)

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
-from servoid.hw.dynamixel.crc import blocks_are_right, crc16, crc16_after
+from servoid.hw.dynamixel.protocol.crc import blocks_are_right, crc16, crc16_after
 
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE

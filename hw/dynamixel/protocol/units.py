@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.dynamixel.tables import ControlTable
+from servoid.hw.dynamixel.protocol.tables import ControlTable
 from servoid.hw.robot.description import Robot
 
 GAIN_MAX = 16383

@@ -1,0 +1,106 @@
+"""A setting's text, unit and range, written beside its field: `x: Annotated[float, Setting("how far", "m", above=0)]`.
+
+The range that is shown is the range that is checked. `overrides` changes settings from a command line.
+"""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+Range = tuple[float, float]  # low, high
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a field of a frozen dataclass is for. `above` is an open end of its range, `least` and `most` are closed."""
+
+    text: str
+    unit: str = ""
+    above: float | None = None
+    least: float | None = None
+    most: float | None = None
+
+    @property
+    def range(self) -> str:
+        """The range in words; empty where none is checked."""
+        if self.least is not None and self.most is not None:
+            return f"{self.least:g} to {self.most:g}"
+        ends = [("above", self.above), ("at least", self.least), ("at most", self.most)]
+        return ", ".join(f"{word} {end:g}" for word, end in ends if end is not None)
+
+    def problem(self, value: float) -> str:
+        """What is wrong with `value`; empty where it is in the range."""
+        low = (self.above is None or value > self.above) and (self.least is None or value >= self.least)
+        if low and (self.most is None or value <= self.most):
+            return ""
+        if self.above == 0.0 and not low:
+            return f"must be positive, not {value:g}"
+        if self.least == 0.0 and not low:
+            return f"must not be negative: {value:g}"
+        return f"must be {self.range}, not {value:g}"
+
+
+@dataclass(frozen=True)
+class Explained:
+    """A setting with its value. A part's settings have names with dots, as `--set` takes them."""
+
+    key: str
+    value: str  # as it is typed after `key=`
+    text: str
+    unit: str
+    range: str
+
+
+def check(settings: Any) -> None:
+    """Raise ValueError, which begins with the setting's name, for the first value outside its range."""
+    for name, setting, ordered in _described(type(settings)):
+        value = getattr(settings, name)
+        if ordered and value[0] > value[1]:
+            raise ValueError(f"{name}: upside down: {value[0]:g} is above {value[1]:g}; write low before high")
+        for number in _numbers(value):
+            if problem := setting.problem(number):
+                raise ValueError(f"{name}: {problem}")
+
+
+def explain(settings: Any, prefix: str = "") -> Iterator[Explained]:
+    """Each setting of a frozen dataclass, and then of the dataclasses in it."""
+    known = {name: setting for name, setting, _ in _described(type(settings))}
+    values = {f.name: getattr(settings, f.name) for f in fields(settings)}
+    for name, value in values.items():
+        if not is_dataclass(value):
+            setting = known.get(name, Setting(""))
+            yield Explained(prefix + name, as_typed(value), setting.text, setting.unit, setting.range)
+    for name, value in values.items():
+        if is_dataclass(value):
+            yield from explain(value, f"{prefix}{name}.")
+
+
+def as_typed(value: Any) -> str:
+    """A value as it is typed after `key=`."""
+    if isinstance(value, tuple):
+        nested = any(isinstance(item, tuple) for item in value)
+        return ":".join(as_typed(item).replace(":", ",") if nested else as_typed(item) for item in value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "none" if value is None else f"{value:g}" if isinstance(value, (int, float)) else str(value)
+
+
+def _described(cls: Any) -> tuple[tuple[str, Setting, bool], ...]:
+    """Name and setting of each field that has one, and whether its value is a range."""
+    hints = typing.get_type_hints(cls, include_extras=True)
+    found = []
+    for f in fields(cls):
+        extras = [extra for extra in getattr(hints[f.name], "__metadata__", ()) if isinstance(extra, Setting)]
+        found += [(f.name, extra, typing.get_args(hints[f.name])[0] == Range) for extra in extras[:1]]
+    return tuple(found)
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, tuple):
+        for item in value:
+            yield from _numbers(item)
+    elif isinstance(value, (int, float)):
+        yield value

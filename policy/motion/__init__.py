@@ -1,0 +1,1 @@
+"""Recorded and authored motions: clips, and libraries of them."""

@@ -1,0 +1,1 @@
+"""`servoid motions`: where clips come from, and what becomes of them."""

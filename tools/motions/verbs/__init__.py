@@ -1,0 +1,1 @@
+"""The verbs of `servoid motions`, a module each."""

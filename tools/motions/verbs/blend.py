@@ -1,0 +1,29 @@
+"""Write a clip that is one clip and then another, blended into each other."""
+
+from __future__ import annotations
+
+import argparse
+
+from servoid.tools.common.exit_codes import DONE
+from servoid.tools.common.output import reporting
+from servoid.tools.motions.verbs.options import add_library_arguments, add_out_arguments, clip_of, out_library
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("first", help="name in the library, or a file")
+    parser.add_argument("second", help="the clip that follows it")
+    parser.add_argument("--name", required=True, help="of the clip that is written")
+    parser.add_argument("--seconds", type=float, default=0.3, help="in which one becomes the other (default: 0.3)")
+    add_out_arguments(parser)
+    add_library_arguments(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        first, robot = clip_of(args.first, args)
+        second, _ = clip_of(args.second, args)
+        clip = first.followed_by(second, round(args.seconds * robot.rate), args.name)
+        path = out_library(args, robot).add(clip, replace=args.replace)
+        report.line(f"{path}: {clip.ticks * robot.dt:.1f} s")
+        report.result({"path": path, "name": clip.name, "seconds": clip.ticks * robot.dt})
+    return DONE

@@ -1,0 +1,68 @@
+"""Play a clip open loop in physics: the goals alone, without a controller, on many robots drawn at random."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from servoid.hw.config import ConfigError
+from servoid.tools.common.confidence import wilson
+from servoid.tools.common.exit_codes import DONE
+from servoid.tools.common.output import reporting
+from servoid.tools.common.parser import check_seed
+from servoid.tools.motions.verbs.options import add_library_arguments, clip_of
+
+HOLD_SECONDS = 1.0  # of the last goal: a robot that is about to fall has fallen by then
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("clip", help="name in the library, or a file")
+    parser.add_argument("--worlds", type=int, default=20, metavar="N", help="robots (default: 20)")
+    parser.add_argument("--randomise", action="store_true", help="draw each robot's mass, friction, delays ...")
+    parser.add_argument("--rate", type=float, default=1.0, help="times as fast (default: 1)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    add_library_arguments(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    with reporting(args.json) as report:
+        check_seed(args.seed)
+        if args.worlds < 1:
+            raise ConfigError(f"--worlds {args.worlds}: must be at least 1")
+        if not 0.1 <= args.rate <= 10.0:
+            raise ConfigError(f"--rate {args.rate:g}: must be between 0.1 and 10")
+        from servoid.tools.motions.physics import play
+
+        clip, robot = clip_of(args.clip, args)
+        goals = clip.at_rate(args.rate).joints
+        held = np.concatenate([goals, np.repeat(goals[-1:], round(HOLD_SECONDS * robot.rate), 0)])
+        played = play(
+            held, robot, begins=clip.about.begins, worlds=args.worlds, randomise=float(args.randomise), seed=args.seed
+        )
+        upright = clip.about.ends == "upright"
+        stood = int(played.stands.sum())
+        error = float(np.sqrt(np.mean((played.joints - played.goals) ** 2)))
+        result = {
+            "clip": clip.name,
+            "worlds": args.worlds,
+            "randomised": args.randomise,
+            "rate": args.rate,
+            "seconds": len(goals) * robot.dt,
+            "stands_share": stood / args.worlds if upright else None,
+            "stands_ci95": wilson(stood, args.worlds) if upright else None,
+            "joint_error_rad": error,
+            "torque_p99_nm": float(np.percentile(np.abs(played.effort), 99)),
+            "height_at_end_m": float(played.place[:, -1, 2].mean()),
+        }
+        report.table(("figure", "value"), [(key, _text(value)) for key, value in result.items()])
+        report.result(result)
+    return DONE
+
+
+def _text(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    if isinstance(value, list | tuple):
+        return " to ".join(_text(item) for item in value)
+    return str(value)
