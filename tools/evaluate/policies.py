@@ -185,9 +185,11 @@ def dependencies(
     """What the episodes of an experiment depend on: the same dependencies, the same episodes. Raises ConfigError."""
     from servoid.hw.robot.description import load_robot
     from servoid.stack.log.provenance import described, fingerprint, versions
-    from servoid.stack.tasks import load_settings
+    from servoid.stack.tasks import load_settings, source
 
+    own = source(experiment.task)
     return {
+        **({} if own is None else {"source": own}),
         "task": experiment.task,
         "settings": described(load_settings(experiment.task, dict(experiment.set))),
         "seconds": seconds,
