@@ -106,6 +106,7 @@ def changes(log: FlightLog) -> list[str]:
 
     settings = _settings(log)
     policy, recorded = policy_fingerprint(settings.policy), dict(log.header["policy"])
+    policy["name"] = log.header["settings"]["policy"]  # as it was typed
     if recorded.get("planner"):
         recorded["planner"] = with_new_names(recorded["planner"])
     header = {**log.header, **_part("policy", recorded)}
