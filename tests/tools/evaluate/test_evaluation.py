@@ -160,12 +160,12 @@ def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path) -> None
     from servoid.policy.diffusion.settings import load_settings
 
     mine = tmp_path / "mine.yaml"
-    mine.write_text("checkpoint: diffusion\nreplan: 6\n")
+    mine.write_text("checkpoint: diffusion\nexecution_horizon: 6\n")
     ran = []
 
     def do(job: EpisodeJob) -> EpisodeResult:
         ran.append(load_settings(job.settings.policy).execution_horizon)
-        mine.write_text("checkpoint: diffusion\nreplan: 8\n")
+        mine.write_text("checkpoint: diffusion\nexecution_horizon: 8\n")
         return EpisodeResult(job, {"success": True})
 
     evaluate([NEAR], Options(tmp_path, policy=str(mine), workers=1), do)
