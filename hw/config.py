@@ -163,8 +163,8 @@ class _Reader:
         try:
             return cls(**values)
         except ValueError as error:  # the dataclass's own check, which names what is wrong
-            named = {found.start(): name for name in items if (found := re.search(rf"\b{name}\b", str(error)))}
-            raise self.marks.error(key, str(error), _join(key, named[min(named)]) if named else key) from error
+            words = (_join(key, word) for word in re.findall(r"\w+(?:\.\w+)*", str(error)))
+            raise self.marks.error(key, str(error), next((w for w in words if w in self.marks.lines), key)) from error
 
     def mapping(self, node: yaml.Node, key: str) -> dict[str, yaml.Node]:
         if not isinstance(node, yaml.MappingNode):

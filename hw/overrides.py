@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import types
 import typing
-from collections.abc import Iterable
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,17 +14,16 @@ from servoid.hw.config import ConfigError, nearest, parse_number
 T = TypeVar("T")
 
 
-def override(base: T, settings: dict[str, str], where: str = "--set", beside: Iterable[str] = ()) -> T:
+def override(base: T, settings: dict[str, str], where: str = "--set") -> T:
     """The dataclass instance `base` with some fields read from text, as typed on a command line.
 
     A field of a field is named with a dot. A pair of numbers is written `low:high`, or as one number for both; a list
-    of points as `x,y:x,y`. `beside` are names that are read elsewhere, and may be meant by one that is unknown here.
-    Raises ConfigError naming the setting for an unknown key or a value that does not parse.
+    of points as `x,y:x,y`. Raises ConfigError naming the setting for an unknown key or a value that does not parse.
     """
-    return _set(base, [(key, key, text) for key, text in settings.items()], where, beside)
+    return _set(base, [(key, key, text) for key, text in settings.items()], where)
 
 
-def _set(base: Any, settings: list[tuple[str, str, str]], where: str, beside: Iterable[str] = ()) -> Any:
+def _set(base: Any, settings: list[tuple[str, str, str]], where: str) -> Any:
     """`base` with (key, key as typed, text) read, all at once: values that are good together come in any order."""
     hints = typing.get_type_hints(type(base))
     values: dict[str, Any] = {}
@@ -33,7 +31,7 @@ def _set(base: Any, settings: list[tuple[str, str, str]], where: str, beside: It
     for key, full, text in settings:
         name, _, rest = key.partition(".")
         if name not in hints:
-            raise ConfigError(f"{where} {full}={text}: unknown setting '{name}': {nearest(name, (*hints, *beside))}")
+            raise ConfigError(f"{where} {full}={text}: unknown setting '{name}': {nearest(name, hints)}")
         if rest:
             if not is_dataclass(getattr(base, name)):
                 raise ConfigError(f"{where} {full}={text}: '{name}' has no settings of its own")

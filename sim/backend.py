@@ -13,12 +13,11 @@ from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array, Command, Mode, Observation
 from servoid.hw.contracts.world import Scene, Start, World
 from servoid.hw.robot.description import Robot
+from servoid.hw.seeds import Stream, generator
 from servoid.sim.model import build
 from servoid.sim.scene import Stage, count_robots
 from servoid.sim.truth import Truth
 from servoid.sim.worlds import Worlds
-
-OTHERS_STREAM = 2  # distinguishes the other robots' random streams from others of the same seed; 1 is the task's
 
 
 class SimBackend:
@@ -32,9 +31,10 @@ class SimBackend:
         self._worlds = Worlds(
             robot, n, threads=1, randomise=float(randomise), model=build(robot, scene), together=n > 1
         )
-        # numpy pads a seed with zeros: what other streams of this seed are told apart by must not be 0 either.
-        streams = [[seed, 0], *([seed, OTHERS_STREAM, number] for number in range(1, n))]
-        rngs = [np.random.default_rng(stream) for stream in streams]
+        rngs = [
+            generator(seed, Stream.BODY),
+            *(generator(seed, Stream.TEAMMATES, number) for number in range(1, n)),
+        ]
         start, places = Start(), np.zeros((n, 3))
         if scene is not None and scene.robots is not None:
             places[1:] = scene.robots[:, :3]

@@ -64,7 +64,6 @@ def look_up(args: Namespace, verb: Verb) -> None:
     task = getattr(args, "task", None)
     if task and task != "TASK" and not is_file_reference(task):  # which its page writes, and its test runs
         given = settings(args) if hasattr(args, "set") else {}
-        given.pop("gain", None)  # the run's own, not the task's
         tasks.load_settings(task, given)
     if verb.module in ("servoid.tools.commands.run", "servoid.tools.commands.rollout"):
         assert args.policy in POLICIES

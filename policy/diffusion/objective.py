@@ -2,61 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
-from servoid.hw.config import ConfigError
-from servoid.policy.diffusion.model.config import DenoiserConfig
+from servoid.policy.diffusion.model.config import TOGETHER, DenoiserConfig, Objective
 from servoid.policy.diffusion.model.denoiser import Denoiser
 
 UNTOLD = 0.1  # share of windows without an instruction
-_TOGETHER = 2 / 3  # of the windows that are not for Diffusion Forcing, the share whose tokens go down together
-
-
-@dataclass(frozen=True)
-class Objective:
-    """What is trained for, beside the plain squared error."""
-
-    near_actions: int = 8  # ticks to come whose actions count in full
-    far_actions: float = 0.2  # weight of those beyond; 0 cuts them, as Diffuse-CLoC does
-    min_snr: float = 0.0  # clip of the signal-to-noise ratio that weights tokens; 0: all levels weigh the same
-    action_rate: float = 0.0  # weight of the error of the change from one action to the next
-    monotone: float = 0.0  # share of windows whose levels rise along the window, as in pyramid and rolling schedules
-    forcing: float = 0.25  # share of windows with independent levels everywhere, the past too: Diffusion Forcing
-
-    def __post_init__(self) -> None:
-        if self.near_actions < 1:
-            raise ConfigError(f"near_actions must be at least 1 tick, not {self.near_actions}")
-        if min(self.far_actions, self.min_snr, self.action_rate) < 0:
-            raise ConfigError("the weights of far actions and of the action rate, and min-SNR, must not be negative")
-        if not 0.0 <= self.forcing <= 1.0:
-            raise ConfigError(f"the share of windows for Diffusion Forcing must be 0 to 1, not {self.forcing:g}")
-        most = _TOGETHER * (1.0 - self.forcing)
-        if not 0.0 <= self.monotone <= most + 1e-9:
-            raise ConfigError(
-                f"the share of windows with monotone levels must be 0 to {most:g} with a share of {self.forcing:g} for"
-                f" Diffusion Forcing, not {self.monotone:g}: set --monotone or --forcing"
-            )
-
-
-PLAIN = Objective()
 
 
 def draw_levels(
-    config: DenoiserConfig, batch: int, committed: int, generator: torch.Generator, objective: Objective = PLAIN
+    config: DenoiserConfig, batch: int, generator: torch.Generator, objective: Objective
 ) -> tuple[Tensor, Tensor]:
     """Noise levels `(batch, state tokens)` and `(batch, action tokens)`.
 
     A share `forcing` of the windows has independent levels, clean included, and a noisy past, which they learn to mend
     (UniPhys, section 4.2). Of the others, which know their past, a third has independent levels of what is to come, and
     two thirds share one level, as they do when a plan is sampled; of these, a share `monotone` of all windows has
-    levels that rise along the window instead. In those two thirds the first 0 to `committed` actions to come are clean:
-    they run while a plan is being made.
+    levels that rise along the window instead. In those two thirds the first 0 to `inference_delay` actions to come are
+    clean: they run while a plan is being made.
     """
     forced = round(objective.forcing * batch)
-    together = round(_TOGETHER * (batch - forced))
+    together = round(TOGETHER * (batch - forced))
     n_states, n_actions, k = len(config.state_ticks), len(config.action_ticks), config.levels
     levels = torch.randint(k + 1, (batch, n_states + n_actions), generator=generator)
     levels[:together] = torch.randint(1, k + 1, (together, 1), generator=generator)
@@ -65,7 +32,7 @@ def draw_levels(
     states, actions = levels[:, :n_states], levels[:, n_states:]
     state_ticks, action_ticks = torch.from_numpy(config.state_ticks), torch.from_numpy(config.action_ticks)
     clean = torch.zeros(batch, 1, dtype=torch.long)
-    clean[:together] = torch.randint(committed + 1, (together, 1), generator=generator)
+    clean[:together] = torch.randint(objective.inference_delay + 1, (together, 1), generator=generator)
     known = torch.arange(batch)[:, None] < batch - forced
     states = torch.where((state_ticks <= 0) & known, 0, states)
     actions = torch.where((action_ticks < clean) & known, 0, actions)
@@ -104,7 +71,7 @@ def token_error(predicted: Tensor, target: Tensor, weight: Tensor) -> Tensor:
     return (error * weight).sum() / weight.sum().clamp_min(1e-9)
 
 
-def action_weight(config: DenoiserConfig, near: int = 8, far_weight: float = 0.2) -> Tensor:
+def action_weight(config: DenoiserConfig, near: int, far_weight: float) -> Tensor:
     """Loss weight of action tokens: 1 for the next `near` ticks, `far_weight` beyond, where they are uncertain."""
     ticks = torch.from_numpy(config.action_ticks)
     return torch.where(ticks < near, 1.0, far_weight) * (ticks >= 0)
@@ -137,16 +104,15 @@ def losses(
     actions: Tensor,
     text: Tensor | None,
     signal: Tensor,
-    committed: int,
     generator: torch.Generator,
-    objective: Objective = PLAIN,
+    objective: Objective,
 ) -> tuple[Tensor, Tensor]:
     """State and action losses of a batch of clean windows: squared error of the predicted clean tokens (x0).
 
     One window in ten is shown without its instruction `text` `(batch, text_size)`, for classifier-free guidance.
     """
     config = denoiser.config
-    state_levels, action_levels = draw_levels(config, len(states), committed, generator, objective)
+    state_levels, action_levels = draw_levels(config, len(states), generator, objective)
     noisy_states = add_noise(states, state_levels, signal, generator)
     noisy_actions = add_noise(actions, action_levels, signal, generator)
     text_mask = torch.rand(len(states), generator=generator) >= UNTOLD

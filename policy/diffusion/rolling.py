@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.seeds import wide_seed
 from servoid.policy.diffusion.features import Normaliser, joints_seen, to_tokens
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.schedule import DenoisingMatrix
@@ -87,5 +88,4 @@ def renoise(
 
 def seeded(*numbers: int) -> torch.Generator:
     """A generator of its own for each sequence of numbers, none of them negative."""
-    state = np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0]
-    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+    return torch.Generator().manual_seed(wide_seed(*numbers))

@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.policy import checkpoint
@@ -31,14 +30,14 @@ _PARTS = ("encoder", "prior", "decoder")
 class LatentConfig:
     """Shape of the three networks. Stored in the checkpoint."""
 
-    size: int = 16  # numbers of a latent; PULSE has 32 for a human's 69 joints
-    width: int = 256  # units of a hidden layer
-    layers: int = 2  # hidden ones
+    size: Annotated[int, "numbers of a latent; PULSE has 32 for a human's 69 joints"] = 16
+    width: Annotated[int, "units of a hidden layer"] = 256
+    layers: Annotated[int, "hidden layers"] = 2
 
     def __post_init__(self) -> None:
         for name in ("size", "width", "layers"):
             if getattr(self, name) < 1:
-                raise ConfigError(f"latent actions: {name} must be at least 1, not {getattr(self, name)}")
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ class LatentActions:
             made = cls(*(Mlp.from_tensors(checkpoint.part(tensors, name)) for name in _PARTS))
             hidden, n, z = (config.width,) * config.layers, state.size, config.size
             found = [part.sizes for part in (made.encoder, made.prior, made.decoder)]
-        except (KeyError, TypeError, IndexError, ConfigError) as error:
+        except (KeyError, TypeError, IndexError, ValueError) as error:
             raise CheckpointError(f"{path}: its latent actions do not fit its own header: {error}") from error
         needed = [(n + n_joints, *hidden, 2 * z), (n, *hidden, 2 * z), (n + z, *hidden, n_joints)]
         if found != needed:

@@ -1,4 +1,4 @@
-"""Reward terms of the tracker: pure functions of one step, `(n,)` each, summed by a table of weights."""
+"""Reward terms of the tracker: pure functions of one step, `(n,)` each."""
 
 from __future__ import annotations
 
@@ -140,9 +140,3 @@ TERMS: Mapping[str, Callable[[Step], Array]] = {
         target_rate, target_acceleration, effort, fall,
     )
 }  # fmt: skip
-
-
-def total(step: Step, weights: Mapping[str, float]) -> tuple[Array, dict[str, float]]:
-    """Weighted sum `(n,)` and the mean of each weighted term. Raises KeyError for an unknown term."""
-    parts = {name: weight * TERMS[name](step) for name, weight in weights.items()}
-    return np.sum(list(parts.values()), axis=0), {name: float(part.mean()) for name, part in parts.items()}

@@ -8,17 +8,15 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
-import numpy as np
-
 from servoid.hw.config import ConfigError, nearest
 from servoid.hw.dynamixel.protocol.tables import ControlTable, table
 from servoid.hw.robot.description import Robot
+from servoid.hw.seeds import Stream, generator
 
 Assembly = Literal["file", "random"]
 ASSEMBLIES: tuple[str, ...] = get_args(Assembly)
 _OFF = 0.2  # rad that a horn may sit off the file's zero: under one tooth and a half of an XM430's spline
 _REVERSED = 0.3  # share of servos mounted the other way round
-_STREAM = 11  # distinguishes its random numbers from others of the same seed
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ class FactoryState:
         """The robot with the zeros and directions of this rig."""
         if self.assembly == "file":
             return robot
-        rng = np.random.default_rng([seed, _STREAM])
+        rng = generator(seed, Stream.DELIVERY)
         off = rng.uniform(-_OFF, _OFF, len(robot.joints)).tolist()
         turned = (rng.random(len(robot.joints)) < _REVERSED).tolist()
         joints = []

@@ -15,12 +15,11 @@ from enum import Enum
 from pathlib import Path
 from typing import Literal, get_args
 
-import numpy as np
-
 from servoid.hw.config import ConfigError, load_yaml, nearest
 from servoid.hw.dynamixel.protocol import codec
 from servoid.hw.faults import ENCODER, INPUT_VOLTAGE, OVERHEATING, OVERLOAD, SHOCK
 from servoid.hw.robot.description import Robot
+from servoid.hw.seeds import Stream, generator
 
 Kind = Literal[
     "drop", "late", "truncate", "duplicate", "wrong_id", "corrupt", "error_status", "stuffed",
@@ -146,7 +145,7 @@ class FaultInjector:
 
     def __post_init__(self) -> None:
         self._faults: list[tuple[Fault, int]] = []
-        self._rng = np.random.default_rng([self.scenario.seed, 7])
+        self._rng = generator(self.scenario.seed, Stream.FAULTS)
         self.pending: list[tuple[float, bool, Fault, int]] = []  # time, whether it begins, of what has yet to happen
         for fault in self.scenario.faults:
             self.add(fault)

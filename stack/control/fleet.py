@@ -12,6 +12,7 @@ from servoid.hw.contracts.body import Array, Command, Mode
 from servoid.hw.contracts.control import Instruction, Policy, State
 from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import Robot
+from servoid.hw.seeds import generator
 from servoid.policy.mlp import Mlp
 from servoid.sim.truth import Truth
 from servoid.sim.worlds import Worlds
@@ -69,7 +70,7 @@ class Fleet:
         if not len(ids):
             return
         for i in ids:
-            self.rngs[i] = np.random.default_rng([*self._stream, int(i), int(self._episodes[i])])
+            self.rngs[i] = generator(*self._stream, int(i), int(self._episodes[i]))
             self._episodes[i] += 1
         start = Start() if start is None else start.of(ids)
         self.worlds.reset(ids, [self.rngs[i] for i in ids], start)

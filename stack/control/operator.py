@@ -29,7 +29,7 @@ _KEYS = {
 
 
 @dataclass(frozen=True)
-class Wish:
+class SteeringInput:
     """What the person wants now. `way` is `(3,)` in -1..1: forward, to the left, turning left."""
 
     way: Array
@@ -39,7 +39,7 @@ class Wish:
 class Steering(Protocol):
     """A device to steer with."""
 
-    def read(self) -> Wish:
+    def read(self) -> SteeringInput:
         """Never waits."""
         ...
 
@@ -68,15 +68,15 @@ class Gamepad:
         if self._pad is None:
             raise ConfigError("no gamepad is connected: plug one in, or steer by keys with --set device=keyboard")
 
-    def read(self) -> Wish:
+    def read(self) -> SteeringInput:
         for event in self._pygame.event.get():
             if event.type == self._pygame.JOYDEVICEREMOVED and self._pad is not None:
                 self._pad = None
             elif event.type == self._pygame.JOYDEVICEADDED:
                 self._find()
         if self._pad is None:
-            return Wish(np.zeros(3))
-        return Wish(
+            return SteeringInput(np.zeros(3))
+        return SteeringInput(
             np.array([self._axis(FORWARD_AXIS), self._axis(LEFT_AXIS), self._axis(TURN_AXIS)]),
             self._pad.get_numbuttons() > END_BUTTON and bool(self._pad.get_button(END_BUTTON)),
         )
@@ -114,7 +114,7 @@ class Keyboard:
         self._way, self._ends = np.zeros(3), False
         print(KEYS_HELP, file=sys.stderr, flush=True)
 
-    def read(self) -> Wish:
+    def read(self) -> SteeringInput:
         while select.select([self._fd], [], [], 0.0)[0]:
             try:
                 pressed = os.read(self._fd, 64).decode("ascii", "ignore")
@@ -124,7 +124,7 @@ class Keyboard:
                 self._way, self._ends = np.zeros(3), True
                 break
             self._press(pressed)
-        return Wish(self._way.copy(), self._ends)
+        return SteeringInput(self._way.copy(), self._ends)
 
     def close(self) -> None:
         """Leave the terminal as it was. May be called twice."""

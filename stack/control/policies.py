@@ -20,15 +20,15 @@ from servoid.stack.control.base import BasePolicy
 if TYPE_CHECKING:
     from servoid.policy.diffusion.settings import DiffusionSettings
 
-Maker = Callable[[str, Robot, Task, bool], Policy]
+Maker = Callable[[str, Robot, Task, bool, tuple[int, ...]], Policy]
 GROUP = "servoid.policies"  # of entry points
 
 
-def _diffusion(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
+def _diffusion(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
     from servoid.stack.control.diffusion import diffusion_policy
 
     cost: Any = Portable(task.objective) if realtime else task.objective
-    return diffusion_policy(robot, _planner(source), cost, process=realtime)
+    return diffusion_policy(robot, _planner(source), cost, process=realtime, shape=shape)
 
 
 def _planner(source: str) -> DiffusionSettings:
@@ -39,17 +39,17 @@ def _planner(source: str) -> DiffusionSettings:
     return replace(load_settings(), checkpoint=source) if trained else load_settings(source)
 
 
-def _expert(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
+def _expert(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
     from servoid.stack.control.tracker import ExpertPolicy
 
-    policy: Policy = ExpertPolicy(robot, source)
+    policy: Policy = ExpertPolicy(robot, source, shape)
     return policy
 
 
-def _gait(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
+def _gait(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
     from servoid.stack.control.gait import GaitPolicy
 
-    policy: Policy = GaitPolicy(robot)
+    policy: Policy = GaitPolicy(robot, shape)
     return policy
 
 
@@ -57,14 +57,14 @@ POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "gait"
 _KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert}  # of checkpoints
 
 
-def _own(source: str, robot: Robot, task: Task, realtime: bool) -> Policy:
+def _own(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
     """A policy of a user's own. Raises ConfigError with file and line where it cannot be made so."""
     plugin = _plugin(source)
     assert plugin is not None
     try:
-        policy: Policy = plugin.cls(robot)
+        policy: Policy = plugin.cls(robot, shape) if shape else plugin.cls(robot)
     except TypeError as error:
-        raise plugin.error(f"{plugin.cls.__name__}(robot): {error}") from error
+        raise plugin.error(f"{plugin.cls.__name__}(robot{', shape' if shape else ''}): {error}") from error
     return policy
 
 
@@ -77,14 +77,15 @@ def check_policy(name: str) -> None:
     _maker(name)
 
 
-def make_policy(name: str, robot: Robot, task: Task, realtime: bool) -> Policy:
-    """A policy for a robot and a task. Raises ConfigError for an unknown name, or for a checkpoint that does not fit.
+def make_policy(name: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...] = ()) -> Policy:
+    """A policy for a robot and a task, or for worlds of any leading `shape`.
 
-    `name` is one of POLICIES, the .safetensors file of a diffusion model or a tracker, a .yaml file of diffusion
-    settings, an installed package's, or `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it
-    answers at the tick that its plan is for.
+    Raises ConfigError for an unknown name, or for a checkpoint that does not fit. `name` is one of POLICIES, the
+    .safetensors file of a diffusion model or a tracker, a .yaml file of diffusion settings, an installed package's, or
+    `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is
+    for.
     """
-    return _maker(name)(name, robot, task, realtime)
+    return _maker(name)(name, robot, task, realtime, shape)
 
 
 def policy_fingerprint(name: str) -> dict[str, Any]:

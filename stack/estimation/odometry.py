@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from servoid.hw.contracts.body import Array
@@ -62,7 +64,10 @@ class OdometryFeatures:
         return picked.reshape(*picked.shape[:-2], -1)
 
 
-def load_odometry(robot: Robot) -> Mlp:
-    """The shipped correction `(..., 3)` m/s of the base velocity, heading frame. Raises CheckpointError."""
+def load_odometry(robot: Robot, name: str | Path = "odometry") -> Mlp:
+    """The correction `(..., 3)` m/s of the base velocity, heading frame: the shipped one, or of a file.
+
+    Raises CheckpointError.
+    """
     inputs = len(OFFSETS) * OdometryFeatures(robot).size
-    return Mlp.load(resolve("odometry"), "odometry", robot, inputs)[0]
+    return Mlp.load(resolve(name), "odometry", robot, inputs)[0]

@@ -77,7 +77,16 @@ def read_log(path: Path | str) -> FlightLog:
     header = found["/run"][0]
     if header.get("format") != FORMAT:
         raise ConfigError(f"{path}: log format {header.get('format')}, but this version reads {FORMAT}")
-    return FlightLog(path, header, found, complete)
+    return FlightLog(path, as_now(header), found, complete)
+
+
+def as_now(header: dict[str, Any]) -> dict[str, Any]:
+    """A header with the servos' gain where it is now: it was one of the task's settings, as text."""
+    settings = header.get("settings", {})
+    if "gain" not in settings.get("set", {}):
+        return header
+    chosen = {name: text for name, text in settings["set"].items() if name != "gain"}
+    return header | {"settings": settings | {"set": chosen, "gain": float(settings["set"]["gain"])}}
 
 
 # What the library raises at the point where a file was cut, depending on the record that it cuts.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import Protocol
 
 from servoid.hw.contracts.body import Array, Observation, Sensors
 from servoid.hw.contracts.control import State
+from servoid.hw.robot.description import Robot
 from servoid.stack.estimation.sample_hold import SampleHold, complete
 from servoid.stack.log.tick import Listener, Proposal, TickRecord, Timing
 from servoid.stack.runtime.clock import Schedule
@@ -31,21 +33,30 @@ class Supervisor(Protocol):
     def act(self, tick: int, observation: Observation, state: State | None) -> Proposal: ...
 
 
+@dataclass(frozen=True)
+class ControlledRobot:
+    """A robot that is connected, and what stands between it and whoever controls it."""
+
+    robot: Robot
+    sensors: Sensors
+    estimator: Estimator
+    guard: Guard
+
+
 class Loop:
     """Runs ticks on schedule until the guard has turned torque off, whatever happens."""
 
     def __init__(
         self,
-        sensors: Sensors,
-        estimator: Estimator,
+        controlled: ControlledRobot,
         supervisor: Supervisor,
-        guard: Guard,
         schedule: Schedule,
         interrupt: Interrupt,
         stops: Stops,
         listeners: tuple[Listener, ...] = (),
     ) -> None:
-        self._sensors, self._estimator, self._supervisor, self._guard = sensors, estimator, supervisor, guard
+        self._sensors, self._estimator, self._guard = controlled.sensors, controlled.estimator, controlled.guard
+        self._supervisor = supervisor
         self._schedule, self._interrupt, self._stops, self._listeners = schedule, interrupt, stops, listeners
         self._hold = SampleHold()
         self._estimated: int | None = None  # tick of the newest state

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.body import Clock
-from servoid.hw.contracts.control import Policy
 from servoid.hw.contracts.task import Assignment, Behaviour
 from servoid.hw.robot.description import Robot
+from servoid.hw.seeds import teammate_seed
+from servoid.stack.control.policies import make_policy
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import load_odometry
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.clock import Schedule
 from servoid.stack.runtime.interrupt import Interrupt, Stops
-from servoid.stack.runtime.loop import Loop
+from servoid.stack.runtime.loop import ControlledRobot, Loop
 from servoid.stack.runtime.phases import Phases
+from servoid.stack.runtime.settings import RunSettings
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import ENDED, Guard, Phase
 
@@ -29,13 +31,12 @@ _QUIET = {"phase", "task", "first"}  # kinds of events of others that the first 
 
 @dataclass(frozen=True)
 class _Member:
-    number: int
     behaviour: Behaviour
     guard: Guard
     loop: Loop
 
 
-class Others:
+class Teammates:
     """Robots 1 and on. They do their tasks for as long as the first robot, number 0, does its own.
 
     Call it with each tick of the first robot, whose log also tells what happens to them. As a Clock it is the world's,
@@ -45,39 +46,35 @@ class Others:
 
     def __init__(
         self,
+        settings: RunSettings,
         robot: Robot,
-        body: Backend,
         assignment: Assignment,
         behaviours: Sequence[Behaviour],
-        make: Callable[[], Policy],
+        body: Backend,
         first: Guard,
         interrupt: Interrupt,
-        seed: int,
-        gain: float,
     ) -> None:
-        """`body` is the first robot's, whose world has one for each of `behaviours`; `make` makes a policy."""
+        """`body` is the first robot's, whose world has a body for each of `behaviours`, and `first` its guard."""
         assert body.simulation is not None
         self._first, self._interrupt, self._robot = first, interrupt, robot
         self._clock: Clock = body.clock
         self._heard: list[Event] = []  # why the first robot ended: the others end with it
         self._open = ExitStack()
         self._members: list[_Member] = []
+        unpushed = replace(assignment, episode=replace(assignment.episode, pushes={}))  # it is the first that is pushed
         for number, (behaviour, other) in enumerate(zip(behaviours, body.simulation.teammates, strict=True), 1):
-            policy = make()
+            # Its planner never runs beside the loop: the log, which is the first robot's, has to repeat it.
+            policy = make_policy(settings.policy, robot, assignment.task, realtime=False)
             self._open.callback(policy.close)
-            policy.reset(None, np.random.SeedSequence([seed, number]).generate_state(1)[0])
+            policy.reset(None, np.array(teammate_seed(settings.seed, number)))
             sensors, motors = other.connect()
             self._open.callback(other.close)
-            guard = Guard(robot, motors, gain)
-            estimator = Estimator(robot, load_odometry(robot))
-            assert other.simulation is not None
-            assert other.simulation.surroundings is not None
-            look = other.simulation.surroundings.look
-            phases = Phases(robot, guard, estimator, assignment, behaviour, policy, None, look)
-            schedule = Schedule(other.clock, robot.rate)
-            stops = Stops(Interrupt(), script=self._heard)
-            loop = Loop(sensors, estimator, phases, guard, schedule, interrupt, stops, (self._listener(number),))
-            self._members.append(_Member(number, behaviour, guard, loop))
+            guard = Guard(robot, motors, settings.gain)
+            controlled = ControlledRobot(robot, sensors, Estimator(robot, load_odometry(robot)), guard)
+            phases = Phases(controlled, unpushed, behaviour, policy, other.simulation)
+            schedule, stops = Schedule(other.clock, robot.rate), Stops(Interrupt(), script=self._heard)
+            loop = Loop(controlled, phases, schedule, interrupt, stops, (self._listener(number),))
+            self._members.append(_Member(behaviour, guard, loop))
 
     def __call__(self, record: TickRecord) -> None:
         if record.phase in _ENDING and not self._heard:

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from servoid.hw.contracts.body import Array, Observation
+from servoid.hw.contracts.backend import Simulation
+from servoid.hw.contracts.body import Observation
 from servoid.hw.contracts.control import Instruction, Policy, State
 from servoid.hw.contracts.task import Assignment, Behaviour, Trace
-from servoid.hw.contracts.world import Percept
-from servoid.hw.robot.description import Robot
 from servoid.stack.estimation.sample_hold import missing
 from servoid.stack.log.tick import Proposal
 from servoid.stack.log.trace_buffer import TraceBuffer
-from servoid.stack.runtime.loop import Estimator
-from servoid.stack.safety.guard import Guard, Phase
+from servoid.stack.runtime.loop import ControlledRobot
+from servoid.stack.safety.guard import Phase
 
 WAIT_SECONDS = 1.0  # for a first sample from every sensor
 STILL_SECONDS = 0.5  # after homing, when the body has stopped swinging: gravity is taken from there, not from the way
@@ -26,29 +24,24 @@ SETTLE_SECONDS = 1.5  # standing still at home, in which the estimator learns th
 
 
 class Phases:
-    """Supervises a run. `push` changes the body's velocity, m/s `(2,)`; None where a body cannot be pushed.
-
-    `look` sees what is around the robot (`world.Surroundings`); without it the behaviour says what should be there.
-    """
+    """Supervises a run. On hardware, without a `simulation`, nothing pushes the robot; where no surroundings are seen,
+    the behaviour says what should be there."""
 
     def __init__(
         self,
-        robot: Robot,
-        guard: Guard,
-        estimator: Estimator,
+        controlled: ControlledRobot,
         assignment: Assignment,
         behaviour: Behaviour,
         policy: Policy,
-        push: Callable[[Array], None] | None = None,
-        look: Callable[[State], Percept] | None = None,
+        simulation: Simulation | None = None,
     ) -> None:
-        self._robot, self._guard, self._estimator, self._policy = robot, guard, estimator, policy
-        self._behaviour, self._seconds = behaviour, assignment.task.seconds
-        self._pushes = assignment.episode.pushes
-        self._push = push
-        self._look = behaviour.percept if look is None else look
+        self._robot, self._guard, self._estimator = controlled.robot, controlled.guard, controlled.estimator
+        self._behaviour, self._policy, self._simulation = behaviour, policy, simulation
+        self._seconds, self._pushes = assignment.task.seconds, assignment.episode.pushes
+        surroundings = None if simulation is None else simulation.surroundings
+        self._look = behaviour.percept if surroundings is None else surroundings.look
         self._settled = 0
-        self._buffer = TraceBuffer(len(robot.joints), round(self._seconds / robot.dt))
+        self._buffer = TraceBuffer(len(self._robot.joints), round(self._seconds / self._robot.dt))
         self.ended: str | None = None  # "done" or "time", if the task ended by itself
 
     @property
@@ -86,21 +79,26 @@ class Phases:
 
     def _do_task(self, state: State) -> Proposal:
         tick = self.task_ticks
-        percept = self._look(state)
-        instruction = self._behaviour.instruct(tick, state, percept)
-        self._buffer.add(state, instruction, percept)
+        try:
+            percept = self._look(state)
+            instruction = self._behaviour.instruct(tick, state, percept)
+            self._buffer.add(state, instruction, percept)
+            done = self._behaviour.done(state)
+        except Exception as error:  # whatever a task raises, the robot must end safe
+            self._guard.give_up(_failed("task", error))
+            return Proposal()
         shown = Proposal(instruction=instruction, percept=percept)
-        if self._behaviour.done(state):
+        if done:
             return self._end("done", DONE, shown, state)
         if tick * self._robot.dt >= self._seconds:
             return self._end("time", f"{self._seconds:g} s are over", shown, state)
         velocity = self._pushes.get(tick)
-        if velocity is not None and self._push is not None:
-            self._push(velocity)
+        if velocity is not None and self._simulation is not None:
+            self._simulation.push(velocity)
         try:
             target = self._policy.act(state, self._guard.applied, instruction)
         except Exception as error:  # whatever a controller raises, the robot must end safe
-            self._guard.give_up(_failed(error))
+            self._guard.give_up(_failed("policy", error))
             return shown
         self._tell()
         return Proposal(target, instruction, percept, self._policy.adopted)
@@ -110,7 +108,7 @@ class Phases:
         try:
             target = self._policy.act(state, self._guard.applied, Instruction(np.zeros(3)))
         except Exception as error:
-            self._guard.give_up(_failed(error))
+            self._guard.give_up(_failed("policy", error))
             return Proposal()
         self._tell()
         return Proposal(target, plan=self._policy.adopted)
@@ -129,6 +127,6 @@ class Phases:
         return replace(self._come_to_rest(state), instruction=shown.instruction, percept=shown.percept)
 
 
-def _failed(error: Exception) -> str:
+def _failed(what: str, error: Exception) -> str:
     where = traceback.extract_tb(error.__traceback__)[-1]
-    return f"the policy failed: {type(error).__name__}: {error} ({where.filename}:{where.lineno})"
+    return f"the {what} failed: {type(error).__name__}: {error} ({where.filename}:{where.lineno})"

@@ -2,94 +2,42 @@
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
+from types import TracebackType
 
 import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.backend import Backend
-from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Policy
-from servoid.hw.contracts.task import Assignment, Task, Trace
+from servoid.hw.contracts.task import Assignment, Behaviour, Task
+from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.calibration import calibrated
 from servoid.hw.robot.description import Robot, load_robot
+from servoid.hw.seeds import Stream, generator
 from servoid.stack.control.policies import make_policy, policy_fingerprint
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import load_odometry
-from servoid.stack.log.tick import Listener, TickRecord
+from servoid.stack.log.provenance import header
+from servoid.stack.log.recorder import Recorder, check_new
+from servoid.stack.log.tick import Listener
 from servoid.stack.runtime.backends import backend_kind, make_backend
 from servoid.stack.runtime.clock import RealTime, Schedule, WallClock
 from servoid.stack.runtime.interrupt import Interrupt, Stops
-from servoid.stack.runtime.loop import Loop
-from servoid.stack.runtime.multi_robot import Others
+from servoid.stack.runtime.loop import ControlledRobot, Loop
+from servoid.stack.runtime.multi_robot import Teammates
 from servoid.stack.runtime.phases import Phases
 from servoid.stack.runtime.realtime import undisturbed
+from servoid.stack.runtime.result import Result, Tally
+from servoid.stack.runtime.settings import RunSettings, Script
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import Guard, Phase
+from servoid.stack.safety.guard import Guard
 from servoid.stack.tasks import load_task, source
 from servoid.stack.tasks.steer import SteeredAgain
 
-MAX_GAIN = 2.0  # times the firmware's configured gain; above, a servo of this class rings
-TASK_STREAM = 1  # distinguishes the task's random stream from others of the same seed
-
-
-@dataclass(frozen=True)
-class RunSettings:
-    """What to run. `set` overrides the task's settings by name; `gain` in it scales the servos' position gain."""
-
-    task: str
-    backend: str = "sim"
-    robot: str = "op3"
-    policy: str = "diffusion"
-    randomise: bool = False  # draw the simulated robot's mass, friction, delays and so on
-    seconds: float | None = None  # instead of the task's own
-    seed: int = 0
-    set: Mapping[str, str] = field(default_factory=dict)
-    start: bool = False  # move a real robot without asking
-    record: Path | None = None  # flight log to write
-    realtime: bool | None = None  # in step with the wall; None: only where there is hardware
-    port: str | None = None
-
-
-@dataclass(frozen=True)
-class Script:
-    """What came to a recorded run from outside, for a run that repeats it."""
-
-    stops: tuple[Event, ...] = ()  # what ended it: Ctrl-C, a full disk
-    plans: Mapping[int, int] | None = None  # ticks of plan requests, and when their plans were adopted
-    velocities: Array | None = None  # (ticks, 3) that a person steered by,
-    ended: bool = False  # and whether the person ended the run
-
-
-@dataclass(frozen=True)
-class Result:
-    """How a run went, by what the robot knew. Times s, lateness ms."""
-
-    outcome: str  # succeeded, failed, fell, timed_out, stopped or interrupted
-    success: bool
-    seconds: float  # spent on the task
-    ticks: int  # spent on the task
-    missed: int
-    late_p50_ms: float
-    late_p99_ms: float
-    metrics: dict[str, float]
-    events: tuple[Event, ...]
-    trace: Trace
-    log: Path | None
-    interrupted: bool = False  # whether it was told to end, be it after its task had ended
-
-    def summary(self) -> dict[str, Any]:
-        """The result as JSON values, without the trace."""
-        from servoid.stack.log.format import event_message, plain
-
-        names = ("outcome", "success", "seconds", "ticks", "missed", "late_p50_ms", "late_p99_ms", "metrics")
-        values: dict[str, Any] = plain({name: getattr(self, name) for name in names})
-        return values | {"events": [event_message(event) for event in self.events]}
+Confirm = Callable[[str], None]
 
 
 def run(
@@ -98,142 +46,21 @@ def run(
     backend: Backend | None = None,
     on_tick: Listener | None = None,
     policy: Policy | None = None,
-    confirm: Callable[[str], None] | None = None,
+    confirm: Confirm | None = None,
     script: Script | None = None,
 ) -> Result:
     """Do one run and return how it went, the robot with torque off.
 
     `backend` and `policy` replace those that the settings name; a backend that offers a `simulation` starts itself and
-    need not keep to real time. `on_tick` is called after each tick and must be quick. `confirm` asks the person
-    at a real robot, and returns when it may move. `script` repeats a recorded run. Raises ConfigError before anything
-    is connected, BackendError when the body cannot be reached.
+    need not keep to real time. `on_tick` is called after each tick and must be quick. `confirm` asks the person at a
+    real robot, and returns when it may move. `script` repeats a recorded run. Raises ConfigError before anything is
+    connected, BackendError when the body cannot be reached.
     """
-    script = script or Script()
-    robot = load_robot(settings.robot)
-    task, gain = _task(settings, robot)
-    simulated = backend_kind(settings.backend).simulated if backend is None else backend.simulation is not None
-    realtime = not simulated if settings.realtime is None else settings.realtime
-    if not (simulated or settings.start or confirm):
-        raise ConfigError(
-            "nothing moves by itself on a real robot: give start=True (--start), or confirm at the prompt"
-        )
-    odometry = load_odometry(robot)
-    if settings.record is not None:
-        from servoid.stack.log.recorder import Recorder, check_new
-
-        check_new(settings.record)
-    assignment = draw(task, settings.seed)
-    scene = assignment.episode.scene
-    assembled, assembly = (robot, None) if simulated or backend is not None else calibrated(robot)
-    body = backend or make_backend(
-        settings.backend,
-        assembled,
-        seed=settings.seed,
-        randomise=settings.randomise,
-        port=settings.port,
-        scene=scene,
-    )
-    surroundings = None if body.simulation is None else body.simulation.surroundings
-    if scene is not None and simulated and surroundings is None:
-        raise ConfigError(
-            f"task '{task.name}' has a scene: make the backend with it (servoid.stack.runtime.run.prepare does)"
-        )
-    if scene is not None and scene.robots is not None and policy is not None:
-        robots = len(scene.robots) + 1
-        raise ConfigError(f"task '{task.name}' has {robots} robots, each with its own policy: name one instead")
-    with ExitStack() as stack:
-        behaviour = (
-            SteeredAgain(script.velocities, script.ended)
-            if task.steered and script.velocities is not None
-            else task.behaviour(assignment.episode)
-        )
-        stack.callback(behaviour.close)
-        interrupt = stack.enter_context(Interrupt(eager=True))
-        pilot = make_policy(settings.policy, robot, task, realtime) if policy is None else policy
-        stack.callback(pilot.close)
-        if script.plans is not None:
-            pilot.repeat(script.plans)
-        stack.callback(body.close)
-        stack.callback(setattr, interrupt, "eager", False)  # a second Ctrl-C must not break off the closing
-        push = None if body.simulation is None else body.simulation.push
-        if push is None and assignment.episode.pushes:
-            raise ConfigError(f"backend '{body.name}' cannot push the robot: drop the task's push setting")
-        pilot.reset(None, np.array(settings.seed))
-        sensors, motors = body.connect()
-        if not (simulated or settings.start) and confirm is not None:
-            known = f"{assembly}. " if assembly is not None else ""
-            confirm(f"{known}{robot.name} will go to its home pose and then: {task.name}")
-
-        # From here on a Ctrl-C is a request, until the motors are off.
-        interrupt.settle()
-        guard = Guard(robot, motors, gain)
-        if assembly is not None:
-            guard.note("system", assembly)
-        estimator = Estimator(robot, odometry)
-        look = None if surroundings is None else surroundings.look
-        phases = Phases(robot, guard, estimator, assignment, behaviour, pilot, push, look)
-        tally = _Tally()
-        listeners: list[Listener] = [tally]
-        others = None
-        time = body.clock
-        if behaviour.teammates and body.simulation is not None:
-            # Their planners never run beside the loop: the log, which is the first robot's, has to repeat them.
-            time = others = Others(
-                robot,
-                body,
-                assignment,
-                behaviour.teammates,
-                lambda: make_policy(settings.policy, robot, task, realtime=False),
-                guard,
-                interrupt,
-                settings.seed,
-                gain,
-            )
-            stack.callback(others.close)
-            listeners.append(others)
-        recorder = None
-        if settings.record is not None:
-            from servoid.stack.log.provenance import header
-
-            recorder = Recorder.create(
-                settings.record,
-                header(
-                    settings,
-                    robot,
-                    assignment,
-                    source(settings.task),
-                    body.name,
-                    policy_fingerprint(settings.policy) if policy is None else {"name": type(policy).__qualname__},
-                ),
-                wait=simulated and not realtime,
-            )
-            listeners.append(recorder)
-        if on_tick is not None:
-            listeners.append(on_tick)
-        if realtime:
-            stack.enter_context(undisturbed(not simulated, lambda text: guard.note("system", text)))
-        clock = RealTime(time) if realtime and not isinstance(time, WallClock) else time
-        requests = Stops(interrupt, lambda: recorder.error if recorder is not None else None, script.stops)
-        loop = Loop(
-            sensors, estimator, phases, guard, Schedule(clock, robot.rate), interrupt, requests, tuple(listeners)
-        )
-        try:
-            loop.run()
-            if others is not None:
-                others.finish()
-        except BaseException as error:
-            if recorder is not None:
-                recorder.events(guard.events())
-                recorder.close({"outcome": "error", "error": f"{type(error).__name__}: {error}"})
-            raise
-        last = guard.events()
-        tally.events += last
-        result = replace(tally.result(phases, guard, assignment, settings), interrupted=interrupt.count > 0)
-        if recorder is not None:
-            recorder.events(last)
-            recorder.close(result.summary())
-            result = _with_failure(result, recorder.error)
-        return result
+    with Run(settings, backend=backend, on_tick=on_tick, policy=policy, confirm=confirm, script=script) as one:
+        one.prepare()
+        one.connect()
+        one.loop()
+        return one.report()
 
 
 def prepare(settings: RunSettings) -> tuple[Assignment, Backend]:
@@ -242,36 +69,196 @@ def prepare(settings: RunSettings) -> tuple[Assignment, Backend]:
     Raises ConfigError like `run`.
     """
     robot = load_robot(settings.robot)
-    task, _ = _task(settings, robot)
-    assignment = draw(task, settings.seed)
-    body = make_backend(
+    assignment = draw(_task(settings, robot), settings.seed)
+    return assignment, _body(settings, robot, assignment.episode.scene)
+
+
+def draw(task: Task, seed: int) -> Assignment:
+    """The episode that a run with this seed does."""
+    return Assignment(task, task.scenario(generator(seed, Stream.TASK)))
+
+
+class Run:
+    """A run in four steps: prepare, connect, loop, report. It takes what `run` takes; leaving it lets go of all that it
+    holds."""
+
+    robot: Robot
+    assignment: Assignment
+    behaviour: Behaviour
+    body: Backend
+    policy: Policy
+    guard: Guard
+    phases: Phases
+
+    def __init__(
+        self,
+        settings: RunSettings,
+        *,
+        backend: Backend | None = None,
+        on_tick: Listener | None = None,
+        policy: Policy | None = None,
+        confirm: Confirm | None = None,
+        script: Script | None = None,
+    ) -> None:
+        self.settings, self._backend, self._on_tick, self._policy = settings, backend, on_tick, policy
+        self._confirm, self._script = confirm, script or Script()
+        self._interrupt = Interrupt(eager=True)
+        self._open = ExitStack()
+        self._tally = Tally()
+        self._recorder: Recorder | None = None
+        self._teammates: Teammates | None = None
+        self._assembly: str | None = None  # which calibration a real robot goes by
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._open.__exit__(kind, error, at)
+
+    def prepare(self) -> None:
+        """Choose robot, task and body, and check that they go together; nothing is connected. Raises ConfigError."""
+        settings, backend = self.settings, self._backend
+        self.robot = load_robot(settings.robot)
+        task = _task(settings, self.robot)
+        simulated = backend_kind(settings.backend).simulated if backend is None else backend.simulation is not None
+        self.realtime = not simulated if settings.realtime is None else settings.realtime
+        if not (simulated or settings.start or self._confirm):
+            raise ConfigError(
+                "nothing moves by itself on a real robot: give start=True (--start), or confirm at the prompt"
+            )
+        self._odometry = load_odometry(self.robot)
+        if settings.record is not None:
+            check_new(settings.record)
+        self.assignment = draw(task, settings.seed)
+        assembled = self.robot
+        if not simulated and backend is None:
+            assembled, self._assembly = calibrated(self.robot)
+        self.body = backend or _body(settings, assembled, self.assignment.episode.scene)
+        self._check()
+
+    def _check(self) -> None:
+        """Raise ConfigError where the task asks for what body or policy do not have."""
+        name, episode, simulation = self.assignment.task.name, self.assignment.episode, self.body.simulation
+        scene = episode.scene
+        if scene is not None and simulation is not None and simulation.surroundings is None:
+            raise ConfigError(
+                f"task '{name}' has a scene: make the backend with it (servoid.stack.runtime.run.prepare does)"
+            )
+        if scene is not None and scene.robots is not None and self._policy is not None:
+            robots = len(scene.robots) + 1
+            raise ConfigError(f"task '{name}' has {robots} robots, each with its own policy: name one instead")
+        if episode.pushes and simulation is None:
+            raise ConfigError(f"backend '{self.body.name}' cannot push the robot: drop the task's push setting")
+
+    def connect(self) -> None:
+        """Make the policy and open the body; ask whether a real robot may move. A Ctrl-C raises KeyboardInterrupt.
+
+        Raises ConfigError where the policy does not fit, BackendError where the body cannot be reached.
+        """
+        settings, task, body, robot = self.settings, self.assignment.task, self.body, self.robot
+        self.behaviour = self._behaviour()
+        self._open.callback(self.behaviour.close)
+        self._open.enter_context(self._interrupt)
+        self.policy = self._policy or make_policy(settings.policy, robot, task, self.realtime)
+        self._open.callback(self.policy.close)
+        self._interrupt.check()
+        if self._script.plans is not None:
+            self.policy.repeat(self._script.plans)
+        self._open.callback(body.close)
+        self._open.callback(setattr, self._interrupt, "eager", False)  # a second Ctrl-C must not break off the closing
+        self.policy.reset(None, np.array(settings.seed))
+        sensors, motors = body.connect()
+        self._interrupt.check()
+        if body.simulation is None and not settings.start and self._confirm is not None:
+            known = f"{self._assembly}. " if self._assembly is not None else ""
+            self._confirm(f"{known}{robot.name} will go to its home pose and then: {task.name}")
+        self._interrupt.settle()  # from here on a Ctrl-C is a request, until the motors are off
+        self.guard = Guard(robot, motors, settings.gain)
+        if self._assembly is not None:
+            self.guard.note("system", self._assembly)
+        self._controlled = ControlledRobot(robot, sensors, Estimator(robot, self._odometry), self.guard)
+        self.phases = Phases(self._controlled, self.assignment, self.behaviour, self.policy, body.simulation)
+
+    def loop(self) -> None:
+        """Do the ticks of the run, until torque is off. Raises BackendError where the body cannot be reached."""
+        listeners: list[Listener] = [self._tally]
+        clock = self.body.clock
+        if behaviours := self.behaviour.teammates:
+            clock = self._teammates = Teammates(
+                self.settings, self.robot, self.assignment, behaviours, self.body, self.guard, self._interrupt
+            )
+            self._open.callback(self._teammates.close)
+            listeners.append(self._teammates)
+        if self.settings.record is not None:
+            listeners.append(self._record())
+        if self._on_tick is not None:
+            listeners.append(self._on_tick)
+        if self.realtime:
+            self._open.enter_context(undisturbed(self.body.simulation is None, self._note))
+            clock = clock if isinstance(clock, WallClock) else RealTime(clock)
+        stops = Stops(self._interrupt, self._failure, self._script.stops)
+        schedule = Schedule(clock, self.robot.rate)
+        loop = Loop(self._controlled, self.phases, schedule, self._interrupt, stops, tuple(listeners))
+        try:
+            loop.run()
+            if self._teammates is not None:
+                self._teammates.finish()
+        except BaseException as error:
+            if self._recorder is not None:
+                self._recorder.events(self.guard.events())
+                self._recorder.close({"outcome": "error", "error": f"{type(error).__name__}: {error}"})
+            raise
+
+    def report(self) -> Result:
+        """How the run went, and the end of its log."""
+        last = self.guard.events()
+        self._tally.events += last
+        told = self._interrupt.count > 0
+        result = self._tally.result(self.phases, self.guard, self.assignment, self.settings.record, told)
+        if self._recorder is not None:
+            self._recorder.events(last)
+            self._recorder.close(result.summary())
+            result = _with_failure(result, self._recorder.error)
+        return result
+
+    def _behaviour(self) -> Behaviour:
+        assignment, steered = self.assignment, self._script.velocities
+        if assignment.task.steered and steered is not None:
+            return SteeredAgain(steered, self._script.ended)
+        return assignment.task.behaviour(assignment.episode)
+
+    def _record(self) -> Recorder:
+        settings, own = self.settings, self._policy
+        assert settings.record is not None
+        policy = policy_fingerprint(settings.policy) if own is None else {"name": type(own).__qualname__}
+        facts = header(settings, self.robot, self.assignment, source(settings.task), self.body.name, policy)
+        wait = self.body.simulation is not None and not self.realtime
+        self._recorder = Recorder.create(settings.record, facts, wait=wait)
+        return self._recorder
+
+    def _failure(self) -> str | None:
+        return None if self._recorder is None else self._recorder.error
+
+    def _note(self, text: str) -> None:
+        self.guard.note("system", text)
+
+
+def _task(settings: RunSettings, robot: Robot) -> Task:
+    values = dict(settings.set)
+    if settings.seconds is not None:
+        values["seconds"] = repr(settings.seconds)
+    return load_task(settings.task, values, robot.dt, robot)
+
+
+def _body(settings: RunSettings, robot: Robot, scene: Scene | None) -> Backend:
+    return make_backend(
         settings.backend,
         robot,
         seed=settings.seed,
         randomise=settings.randomise,
         port=settings.port,
-        scene=assignment.episode.scene,
+        scene=scene,
     )
-    return assignment, body
-
-
-def draw(task: Task, seed: int) -> Assignment:
-    """The episode that a run with this seed does."""
-    return Assignment(task, task.scenario(np.random.default_rng([seed, TASK_STREAM])))
-
-
-def _task(settings: RunSettings, robot: Robot) -> tuple[Task, float]:
-    values = dict(settings.set)
-    text = values.pop("gain", "1")
-    try:
-        gain = float(text)
-    except ValueError:
-        raise ConfigError(f"gain: '{text}' is not a number") from None
-    if not 0.0 < gain <= MAX_GAIN:
-        raise ConfigError(f"gain: {gain:g} is outside 0 to {MAX_GAIN:g}: it scales the servos' position gain")
-    if settings.seconds is not None:
-        values["seconds"] = repr(settings.seconds)
-    return load_task(settings.task, values, robot.dt, robot), gain
 
 
 def _with_failure(result: Result, error: str | None) -> Result:
@@ -282,42 +269,4 @@ def _with_failure(result: Result, error: str | None) -> Result:
     return replace(result, events=(*result.events, Event(last.tick, last.time, "record", None, error)))
 
 
-class _Tally:
-    """Counts while a run goes on."""
-
-    def __init__(self) -> None:
-        self.events: list[Event] = []
-        self._late = array("q")  # ns; a list of numbers would be five times as large
-        self._missed = 0
-
-    def __call__(self, record: TickRecord) -> None:
-        self.events += record.events
-        if record.phase is Phase.RUNNING:
-            self._late.append(record.timing.late)
-            self._missed += record.timing.missed
-
-    def result(self, phases: Phases, guard: Guard, assignment: Assignment, settings: RunSettings) -> Result:
-        trace = phases.trace()
-        success = bool(phases.ended is not None and assignment.success(trace))
-        late = np.array(self._late or [0], dtype=float) * 1e-6
-        return Result(
-            outcome=_outcome(phases, guard, success, trace),
-            success=success,
-            seconds=phases.task_ticks * trace.dt,
-            ticks=phases.task_ticks,
-            missed=self._missed,
-            late_p50_ms=float(np.percentile(late, 50)),
-            late_p99_ms=float(np.percentile(late, 99)),
-            metrics=assignment.metrics(trace) if phases.task_ticks else {},
-            events=tuple(self.events),
-            trace=trace,
-            log=settings.record,
-        )
-
-
-def _outcome(phases: Phases, guard: Guard, success: bool, trace: Trace) -> str:
-    if phases.ended is not None:
-        return "succeeded" if success else "timed_out" if phases.ended == "time" else "failed"
-    if trace.fallen:
-        return "fell"
-    return "interrupted" if guard.cause == "interrupt" else "stopped"
+__all__ = ["Result", "Run", "RunSettings", "Script", "draw", "prepare", "run"]

@@ -95,7 +95,7 @@ def load_settings(name: str, settings: dict[str, str] | None = None) -> Any:
         except (TypeError, ValueError) as error:
             raise known.plugin.error(f"the defaults of {known.cls.settings_type.__name__}: {error}") from error
     typed = known.cls.settings_type.completed(settings or {})
-    return override(base, typed, beside=("gain",))  # which a run takes for the servos
+    return override(base, typed)
 
 
 def load_task(name: str, settings: dict[str, str] | None = None, dt: float = 0.02, robot: Robot | None = None) -> Task:

@@ -38,14 +38,15 @@ def measure(robot_name: str, worlds: int, ticks: int) -> dict[str, float]:
     from servoid.policy.checkpoint import CheckpointError
     from servoid.stack.estimation.odometry import load_odometry
     from servoid.tools.learn.envs.tracking import Tracking
-    from servoid.tools.learn.settings import load_settings
+    from servoid.tools.learn.settings import TrackingSettings
 
     robot = load_robot(robot_name)
     try:
         odometry = load_odometry(robot)
     except CheckpointError:
         odometry = None  # a robot of the user's own, before its odometry is learned
-    env = Tracking(robot, worlds, odometry, load_settings())
+    env = Tracking(robot, worlds, odometry, TrackingSettings())
+    env.reset()
     source = env.fleet.worlds
     raw = Batch(source.model, worlds, 0)
     rng = np.random.default_rng(0)

@@ -69,7 +69,7 @@ def _jog(
     from servoid.stack.estimation.estimator import Estimator
     from servoid.stack.runtime.clock import RealTime, Schedule, WallClock
     from servoid.stack.runtime.interrupt import Interrupt, Stops
-    from servoid.stack.runtime.loop import Loop
+    from servoid.stack.runtime.loop import ControlledRobot, Loop
     from servoid.stack.safety.guard import Guard
     from servoid.tools.bringup.jogging import SPEED, JogSupervisor, Keys, There, reach, restrict
 
@@ -96,7 +96,8 @@ def _jog(
         shown = _Shown(guard, i, args.joint, here, sys.stderr)
         supervisor = JogSupervisor(restricted, guard, i, source)
         schedule = Schedule(clock, robot.rate)
-        loop = Loop(sensors, Estimator(robot), supervisor, guard, schedule, interrupt, Stops(interrupt), (shown,))
+        controlled = ControlledRobot(restricted, sensors, Estimator(robot), guard)
+        loop = Loop(controlled, supervisor, schedule, interrupt, Stops(interrupt), (shown,))
         try:
             loop.run()
         finally:

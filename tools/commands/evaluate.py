@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from servoid.hw.config import ConfigError
+from servoid.hw.config import ConfigError, available
 from servoid.tools.common.exit_codes import exit_code, explain
 from servoid.tools.common.output import Report, add_json_argument, reporting
 from servoid.tools.common.parser import check_seed
@@ -26,7 +26,8 @@ QUICK_MINUTES = 9.0  # one more is for the start and for drawing
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("evaluation", metavar="EVALUATION", help="papers, or FILE.yaml")
+    names = ", ".join(available("evaluation"))
+    parser.add_argument("evaluation", metavar="EVALUATION", help=f"{names}, or a YAML file of your own")
     parser.add_argument("--quick", action="store_true", help="few episodes of the main rows, in under 10 minutes")
     parser.add_argument(
         "--rows",

@@ -106,6 +106,7 @@ def changes(log: FlightLog) -> list[str]:
 
     settings = _settings(log)
     policy, recorded = policy_fingerprint(settings.policy), dict(log.header["policy"])
+    policy["name"] = log.header["settings"]["policy"]  # as it was typed
     if recorded.get("planner"):
         recorded["planner"] = with_new_names(recorded["planner"])
     header = {**log.header, **_part("policy", recorded)}
@@ -139,7 +140,7 @@ def _task(settings: RunSettings) -> dict[str, Any]:
     from servoid.stack.log.provenance import described, files
     from servoid.stack.tasks import find, load_settings, source
 
-    chosen = {key: value for key, value in settings.set.items() if key != "gain"}  # which is the servos'
+    chosen = dict(settings.set)
     if settings.seconds is not None:
         chosen["seconds"] = repr(settings.seconds)
     task = load_settings(settings.task, chosen)
@@ -170,7 +171,8 @@ def _by_tick(log: FlightLog) -> dict[int, Tick]:
 def _difference(number: int, recorded: Tick | None, repeated: Tick | None) -> Difference | None:
     if recorded is None or repeated is None:
         return Difference(number, "/run", "length: " + ("the repetition is longer" if repeated else "it ended earlier"))
-    for channel in sorted((recorded.keys() | repeated.keys()) - MACHINE_DEPENDENT.keys() | {"/plan"}):
+    compared = [name for name in recorded.keys() | repeated.keys() if MACHINE_DEPENDENT.get(name, ()) is not None]
+    for channel in sorted(compared):
         before, after = recorded.get(channel, []), repeated.get(channel, [])
         if len(before) != len(after):
             return Difference(number, channel, f"{len(before)} messages, now {len(after)}")

@@ -22,7 +22,7 @@ from servoid.hw.contracts.task import Assignment, Trace
 from servoid.tools.common.confidence import wilson
 from servoid.tools.common.exit_codes import exit_code, explain
 from servoid.tools.common.output import add_json_argument, reporting
-from servoid.tools.common.parser import add_set_argument, check_seed, settings
+from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, settings
 from servoid.tools.common.worker_pool import each
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, help="instead of the task's own")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode's stream (default: %(default)s)")
     add_set_argument(parser)
+    add_gain_argument(parser)
     add_json_argument(parser)
 
 
@@ -86,13 +87,6 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(f"backend '{args.backend}' has no truth to judge by: use a simulated one, or `servoid run`")
 
 
-def episode_seed(seed: int, episode: int) -> int:
-    """The seed that repeats episode `episode` with `servoid run`."""
-    import numpy as np
-
-    return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
-
-
 def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[int, dict[str, Any]]]:
     """All episodes with their rows, as they are done by `--workers` processes. Bad settings are refused before any.
 
@@ -100,6 +94,7 @@ def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[
     """
     from tqdm import tqdm
 
+    from servoid.hw.seeds import episode_seed
     from servoid.stack.runtime.run import RunSettings
 
     seeds = [episode_seed(args.seed, i) for i in range(args.episodes)]
@@ -112,6 +107,7 @@ def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[
             randomise=args.randomise,
             seconds=args.seconds,
             seed=seed,
+            gain=args.gain,
             set=values,
         )
         for seed in seeds

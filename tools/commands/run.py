@@ -17,7 +17,7 @@ from typing import Any
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, add_json_argument, reporting
-from servoid.tools.common.parser import add_set_argument, check_seed, settings
+from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, settings
 from servoid.tools.common.prompt import confirm
 
 EXIT_CODES = {
@@ -54,6 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=positive, metavar="S", help="length of the task instead of its own")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything that is random (default: 0)")
     add_set_argument(parser)
+    add_gain_argument(parser)
     parser.add_argument("--start", action="store_true", help="move a real robot without asking")
     parser.add_argument("--record", type=Path, metavar="FILE", help="flight log (default: runs/DATE-TASK.mcap)")
     parser.add_argument("--video", type=Path, metavar="FILE", help="film the run afterwards: MP4, and its path as PNG")
@@ -66,15 +67,10 @@ def main(args: argparse.Namespace) -> int:
         check_seed(args.seed)
         if args.video is not None:
             _prepare_video(args.video)
-        from servoid.stack.runtime.interrupt import Interrupt
-
-        with Interrupt(eager=True) as interrupt:  # these take a while, and a Ctrl-C meanwhile must not get lost
-            from servoid.stack.runtime.backends import backend_kind
-            from servoid.stack.runtime.run import RunSettings, run
-            from servoid.stack.tasks import find
-            from servoid.tools.common.live import LiveLine
-
-            interrupt.settle()
+        from servoid.stack.runtime.backends import backend_kind
+        from servoid.stack.runtime.run import RunSettings, run
+        from servoid.stack.tasks import find
+        from servoid.tools.common.live import LiveLine
 
         watched = (sys.stdout.isatty() and not args.json) or find(args.task).cls.steered
         plan = RunSettings(
@@ -85,6 +81,7 @@ def main(args: argparse.Namespace) -> int:
             randomise=args.randomise,
             seconds=args.seconds,
             seed=args.seed,
+            gain=args.gain,
             set=settings(args),
             start=args.start,
             record=args.record or _default_log(find(args.task).name),
@@ -104,7 +101,7 @@ def main(args: argparse.Namespace) -> int:
         for name, path in files.items():
             if path is not None:
                 report.line(f"{name:>8}: {path}")
-        chosen = {name: getattr(args, name) for name in ("task", "policy", "backend", "robot", "seed")}
+        chosen = {name: vars(args)[name] for name in ("task", "policy", "backend", "robot", "seed")}
         report.result(chosen | {"randomised": args.randomise} | result.summary() | files)
     return EXIT_CODES[result.outcome]
 

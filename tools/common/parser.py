@@ -53,7 +53,14 @@ def add_set_argument(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="change a setting of the task (servoid tasks); gain=G scales the servos' position gain",
+        help="change a setting of the task (servoid tasks)",
+    )
+
+
+def add_gain_argument(parser: argparse.ArgumentParser) -> None:
+    """`--gain G`, for `RunSettings.gain`."""
+    parser.add_argument(
+        "--gain", type=float, default=1.0, metavar="G", help="scale the servos' position gain; below 1 is softer"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ def recipe(robot: str) -> dict[str, Any]:
     }
 
 
-def record_clips(folder: Path, robot: str, number: int) -> list[Path]:
+def record_clips(folder: Path, robot: str, number: int, say: Callable[[str], None]) -> list[Path]:
     """Flight logs of `number` walks in all directions, recorded where they are not in `folder` yet.
 
     Raises ConfigError where the expert falls too often.
@@ -50,6 +51,7 @@ def record_clips(folder: Path, robot: str, number: int) -> list[Path]:
             part = place / f"part-{seed}.mcap"
             place.mkdir(parents=True, exist_ok=True)
             part.unlink(missing_ok=True)
+            say(f"recording {path}, one of {number} walks of the expert that keyframes are taken from")
             result = run(RunSettings("walk", policy="expert", robot=robot, seconds=SECONDS, seed=seed, record=part))
             if result.interrupted:  # a Ctrl-C that the run took for itself
                 raise KeyboardInterrupt

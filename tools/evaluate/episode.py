@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from servoid.stack.runtime.run import RunSettings
 
 PATH_STEP = 0.2  # s between the points of a path that is kept
-_STREAM = 20_250_417  # any number but 0: the episodes are not those of `servoid rollout`, on which settings are tried
 
 
 @dataclass(frozen=True)
@@ -38,11 +37,6 @@ class EpisodeResult:
     record: dict[str, Any]
     refused: str | None = None
     wall_seconds: float = 0.0
-
-
-def episode_seed(seed: int, episode: int) -> int:
-    """The seed of an episode, which repeats it with `servoid run`."""
-    return int(np.random.SeedSequence([seed, episode, _STREAM]).generate_state(1)[0])
 
 
 def do_episode(job: EpisodeJob) -> EpisodeResult:

@@ -23,7 +23,13 @@ if TYPE_CHECKING:
 
 _DATA = "runs/walks"  # the dataset that the README shows how to record
 _LAST = "last.safetensors"  # the newest network of a training run, beside its best
-_WHATEVER = ("evaluate_every", "seed")  # of training: what does not make another kind of network
+_WHATEVER = (
+    "evaluate_every",
+    "seed",
+    "survival_seconds",
+    "survival_worlds",
+    "licence",
+)  # of training: what does not make another kind of network
 
 
 class Policies:
@@ -140,13 +146,18 @@ def _anew(path: Path) -> str:
 def _check_training(path: Path, network: OwnNetwork) -> None:
     """Raise ConfigError for a network that was trained with other options than its row says."""
     from servoid.policy.checkpoint import read_header
+    from servoid.tools.learn.flags import plain, read_settings
+    from servoid.tools.learn.settings import DiffusionTraining
     from servoid.tools.learn.trainers.diffusion import add_arguments
 
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    asked = vars(parser.parse_args(["--data", "", "--out", "", *shlex.split(network.train)]))
+    args = parser.parse_args(["--data", "", "--out", "", *shlex.split(network.train)])
+    asked = plain(read_settings(args, DiffusionTraining()))
     header = read_header(path)
     given = {**header.get("config", {}), **header.get("training", {})}
+    if "committed" in given:  # in headers of before it was called inference_delay
+        given["inference_delay"] = given.pop("committed")
     whatever = {*_WHATEVER, "minutes"} if asked["steps"] else _WHATEVER  # then they say when to evaluate, and no more
     for name, value in given.items():
         if name in asked and name not in whatever and asked[name] != value:
@@ -176,9 +187,11 @@ def dependencies(
     """What the episodes of an experiment depend on: the same dependencies, the same episodes. Raises ConfigError."""
     from servoid.hw.robot.description import load_robot
     from servoid.stack.log.provenance import described, fingerprint, versions
-    from servoid.stack.tasks import load_settings
+    from servoid.stack.tasks import load_settings, source
 
+    own = source(experiment.task)
     return {
+        **({} if own is None else {"source": own}),
         "task": experiment.task,
         "settings": described(load_settings(experiment.task, dict(experiment.set))),
         "seconds": seconds,

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
+from servoid.hw.seeds import evaluation_seed
 from servoid.tools.common.exit_codes import explain
 from servoid.tools.common.worker_pool import each
 from servoid.tools.evaluate.cache import EpisodeCache, key
 from servoid.tools.evaluate.code_hash import read_anew
-from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult, do_episode, episode_seed
+from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult, do_episode
 from servoid.tools.evaluate.policies import Policies, dependencies
 from servoid.tools.evaluate.progress import EpisodeBar, Forecast
 from servoid.tools.evaluate.report import Measured
@@ -86,7 +87,7 @@ def evaluate(
     begun = time.monotonic()
     read = read_anew(options.robot)
     policies = Policies(options.policy, options.out)
-    measured, prepared = _prepare_all(rows, policies, options)
+    measured, prepared = _prepare_all(rows, policies, options, say)
     jobs, commit = list(_jobs(prepared, options.seed)), git_commit()
     cached = sum(len(one.records()) for one in prepared)
     ahead = "" if options.minutes == 0 else f", {len(jobs)} are to be done"
@@ -126,7 +127,7 @@ def evaluate(
 
 
 def _prepare_all(
-    rows: Sequence[Row], policies: Policies, options: Options
+    rows: Sequence[Row], policies: Policies, options: Options, say: Callable[[str], None]
 ) -> tuple[dict[str, Measured], list[_Prepared]]:
     """Why rows cannot be done, by their names, and the experiments of the others."""
     measured: dict[str, Measured] = {}
@@ -137,7 +138,7 @@ def _prepare_all(
             try:
                 training = policies.training(row.experiment)
                 if training is None:
-                    one = _prepare(row.experiment, policies, options)
+                    one = _prepare(row.experiment, policies, options, say)
                     prepared.setdefault(one.cache.path.name, one)
                     known[repr(row.experiment)] = one.cache.path.name
                 else:
@@ -152,7 +153,7 @@ def _prepare_all(
     return measured, list(prepared.values())
 
 
-def _prepare(experiment: Experiment, policies: Policies, options: Options) -> _Prepared:
+def _prepare(experiment: Experiment, policies: Policies, options: Options, say: Callable[[str], None]) -> _Prepared:
     """Raises ConfigError where the experiment cannot be done."""
     from servoid.stack.runtime.run import RunSettings
     from servoid.stack.tasks import load_settings
@@ -162,8 +163,9 @@ def _prepare(experiment: Experiment, policies: Policies, options: Options) -> _P
     if experiment.clips:
         number = experiment.clips
         recipe = key(clips.recipe(options.robot) | {"number": number})
-        recorded = [] if options.minutes == 0 else clips.record_clips(options.out / "clips", options.robot, number)
-        chosen["clips"] = ":".join(map(str, recorded))
+        if options.minutes != 0:
+            recorded = clips.record_clips(options.out / "clips", options.robot, number, say)
+            chosen["clips"] = ":".join(map(str, recorded))
     own = load_settings(experiment.task, dict(experiment.set)).seconds
     limits = [own, options.seconds, experiment.quick_seconds if options.quick else None]
     shortest = min(limit for limit in limits if limit is not None)
@@ -200,4 +202,4 @@ def _jobs(prepared: Sequence[_Prepared], seed: int) -> Iterator[EpisodeJob]:
     for episode in range(max((one.episodes for one in prepared), default=0)):
         for number, one in enumerate(prepared):
             if episode < one.episodes and episode not in one.cache.records and one.refused is None:
-                yield EpisodeJob(number, episode, replace(one.settings, seed=episode_seed(seed, episode)))
+                yield EpisodeJob(number, episode, replace(one.settings, seed=evaluation_seed(seed, episode)))

@@ -1,41 +1,306 @@
-"""Settings of the expert's training: configs/policies/expert.yaml."""
+"""Settings of every training: one frozen dataclass a method, which makes its flags, their help and its files' check.
+
+The help is grouped by the class that declares a setting first (`TITLES`). `configs/training/` holds a file for each
+method, with what differs from the defaults here in the training of the network that ships.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar, Literal
 
-from servoid.hw.config import CONFIGS, load_marked, nearest
+from servoid.hw.config import nearest
+from servoid.policy.diffusion.model.config import DenoiserShape, Objective
+from servoid.policy.latent.actions import LatentConfig
 from servoid.policy.tracker.rewards import TERMS
+
+Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class ExpertSettings:
-    """Ranges are (low, high); shares are of 1. The file says the rest."""
+class Run:
+    """How long, and how often to look."""
 
-    hidden: tuple[int, ...]
-    noise: tuple[float, float]
-    learning_rate: float
-    discount: float
-    horizon: int
-    epochs: int
-    mini_batches: int
-    mirror: float
-    episode_seconds: float
-    randomised: float
-    hardest_push: float
-    push_every: tuple[float, float]
-    command_every: tuple[float, float]
-    stand: float
-    forward: float
-    single: float
-    backward: float
-    rewards: dict[str, float]
+    # Fields that may change when a run goes on.
+    FREE: ClassVar[frozenset[str]] = frozenset({"minutes", "steps", "samples", "evaluate_every"})
+
+    minutes: Annotated[float, "minutes of training in all; evaluations are not counted"] = 45.0
+    evaluate_every: Annotated[float, "minutes of training between evaluations; 0: only at the end"] = 5.0
+    seed: Annotated[int, "random seed"] = 0
+
+    def __post_init__(self) -> None:
+        if self.minutes <= 0:
+            raise ValueError(f"minutes must be positive, not {self.minutes:g}")
+        for name in ("evaluate_every", "seed"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, not {getattr(self, name):g}")
+
+    @property
+    def budget(self) -> float:
+        """Steps to train for, in the trainer's own unit; 0: as many as fit into the minutes."""
+        raise NotImplementedError
 
 
-def load_settings() -> ExpertSettings:
-    """Load the settings. Raises ConfigError, also for a reward that is no term."""
-    settings, marks = load_marked(CONFIGS / "policies" / "expert.yaml", ExpertSettings)
-    for name in settings.rewards:
-        if name not in TERMS:
-            raise marks.error(f"rewards.{name}", f"no such reward term; {nearest(name, TERMS)}")
-    return settings
+@dataclass(frozen=True)
+class StepRun(Run):
+    """A run that may be measured in steps of the optimiser."""
+
+    steps: Annotated[int, "steps to train for instead of minutes, the same on any machine; 0: by minutes"] = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.steps < 0:
+            raise ValueError(f"steps must not be negative, not {self.steps}")
+
+    @property
+    def budget(self) -> float:
+        return self.steps
+
+
+@dataclass(frozen=True)
+class DataRun(StepRun):
+    """A training on a recorded dataset, judged in closed loop."""
+
+    FREE: ClassVar[frozenset[str]] = Run.FREE | {"survival_seconds", "survival_worlds", "licence"}
+
+    survival_seconds: Annotated[float, "seconds that the network walks in each evaluation"] = 10.0
+    survival_worlds: Annotated[int, "worlds it walks in; 0: keep the best by its loss on held-out data instead"] = 32
+    licence: Annotated[str, "licence of the data, kept in the checkpoint"] = "Apache-2.0"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.survival_worlds < 0 or self.survival_seconds <= 0:
+            raise ValueError("survival_seconds must be positive, and survival_worlds must not be negative")
+
+
+@dataclass(frozen=True)
+class Layers:
+    """A multilayer perceptron."""
+
+    hidden: Annotated[tuple[int, ...], "units of each hidden layer"] = (256, 128)
+
+    def __post_init__(self) -> None:
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"hidden must name the units of one layer or more, not {self.hidden}")
+
+
+@dataclass(frozen=True)
+class Optimiser:
+    """Of networks that learn from examples."""
+
+    batch: Annotated[int, "windows, pairs of ticks or chunks a step"] = 128
+    learning_rate: Annotated[float, "learning rate at its highest"] = 6e-4
+
+    def __post_init__(self) -> None:
+        if self.batch < 1 or self.learning_rate <= 0:
+            raise ValueError("batch and learning_rate must be positive")
+
+
+@dataclass(frozen=True)
+class DecayedOptimiser(Optimiser):
+    """AdamW."""
+
+    weight_decay: Annotated[float, "weight decay of AdamW"] = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiffusionNetwork(DenoiserShape):
+    """A denoiser, and what it is shown."""
+
+    text: Annotated[str, "encoder of instructions; empty: a model that takes none"] = "words"
+    emphasis: Annotated[float, "emphasis of global states; 0: no projection"] = 5.0
+
+
+@dataclass(frozen=True)
+class DiffusionTraining(DecayedOptimiser, Objective, DiffusionNetwork, DataRun):
+    """`servoid train diffusion`."""
+
+    warmup_steps: Annotated[int, "steps over which the learning rate rises"] = 200
+    average: Annotated[float, "decay of the averaged weights, which are the ones that are kept"] = 0.999
+    precision: Annotated[Literal["bf16", "fp32"], "arithmetic of the network"] = "bf16"
+
+    def __post_init__(self) -> None:
+        for part in (DataRun, DenoiserShape, Objective, Optimiser):
+            part.__post_init__(self)
+        if self.history < 2:
+            raise ValueError(f"history must be at least 2, not {self.history}: what ran last is an action of the past")
+        if self.inference_delay > self.horizon:
+            raise ValueError(
+                f"inference_delay must be 0 to the horizon of {self.horizon} ticks, not {self.inference_delay}"
+            )
+        if self.warmup_steps < 1:
+            raise ValueError(f"warmup_steps must be at least 1, not {self.warmup_steps}")
+
+
+@dataclass(frozen=True)
+class LatentTraining(Optimiser, LatentConfig, DataRun):
+    """`servoid train latent`. Loss: squared error of normalised targets + beta KL + weighted change of the latents."""
+
+    minutes: float = 5.0
+    evaluate_every: float = 1.0
+    batch: int = 512
+    learning_rate: float = 1e-3
+    beta: Annotated[Range, "weight of the KL divergence, first and last, geometric in between, as PULSE's"] = (
+        0.01,
+        0.001,
+    )
+    change: Annotated[float, "weight of the change of latents over a tick; this is PULSE's"] = 0.005
+
+    def __post_init__(self) -> None:
+        for part in (DataRun, LatentConfig, Optimiser):
+            part.__post_init__(self)
+        if min(self.beta) <= 0 or self.change < 0:
+            raise ValueError("beta must be positive, and change must not be negative")
+
+
+@dataclass(frozen=True)
+class SampleRun(Run):
+    """A run that is measured in ticks of experience."""
+
+    FREE: ClassVar[frozenset[str]] = Run.FREE | {"worlds"}
+
+    minutes: float = 90.0
+    evaluate_every: float = 2.0
+    samples: Annotated[float, "ticks of experience to train for; learning rate, noise and pushes change over them"] = (
+        20e6
+    )
+    worlds: Annotated[int, "simulated robots side by side"] = 512
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.samples <= 0 or self.worlds < 1:
+            raise ValueError("samples and worlds must be positive")
+
+    @property
+    def budget(self) -> float:
+        return self.samples
+
+
+@dataclass(frozen=True)
+class Ppo(Layers, SampleRun):
+    """PPO, whatever the environment."""
+
+    noise: Annotated[Range, "deviation of actions at the start and at the end: left to learn, it stayed high"] = (
+        0.22,
+        0.07,
+    )
+    learning_rate: Annotated[float, "learning rate at the start; it falls to 15 %"] = 4e-4
+    discount: Annotated[float, "discount of a tick"] = 0.99
+    horizon: Annotated[int, "ticks a world between updates"] = 24
+    epochs: Annotated[int, "times each sample is used"] = 3
+    mini_batches: Annotated[int, "updates an epoch"] = 6
+    mirror: Annotated[float, "weight of the squared difference between an action and its mirror image's"] = 1.0
+
+    def __post_init__(self) -> None:
+        SampleRun.__post_init__(self)
+        Layers.__post_init__(self)
+        for name in ("learning_rate", "horizon", "epochs", "mini_batches"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be positive, not {getattr(self, name):g}")
+        if min(self.noise) <= 0:
+            raise ValueError(f"noise must be positive, not {self.noise}")
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """Episodes of the tracking environment and their rewards. Shares are of 1."""
+
+    episode_seconds: Annotated[float, "longest episode [s]"] = 20.0
+    randomised: Annotated[float, "share of episodes on a robot drawn at random; the others are nominal"] = 0.8
+    hardest_push: Annotated[
+        float, "of the robot's top speed, grown to over the first fifth of the training; pushes are uniform from zero"
+    ] = 0.9
+    push_every: Annotated[Range, "time between pushes [s]"] = (0.6, 2.0)
+    command_every: Annotated[Range, "time between commands [s]"] = (2.0, 5.0)
+    stand: Annotated[float, "share of commands that are zero"] = 0.1
+    forward: Annotated[float, "share of commands straight ahead, half of them in the upper third of the speeds"] = 0.2
+    single: Annotated[float, "share of commands that are backward, sideways or a turn alone"] = 0.2
+    backward: Annotated[float, "share of commands backward while turning and side-stepping: where it fell most"] = 0.25
+    rewards: Annotated[dict[str, float], "weights of reward terms (policy/tracker/rewards.py), a tick each"] = field(
+        default_factory=lambda: {
+            "velocity": 3.0,
+            "progress": 0.6,
+            "yaw_rate": 1.2,
+            "pose": 0.4,
+            "contact": 0.3,
+            "clearance": 0.3,
+            "upright": -2.0,
+            "height": -20.0,
+            "sway_rate": -0.03,
+            "slip": -0.5,
+            "level_feet": -0.3,
+            "impact": -0.1,
+            "target_rate": -0.15,
+            "target_acceleration": -0.1,
+            "effort": -0.005,
+            "fall": -10.0,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        for name in self.rewards:
+            if name not in TERMS:
+                raise ValueError(f"rewards.{name}: no such reward term; {nearest(name, TERMS)}")
+        if min(self.stand, self.forward, self.single, self.backward) < 0 or (
+            self.stand + self.forward + self.single + self.backward > 1.0
+        ):
+            raise ValueError("stand, forward, single and backward must be shares whose sum is at most 1")
+
+
+@dataclass(frozen=True)
+class ExpertTraining(TrackingSettings, Ppo):
+    """`servoid train expert`."""
+
+    plain_odometry: Annotated[bool, "no learned correction in the estimator"] = False
+
+    def __post_init__(self) -> None:
+        for part in (Ppo, TrackingSettings):
+            part.__post_init__(self)
+
+
+@dataclass(frozen=True)
+class OdometryWalks:
+    """What walks, to learn from and to measure."""
+
+    policy: Annotated[tuple[str, ...], "policies or checkpoints that walk, beside the gait"] = ("expert", "diffusion")
+    worlds: Annotated[int, "simulated robots that walk, of all policies together"] = 192
+    seconds: Annotated[float, "seconds that each walks"] = 60.0
+    walks: Annotated[int, "walks of each policy on which the drift is measured"] = 64
+    walk_seconds: Annotated[float, "seconds of each of these walks"] = 30.0
+
+    def __post_init__(self) -> None:
+        if self.worlds <= len(self.policy):
+            raise ValueError(f"worlds must be more than the {len(self.policy)} policies, not {self.worlds}")
+        if min(self.seconds, self.walks, self.walk_seconds) <= 0:
+            raise ValueError("seconds, walks and walk_seconds must be positive")
+
+
+@dataclass(frozen=True)
+class OdometryTraining(DecayedOptimiser, Layers, OdometryWalks, StepRun):
+    """`servoid train odometry`."""
+
+    minutes: float = 10.0
+    evaluate_every: float = 0.0
+    steps: int = 3000
+    hidden: tuple[int, ...] = (128, 64)
+    batch: int = 48
+    learning_rate: float = 2e-3
+    chunk: Annotated[int, "ticks whose mean error counts beside each tick's: the mean is what drifts"] = 50
+    mean_weight: Annotated[float, "weight of that mean's squared error"] = 20.0
+
+    def __post_init__(self) -> None:
+        for part in (StepRun, OdometryWalks, Layers, Optimiser):
+            part.__post_init__(self)
+        if self.chunk < 1:
+            raise ValueError(f"chunk must be at least 1 tick, not {self.chunk}")
+
+
+TITLES: Mapping[type, str] = {  # of the help, in its order
+    Run: "run", StepRun: "run", DataRun: "run", SampleRun: "run",
+    OdometryWalks: "walks",
+    DenoiserShape: "network", DiffusionNetwork: "network", LatentConfig: "network", Layers: "network",
+    Objective: "objective", LatentTraining: "objective", OdometryTraining: "objective", Ppo: "objective (PPO)",
+    Optimiser: "optimiser", DecayedOptimiser: "optimiser", DiffusionTraining: "optimiser",
+    TrackingSettings: "episodes and rewards", ExpertTraining: "episodes and rewards",
+}  # fmt: skip

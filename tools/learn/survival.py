@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from servoid.hw.robot.description import load_robot
+from servoid.tools.learn.progress import counted
 
 if TYPE_CHECKING:
     from servoid.hw.contracts.control import Policy
@@ -80,7 +81,7 @@ def survival_of(policy: Policy, fleet: Fleet, seconds: float) -> dict[str, float
     command = np.zeros((worlds, 3))
     alive, errors = everything.copy(), []
     smooth = np.zeros((worlds, 2))
-    for tick in range(round(seconds * robot.rate)):
+    for tick in counted(round(seconds * robot.rate), "walking"):
         if tick % _CHANGE == 25:
             command = np.array([rng.uniform(low, high) for rng in fleet.rngs])
         if tick % _PUSH_EVERY == 0 and tick:

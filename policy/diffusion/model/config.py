@@ -1,11 +1,11 @@
-"""The shape of a denoiser, and whether the one that a checkpoint describes fits a robot. Free of torch."""
+"""The shape of a denoiser, what it is trained for, and whether the one of a checkpoint fits a robot. Free of torch."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -21,36 +21,89 @@ from servoid.policy.text.encoder import code_size
 KIND = "diffusion"  # of a checkpoint
 
 
+TOGETHER = 2 / 3  # of the windows that are not for Diffusion Forcing, the share whose tokens go down together
+
+
+@dataclass(frozen=True, kw_only=True)
+class DenoiserShape:
+    """What may be chosen of a denoiser's shape, whatever the robot."""
+
+    layers: Annotated[int, "layers of the transformer"] = 2
+    width: Annotated[int, "numbers of a token inside it"] = 192
+    heads: Annotated[int, "attention heads; they divide the width"] = 4
+    history: Annotated[int, "ticks of past and present states"] = 4
+    horizon: Annotated[int, "ticks to come"] = 16
+    levels: Annotated[int, "noise levels"] = 20
+    mask: Annotated[str, "attention mask (docs/diffusion.md)"] = "state_full_action_causal"
+    actions: Annotated[int, "ticks to come with actions; 0: the whole horizon"] = 0
+
+    def __post_init__(self) -> None:
+        for name in ("layers", "width", "heads", "history", "horizon", "levels"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        try:
+            check_mask(self.mask)
+        except ConfigError as error:
+            raise ValueError(f"mask: {error}") from error
+        if not 0 <= self.actions <= self.horizon:
+            raise ValueError(
+                f"actions must be 1 to the horizon of {self.horizon} ticks, or 0 for all, not {self.actions}"
+            )
+        if self.width % self.heads:
+            raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
+
+
 @dataclass(frozen=True)
-class DenoiserConfig:
-    """Shape of a denoiser. Stored in the checkpoint."""
+class Objective:
+    """What a denoiser is trained for, beside the plain squared error."""
+
+    inference_delay: Annotated[int, "longest delay of a plan to train for, in ticks, whose actions are given"] = 2
+    near_actions: Annotated[int, "ticks to come whose actions count in full"] = 8
+    far_actions: Annotated[float, "weight of the actions beyond; 0 cuts them, as Diffuse-CLoC does"] = 0.2
+    min_snr: Annotated[float, "clip of the signal-to-noise ratio that weights tokens, 5 for one; 0: no weights"] = 0.0
+    action_rate: Annotated[float, "weight of the error of the change from one action to the next"] = 0.0
+    monotone: Annotated[
+        float, "share of windows whose noise rises along the window, at most two thirds of what --forcing leaves"
+    ] = 0.25
+    forcing: Annotated[
+        float, "share of windows with independent noise, the past too: Diffusion Forcing (1: with --monotone 0)"
+    ] = 0.25
+
+    def __post_init__(self) -> None:
+        if self.inference_delay < 0:
+            raise ValueError(f"inference_delay must not be negative, not {self.inference_delay}")
+        if self.near_actions < 1:
+            raise ValueError(f"near_actions must be at least 1 tick, not {self.near_actions}")
+        for name in ("far_actions", "min_snr", "action_rate"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, not {getattr(self, name):g}")
+        if not 0.0 <= self.forcing <= 1.0:
+            raise ValueError(f"forcing must be a share of 0 to 1, not {self.forcing:g}")
+        most = TOGETHER * (1.0 - self.forcing)
+        if not 0.0 <= self.monotone <= most + 1e-9:
+            raise ValueError(
+                f"monotone must be a share of 0 to {most:g}, not {self.monotone:g}, with forcing {self.forcing:g}"
+            )
+
+
+@dataclass(frozen=True)
+class DenoiserConfig(DenoiserShape):
+    """Shape of a denoiser. Stored in the checkpoint. Raises ConfigError for one that cannot be."""
 
     state_size: int
     action_size: int
-    layers: int = 2
-    width: int = 192
-    heads: int = 4
-    history: int = 4
-    horizon: int = 16
-    levels: int = 20
-    mask: str = "state_full_action_causal"
     text: str = ""  # name of the encoder of its instructions; empty: it takes none
     text_size: int = 0  # of an encoded instruction
-    actions: int = 0  # ticks to come whose actions are planned; 0: all of the horizon
 
     def __post_init__(self) -> None:
-        for name in ("state_size", "action_size", "layers", "width", "heads", "history", "horizon", "levels"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"denoiser: {name} must be at least 1, not {getattr(self, name)}")
-        check_mask(self.mask)
+        try:
+            super().__post_init__()
+        except ValueError as error:
+            raise ConfigError(f"denoiser: {error}") from error
+        if min(self.state_size, self.action_size) < 1:
+            raise ConfigError(f"denoiser: sizes must be at least 1, not {self.state_size} and {self.action_size}")
         if self.text_size < 0 or bool(self.text) != bool(self.text_size):
             raise ConfigError(f"denoiser: an encoder '{self.text}' and a text_size of {self.text_size} do not agree")
-        if not 0 <= self.actions <= self.horizon:
-            raise ConfigError(
-                f"denoiser: actions must be 1 to the horizon of {self.horizon} ticks, or 0 for all, not {self.actions}"
-            )
-        if self.width % self.heads:
-            raise ConfigError(f"denoiser: width {self.width} is not a multiple of heads {self.heads}")
 
     @property
     def state_ticks(self) -> Array:

@@ -15,6 +15,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
+from servoid.hw.seeds import Stream, generator
 from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.randomise import Body, draw
 from servoid.sim.scene import robot_bodies, scene_sensors
@@ -65,7 +66,7 @@ class Plant:
         The stream is that of the simulated backend, used as its worlds use it: the same seed is the same robot with
         the same noise.
         """
-        self._rng = np.random.default_rng([seed, 0])
+        self._rng = generator(seed, Stream.BODY)
         randomise = self._rng.random() < float(randomise)
         self.body: Body = draw(self._rng, self.robot, self._bodies, randomise)
         self.stiffness = self.body.stiffness / self.robot.servos[0].stiffness  # factor on every servo's
@@ -77,7 +78,7 @@ class Plant:
         mujoco.mj_setConst(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
         self.held, self._noise_block, self._ticks = True, -1, 0
-        self._idle_rng = np.random.default_rng([seed, 0, 1])  # while held: the episode's stream waits
+        self._idle_rng = generator(seed, Stream.BODY, 1)  # while held: the episode's stream waits
         self._idle = self._idle_rng.standard_normal(6 + len(self.robot.joints))
         self._joint_age = round(self.body.joint_latency / TIMESTEP)
         self._imu_age = max(round(self.body.imu_latency / TIMESTEP) - 1, 0)  # sensor data is a substep old already

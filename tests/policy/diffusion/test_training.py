@@ -8,13 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from servoid.policy.diffusion.model.config import DenoiserConfig
+from servoid.policy.diffusion.model.config import DenoiserConfig, Objective
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.objective import UNTOLD, losses
 from servoid.policy.diffusion.schedule import cosine_signal
 
 WINDOWS, WORDS = 2000, 5
 CONFIG = DenoiserConfig(3, 2, width=16, heads=2, history=2, horizon=4, text="words", text_size=WORDS)
+OBJECTIVE = Objective(inference_delay=0, monotone=0.0)
 SIGNAL = torch.as_tensor(cosine_signal(CONFIG.levels), dtype=torch.float32)
 
 
@@ -36,7 +37,7 @@ def untold(seed: int) -> Tensor:
     torch.nn.init.normal_(network.no_text)  # as a window without a text is known after some training
     states, actions, text = batch()
     text.requires_grad_()
-    parts = losses(network, states, actions, text, SIGNAL, 0, torch.Generator().manual_seed(seed))
+    parts = losses(network, states, actions, text, SIGNAL, torch.Generator().manual_seed(seed), OBJECTIVE)
     by_text, without = torch.autograd.grad(torch.stack(parts).sum(), (text, network.no_text))
     assert without.abs().max() > 0.0
     return by_text.abs().amax(1) == 0.0
@@ -63,5 +64,5 @@ def test_a_network_without_words_is_trained_without_them() -> None:
     shape: dict[str, Any] = {"width": 16, "heads": 2, "history": 2, "horizon": 4}
     network = Denoiser(DenoiserConfig(3, 2, **shape))
     states, actions, _ = batch()
-    parts = losses(network, states, actions, None, SIGNAL, 0, torch.Generator().manual_seed(3))
+    parts = losses(network, states, actions, None, SIGNAL, torch.Generator().manual_seed(3), OBJECTIVE)
     assert all(torch.isfinite(part) for part in parts)

@@ -11,7 +11,6 @@ import pytest
 import torch
 from synthetic_recording import write_dataset
 
-from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import CheckpointError, read_header
@@ -165,5 +164,5 @@ def test_what_does_not_fit_is_refused_with_the_reason(tmp_path: Path) -> None:
     shipped = Path(__file__).resolve().parents[3] / "policy" / "checkpoints" / "expert.safetensors"
     with pytest.raises(CheckpointError, match="holds a tracker network, and a latent network is needed"):
         load_latents(shipped, ROBOT)
-    with pytest.raises(ConfigError, match="size must be at least 1"):
+    with pytest.raises(ValueError, match="size must be at least 1"):
         LatentConfig(size=0)

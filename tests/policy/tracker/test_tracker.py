@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.references.gait import Gait
 from servoid.policy.tracker import rewards
 from servoid.policy.tracker.observation import AHEAD, TrackerObservation
-from servoid.policy.tracker.rewards import TERMS, Step, total
-from servoid.tools.learn import settings as training
+from servoid.policy.tracker.rewards import TERMS, Step
+from servoid.tools.learn.settings import TrackingSettings
+from servoid.tools.learn.terms import Terms
 
 ROBOT = load_robot()
 
@@ -246,28 +246,16 @@ def test_a_steady_motion_of_targets_is_not_acceleration() -> None:
 
 def test_the_total_is_the_weighted_sum_and_every_part_is_logged() -> None:
     fell = step(fallen=np.array([True, False]))
-    value, parts = total(fell, {"velocity": 2.0, "fall": -10.0})
+    value, parts = Terms({"velocity": 2.0, "fall": -10.0}, TERMS)(fell)
     assert value == pytest.approx([-8.0, 2.0])
     assert parts == pytest.approx({"velocity": 2.0, "fall": -5.0})
 
 
 def test_shipped_rewards_prefer_tracking_to_standing_and_standing_to_falling() -> None:
-    weights = training.load_settings().rewards
+    total = Terms(TrackingSettings().rewards, TERMS)
     asked = {"reference_velocity": np.tile([0.3, 0.0], (2, 1))}
-    tracking, _ = total(step(**asked, velocity=np.tile([0.3, 0.0], (2, 1))), weights)
-    standing, _ = total(step(**asked), weights)
-    falling, _ = total(replace(step(**asked), fallen=np.ones(2, bool)), weights)
+    tracking, _ = total(step(**asked, velocity=np.tile([0.3, 0.0], (2, 1))))
+    standing, _ = total(step(**asked))
+    falling, _ = total(replace(step(**asked), fallen=np.ones(2, bool)))
     assert tracking[0] > standing[0] + 1.0
     assert standing[0] > falling[0] + 5.0
-
-
-def test_a_reward_that_is_no_term_is_refused_by_file_line_and_nearest_name(
-    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = (training.CONFIGS / "policies" / "expert.yaml").read_text().replace("  slip: -0.5", "  slipp: -0.5")
-    (tmp_path / "policies").mkdir()
-    (tmp_path / "policies" / "expert.yaml").write_text(text)
-    monkeypatch.setattr(training, "CONFIGS", tmp_path)
-    line = text.splitlines().index("  slipp: -0.5") + 1
-    with pytest.raises(ConfigError, match=rf"expert.yaml:{line}: rewards.slipp: .*slip"):
-        training.load_settings()

@@ -15,7 +15,7 @@ from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.tracker import ExpertPolicy
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import load_odometry
-from servoid.tools.learn.trainers.odometry import drift, maker
+from servoid.tools.learn.walks import drift, maker
 
 ROBOT = load_robot()
 

@@ -14,7 +14,7 @@ from servoid.hw.robot.description import load_robot
 from servoid.stack.log.tick import Proposal
 from servoid.stack.runtime.clock import Schedule
 from servoid.stack.runtime.interrupt import TWICE, Interrupt, Stops
-from servoid.stack.runtime.loop import Loop
+from servoid.stack.runtime.loop import ControlledRobot, Loop
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Guard, Phase
 
@@ -44,10 +44,8 @@ def make(targets=lambda tick: ROBOT.home, script=(), listeners=(), failure=lambd
     interrupt = Interrupt()
     records = []
     loop = Loop(
-        body,
-        StillEstimator(ROBOT),
+        ControlledRobot(ROBOT, body, StillEstimator(ROBOT), guard),
         Homes(guard, targets),
-        guard,
         Schedule(body.clock, ROBOT.rate),
         interrupt,
         Stops(interrupt, failure, script),

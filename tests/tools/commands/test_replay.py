@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from servoid.hw.config import ConfigError
 from servoid.stack.control.policies import policy_fingerprint
-from servoid.stack.log.flightlog import read_log
+from servoid.stack.log.flightlog import as_now, read_log
 from servoid.stack.runtime.run import RunSettings, Script, run
 from servoid.stack.safety.event import Event
 from servoid.tools.commands.replay import changes, replay
@@ -18,9 +19,7 @@ from servoid.tools.common.flightpath import plans
 def test_what_a_policy_is_made_of_is_in_the_log_and_changes_are_named(tmp_path: Path) -> None:
     mine = tmp_path / "mine.yaml"
     mine.write_text("execution_horizon: 6\ndelay: 2\n")
-    chosen = RunSettings(
-        "walk", policy=str(mine), seconds=0.4, set={"vx": "0.1", "gain": "0.9"}, record=tmp_path / "a.mcap"
-    )
+    chosen = RunSettings("walk", policy=str(mine), seconds=0.4, gain=0.9, set={"vx": "0.1"}, record=tmp_path / "a.mcap")
     run(chosen)
     log = read_log(tmp_path / "a.mcap")
     assert changes(log) == []
@@ -43,6 +42,17 @@ def test_what_a_policy_is_made_of_is_in_the_log_and_changes_are_named(tmp_path: 
     assert changes(log) == []
     del log.header["policy"]["planner"], log.header["policy"]["odometry_sha256"]  # of an older program
     assert changes(log) == []
+
+
+def test_a_log_whose_gain_was_a_setting_of_the_task_is_repeated_with_it(tmp_path: Path) -> None:
+    """So were all logs until the gain had an option of its own."""
+    run(RunSettings("stand", policy="gait", seconds=0.4, gain=0.5, set={"cost.stand": "2"}, record=tmp_path / "a.mcap"))
+    log = read_log(tmp_path / "a.mcap")
+    before = log.header["settings"] | {"set": {"cost.stand": "2", "gain": "0.5"}}
+    del before["gain"]
+    now = as_now(log.header | {"settings": before})
+    assert now == log.header
+    assert replay(replace(log, header=now))[1] is None
 
 
 @pytest.mark.parametrize("name", ["gait", "expert"])

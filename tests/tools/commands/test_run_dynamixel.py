@@ -66,7 +66,7 @@ def test_it_stands_more_softly_and_lets_go(rig: RigProcess, capsys: pytest.Captu
     """The same command as on a robot. `gain` is what the servos get: of 800, then none to brake."""
     for i in range(TRIES):
         rig.control.accepted()
-        code = main([*RUN, "--port", rig.port, "--start", "--set", "gain=0.9", "--record", f"{i}.mcap"])
+        code = main([*RUN, "--port", rig.port, "--start", "--gain", "0.9", "--record", f"{i}.mcap"])
         if code != 4:
             break
         rig.control.reset(0)

@@ -20,6 +20,8 @@ def test_ctrl_c_while_a_clip_is_recorded_is_no_fall(tmp_path: Path, monkeypatch:
         return SimpleNamespace(interrupted=True, outcome="stopped")
 
     monkeypatch.setattr("servoid.stack.runtime.run.run", run)
+    told: list[str] = []
     with pytest.raises(KeyboardInterrupt):
-        clips.record_clips(tmp_path, "op3", 1)
+        clips.record_clips(tmp_path, "op3", 1, told.append)
+    assert "walk-7000000.mcap" in told[0]
     assert not list(tmp_path.rglob("*.fell"))

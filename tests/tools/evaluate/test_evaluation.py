@@ -12,6 +12,7 @@ import pytest
 
 from servoid.hw.config import CONFIGS, ConfigError
 from servoid.hw.contracts.body import BackendError
+from servoid.hw.seeds import episode_seed
 from servoid.policy.checkpoint import resolve
 from servoid.stack.runtime.run import RunSettings
 from servoid.tools.cli import main
@@ -120,7 +121,7 @@ def test_episodes_are_not_those_that_settings_are_tried_on(tmp_path: Path, done:
         run: [job.settings.seed for job in done.jobs if job.settings.task == run] for run in ("goal-near", "goal-far")
     }
     assert seeds["goal-near"][:2] == seeds["goal-far"]  # the same for every row
-    assert not set(seeds["goal-near"]) & {rollout.episode_seed(0, episode) for episode in range(100)}
+    assert not set(seeds["goal-near"]) & {episode_seed(0, episode) for episode in range(100)}
 
 
 def test_what_changes_meanwhile_ends_the_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,12 +160,12 @@ def test_settings_of_the_planner_stay_those_of_the_start(tmp_path: Path) -> None
     from servoid.policy.diffusion.settings import load_settings
 
     mine = tmp_path / "mine.yaml"
-    mine.write_text("checkpoint: diffusion\nreplan: 6\n")
+    mine.write_text("checkpoint: diffusion\nexecution_horizon: 6\n")
     ran = []
 
     def do(job: EpisodeJob) -> EpisodeResult:
         ran.append(load_settings(job.settings.policy).execution_horizon)
-        mine.write_text("checkpoint: diffusion\nreplan: 8\n")
+        mine.write_text("checkpoint: diffusion\nexecution_horizon: 8\n")
         return EpisodeResult(job, {"success": True})
 
     evaluate([NEAR], Options(tmp_path, policy=str(mine), workers=1), do)

@@ -218,6 +218,8 @@ def test_networks_are_named_apart() -> None:
 
 def test_commands_that_train_networks_can_be_typed() -> None:
     from servoid.policy.diffusion.model.masks import MASKS
+    from servoid.tools.learn.flags import read_settings
+    from servoid.tools.learn.settings import DiffusionTraining
     from servoid.tools.learn.trainers import diffusion
 
     parser = Parser()
@@ -225,9 +227,9 @@ def test_commands_that_train_networks_can_be_typed() -> None:
     for row in ROWS:
         if row.experiment.network is not None:
             words = shlex.split(f"--data runs/walks --out runs/x {row.experiment.network.train}")
-            args = parser.parse_args(words)
-            assert args.mask in MASKS, row.name
-            assert (args.steps, args.width) == (15_000, 128)  # equal ones, whatever the load of the machine was
+            asked = read_settings(parser.parse_args(words), DiffusionTraining())
+            assert asked.mask in MASKS, row.name
+            assert (asked.steps, asked.width) == (15_000, 128)  # equal ones, whatever the load of the machine was
 
 
 def test_stabilisation_is_about_as_noisy_as_the_papers() -> None:

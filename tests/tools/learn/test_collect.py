@@ -25,7 +25,7 @@ from servoid.stack.control.gait import GaitPolicy
 from servoid.tools import cli
 from servoid.tools.learn.collect.disturbances import Disturbances, DisturbanceSettings, joint_noise
 from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
-from servoid.tools.learn.collect.lerobot import DatasetWriter, Feature
+from servoid.tools.learn.collect.lerobot import DatasetWriter, Feature, Schema
 from servoid.tools.learn.collect.skills import SKILLS, skills_of
 
 TICKS = 250  # 5 s
@@ -292,7 +292,7 @@ def test_noise_rises_to_the_feet_and_pushes_keep_their_pace(robot: Robot) -> Non
 
 
 def writer(out: Path, force: bool = False) -> DatasetWriter:
-    return DatasetWriter(out, robot_type="r", fps=50, features={"x": Feature(("a", "b"))}, tasks=["t"], force=force)
+    return DatasetWriter(out, Schema("r", 50, {"x": Feature(("a", "b"))}, ("t",)), force)
 
 
 def rows(count: int, seed: int = 0) -> dict[str, Array]:

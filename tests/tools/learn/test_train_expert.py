@@ -4,130 +4,175 @@ from __future__ import annotations
 
 import csv
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from servoid.hw.config import ConfigError
+from servoid.hw.config import ConfigError, load_yaml
 from servoid.hw.robot.description import load_robot
-from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.checkpoint import CheckpointError, read_header
 from servoid.policy.mlp import Mlp
 from servoid.policy.tracker.observation import TrackerObservation
 from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.envs.tracking import Tracking, _draw
-from servoid.tools.learn.settings import load_settings
-from servoid.tools.learn.trainers.expert import Trainer, _observations, forget_after, plot
+from servoid.tools.learn.settings import ExpertTraining
+from servoid.tools.learn.trainers.expert import ExpertTrainer
+from servoid.tools.learn.trainers.ppo import tensors
 
 ROBOT = load_robot()
-SETTINGS = replace(load_settings(), hidden=(32, 16), horizon=6, mini_batches=2, episode_seconds=1.0)
+SETTINGS = replace(
+    ExpertTraining(), hidden=(32, 16), horizon=6, mini_batches=2, episode_seconds=1.0, samples=1e6, worlds=8
+)
 
 
-def trainer(out: Path, fresh: bool = False, samples: float = 1e6) -> Trainer:
-    out.mkdir(exist_ok=True)
-    return Trainer(Tracking(ROBOT, 8, None, SETTINGS), out, samples, fresh)
+def environment(n: int = 8) -> Tracking:
+    env = Tracking(ROBOT, n, None, SETTINGS)
+    env.reset()
+    return env
+
+
+def trainer(out: Path, resume: bool = True, init: Path | None = None, **changes: Any) -> ExpertTrainer:
+    settings = replace(SETTINGS, **changes)
+    made = ExpertTrainer(Tracking(ROBOT, settings.worlds, None, settings), settings, out)
+    made.start(resume, init)
+    return made
 
 
 def rows(out: Path) -> list[float]:
-    with (out / "progress.csv").open() as file:
-        return [float(row["samples"]) for row in csv.DictReader(file)]
+    with (out / "log.csv").open() as file:
+        return [float(row["step"]) for row in csv.DictReader(file)]
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trainer]:
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ExpertTrainer]:
     out = tmp_path_factory.mktemp("expert")
     first = trainer(out)
+    first.prepare()
     before = first.ppo.actor.mlp[0].weight.detach().clone()
-    for _ in range(2):
-        row = first._iteration()
-        assert all(math.isfinite(value) for value in row.values())
+    row = first.learn()
+    assert all(math.isfinite(value) for value in row.values())
+    assert row["term/fall"] <= 0.0
     assert not (first.ppo.actor.mlp[0].weight == before).all()
-    first._save()
+    first = trainer(out, resume=False, samples=96.0, evaluate_every=0.0)
+    first.run()
     return out, first
 
 
-def test_two_iterations_are_saved_with_their_curve(trained: tuple[Path, Trainer]) -> None:
+def test_two_iterations_are_saved_with_their_curve(
+    trained: tuple[Path, ExpertTrainer], capsys: pytest.CaptureFixture[str]
+) -> None:
     out, first = trained
-    assert first.samples == 2 * 6 * 8
-    assert rows(out) == [48, 96]
-    assert (out / "progress.png").stat().st_size > 1000
-    assert list(out.glob("events.out.tfevents.*"))
+    assert first.step == 2 * 6 * 8
+    assert rows(out)[-1] == 96
+    assert (out / "learning_curve.png").stat().st_size > 1000
+    assert list((out / "tensorboard").glob("events.out.tfevents.*"))
+    assert "term/slip" in (out / "log.csv").read_text()
+    trainer(out, samples=96.0, evaluate_every=0.0).run()  # the same command, where nothing is left to do
+    said = capsys.readouterr().err
+    assert "nothing is left to train" in said
+    assert said.splitlines()[-1] == f"next: servoid rollout walk --policy {out / 'expert.safetensors'} --episodes 50"
 
 
-def test_it_goes_on_where_it_was(trained: tuple[Path, Trainer]) -> None:
+def test_it_goes_on_where_it_was(trained: tuple[Path, ExpertTrainer], tmp_path: Path) -> None:
     out, first = trained
-    again = trainer(out)
-    assert again.samples == first.samples
+    shutil.copytree(out, tmp_path / "copy")
+    again = trainer(tmp_path / "copy", samples=144.0, evaluate_every=0.0)
+    assert again.step == first.step
     for ours, theirs in zip(again.ppo.actor.state_dict().values(), first.ppo.actor.state_dict().values(), strict=True):
         assert (ours == theirs).all()
-    again._iteration()
-    assert again.samples == 144
-    assert rows(out) == [48, 96, 144]
-    # Killed here, before it saved: the next call repeats that iteration, and the curve does not count it twice.
-    assert trainer(out).samples == 96
-    assert rows(out) == [48, 96]
+    again.run()
+    assert again.step == 144
+    assert rows(tmp_path / "copy")[-1] == 144
 
 
-def test_the_export_acts_as_the_trained_actor(trained: tuple[Path, Trainer]) -> None:
+def test_the_export_acts_as_the_trained_actor(trained: tuple[Path, ExpertTrainer]) -> None:
     import torch
 
     out, first = trained
     network, head = Mlp.load(out / "expert.safetensors", "tracker", ROBOT, TrackerObservation(ROBOT).size)
     first.ppo.actor.eval()
     with torch.inference_mode():
-        expected = first.ppo.actor(_observations(first.env)).numpy()
-    np.testing.assert_allclose(network(first.env.actor), expected, atol=1e-4)
+        expected = first.ppo.actor(tensors(first.env)).numpy()
+    np.testing.assert_allclose(network(first.env.observations["actor"]), expected, atol=1e-4)
     assert np.abs(expected).max() > 0.01
-    assert head["results"] == {"samples": 96}
+    assert head["results"]["samples"] == 96
     assert head["config"]["rewards"] == SETTINGS.rewards
+    assert head["training"]["hidden"] == [32, 16]
+    # What was used is in the folder, as a file that another run takes.
+    assert load_yaml(out / "settings.yaml", ExpertTraining) == replace(SETTINGS, samples=96.0, evaluate_every=0.0)
 
 
-def test_a_tracker_is_trained_further(trained: tuple[Path, Trainer], tmp_path: Path) -> None:
+def test_a_tracker_is_trained_further(trained: tuple[Path, ExpertTrainer], tmp_path: Path) -> None:
     """With --init the run begins with what the checkpoint does, less noise, and a critic that learns alone at first."""
     import torch
 
     out, _ = trained
     source = out / "expert.safetensors"
-    env = Tracking(ROBOT, 8, None, SETTINGS)
-    (tmp_path / "further").mkdir()
-    further = Trainer(env, tmp_path / "further", 1e6, False, str(source))
+    further = trainer(tmp_path / "further", init=source)
     network, _ = Mlp.load(source, "tracker", ROBOT, TrackerObservation(ROBOT).size)
     further.ppo.actor.eval()
     with torch.inference_mode():
-        acted = further.ppo.actor(_observations(env)).numpy()
-    np.testing.assert_allclose(acted, network(env.actor), atol=1e-3)
-    further.ppo.train_mode()
+        acted = further.ppo.actor(tensors(further.env)).numpy()
+    np.testing.assert_allclose(acted, network(further.env.observations["actor"]), atol=1e-3)
+    further.prepare()
     critic = further.ppo.critic.mlp[0].weight.detach().clone()
-    row = further._iteration()
+    row = further.learn()
     assert row["std"] == pytest.approx(np.mean(SETTINGS.noise), rel=1e-3)
     assert not torch.equal(further.ppo.critic.mlp[0].weight, critic)
     dense = [m for m in further.ppo.actor.mlp if hasattr(m, "weight")]
     for layer, (weight, _) in zip(dense, network.layers, strict=True):
         np.testing.assert_array_equal(layer.weight.detach().numpy().T, weight)
-    further._save()
-    _, head = Mlp.load(tmp_path / "further" / "expert.safetensors", "tracker", ROBOT, TrackerObservation(ROBOT).size)
-    assert head["results"]["begun_with"]["results"] == {"samples": 96}
-    again = Trainer(env, tmp_path / "further", 1e6, False, str(source))  # the same command goes on
+    further.save()
+    further.ship(tmp_path / "further.safetensors", further.progress)
+    _, head = Mlp.load(tmp_path / "further.safetensors", "tracker", ROBOT, TrackerObservation(ROBOT).size)
+    assert head["results"]["begun_with"]["results"]["samples"] == 96
+    again = trainer(tmp_path / "further", init=source)  # the same command goes on
     assert again.begun_with == further.begun_with
-    again.samples = 600_000
-    again._iteration()
+    again.step = 600_000
+    again.prepare()
+    again.learn()
     assert not torch.equal(again.ppo.actor.mlp[0].weight, further.ppo.actor.mlp[0].weight)  # the actor learns too
 
 
-def test_a_tracker_with_other_layers_is_not_trained_further(trained: tuple[Path, Trainer], tmp_path: Path) -> None:
-    env = Tracking(ROBOT, 2, None, replace(SETTINGS, hidden=(16, 16)))
-    with pytest.raises(CheckpointError, match=r"hidden layers are \[32, 16\]"):
-        Trainer(env, tmp_path, 1e6, False, str(trained[0] / "expert.safetensors"))
+def test_a_tracker_with_other_layers_is_not_trained_further(
+    trained: tuple[Path, ExpertTrainer], tmp_path: Path
+) -> None:
+    with pytest.raises(CheckpointError, match=r"hidden layers are \[32, 16\]; give --hidden 32 16"):
+        trainer(tmp_path, init=trained[0] / "expert.safetensors", hidden=(16, 16))
 
 
-def test_a_folder_of_another_run_is_not_gone_on_with(trained: tuple[Path, Trainer], tmp_path: Path) -> None:
-    """Neither for --init, which would be ignored, nor when the saved network has another shape."""
+def test_a_folder_of_another_run_is_not_gone_on_with(trained: tuple[Path, ExpertTrainer], tmp_path: Path) -> None:
+    """Neither for --init, which would be ignored, nor under other settings, nor where an older program began it."""
     out, _ = trained
-    with pytest.raises(ConfigError, match=r"did not begin with .*--fresh"):
-        Trainer(Tracking(ROBOT, 2, None, SETTINGS), out, 1e6, False, str(out / "expert.safetensors"))
-    with pytest.raises(ConfigError, match=r"state\.pt: .*other inputs or layers.*--fresh"):
-        Trainer(Tracking(ROBOT, 2, None, replace(SETTINGS, hidden=(16, 16))), out, 1e6, False)
+    with pytest.raises(ConfigError, match=r"did not begin with .*--no-resume"):
+        trainer(out, init=out / "expert.safetensors")
+    with pytest.raises(
+        ConfigError, match=r"hidden was \(32, 16\), is \(16, 16\); hardest_push was 0.9, is 0.5.*--no-resume"
+    ):
+        trainer(out, hidden=(16, 16), hardest_push=0.5)
+    (tmp_path / "state.pt").write_bytes(b"")
+    with pytest.raises(ConfigError, match=r"state\.pt: a run of an older program.*--no-resume.*--init"):
+        trainer(tmp_path)
+
+
+def test_an_interrupted_run_leaves_its_newest_network(tmp_path: Path) -> None:
+    run = trainer(tmp_path, evaluate_every=0.0)
+    learn = run.learn
+
+    def interrupted() -> dict[str, float]:
+        if run.step == 48:
+            raise KeyboardInterrupt
+        return learn()
+
+    run.learn = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        run.run()
+    assert read_header(tmp_path / "expert.safetensors")["results"]["samples"] == 48
+    assert trainer(tmp_path).step == 48
 
 
 def test_commands_of_training_are_spread_over_what_is_asked() -> None:
@@ -146,37 +191,23 @@ def test_commands_of_training_are_spread_over_what_is_asked() -> None:
 
 
 def test_a_fresh_start_leaves_no_curve_of_the_old_run(tmp_path: Path) -> None:
-    trainer(tmp_path)._iteration()
-    other = trainer(tmp_path, fresh=True)
-    assert other.samples == 0
-    assert not (tmp_path / "progress.csv").exists()
-
-
-def test_a_budget_that_is_used_up_still_saves(tmp_path: Path) -> None:
-    trainer(tmp_path, samples=0.5).learn(0.0)  # no iteration, and so no curve to draw
-    assert (tmp_path / "state.pt").exists()
-    assert (tmp_path / "expert.safetensors").exists()
-
-
-def test_the_curve_keeps_what_was_saved(tmp_path: Path) -> None:
-    path = tmp_path / "progress.csv"
-    forget_after(path, 5)  # nothing there is no error
-    path.write_text("samples,reward\n1.0,2.0\n2.0,3.0\n3.0,4.0\n")
-    forget_after(path, 2)
-    assert path.read_text().split() == ["samples,reward", "1.0,2.0", "2.0,3.0"]
-    plot(tmp_path / "none.csv", tmp_path / "none.png")
-    assert not (tmp_path / "none.png").exists()
+    trainer(tmp_path, samples=48.0).run()
+    assert rows(tmp_path)
+    other = trainer(tmp_path, resume=False, samples=1.0)
+    other.run()
+    assert other.step == 48
+    assert len(rows(tmp_path)) == 1
 
 
 def test_a_world_learns_the_same_whatever_its_neighbours() -> None:
     """Commands, pushes, robots and noise come from the world's own stream, over falls and time-outs."""
 
     def lived(n: int) -> tuple[list[bytes], list[float]]:
-        env, seen, rewards = Tracking(ROBOT, n, None, SETTINGS), [], []
+        env, seen, rewards = environment(n), [], []
         action = np.random.default_rng(0).standard_normal((70, 1, 20))
         for k in range(70):
             reward, done, _ = env.step(np.repeat(0.5 * action[k], n, 0))
-            seen += [env.critic[0].tobytes(), done[0].tobytes()]
+            seen += [env.observations["critic"][0].tobytes(), done[0].tobytes()]
             rewards.append(reward[0])
         return seen, rewards
 
@@ -186,7 +217,7 @@ def test_a_world_learns_the_same_whatever_its_neighbours() -> None:
 
 
 def test_falls_and_time_outs_end_episodes_and_only_time_outs_are_late() -> None:
-    env = Tracking(ROBOT, 4, None, SETTINGS)
+    env = environment(4)
     ended, late = np.zeros(4, int), np.zeros(4, int)
     for _ in range(110):
         action = np.zeros((4, 20))
@@ -196,17 +227,18 @@ def test_falls_and_time_outs_end_episodes_and_only_time_outs_are_late() -> None:
         ended += done
         late += out
         assert (env.ticks[done] == 0).all()
-        assert np.isfinite(env.critic).all()
+        assert np.isfinite(env.observations["critic"]).all()
     assert env.limit == 50
     assert (late[1:] >= 1).all()
     assert ended[0] > late[0]
 
 
 def test_the_actor_sees_nothing_of_the_truth_that_the_critic_sees() -> None:
-    env = Tracking(ROBOT, 2, None, SETTINGS)
-    assert env.actor.shape == (2, TrackerObservation(ROBOT).size)
-    assert env.critic.shape[1] > env.actor.shape[1]
-    np.testing.assert_array_equal(env.critic[:, : env.actor.shape[1]], env.actor)
+    env = environment(2)
+    actor, critic = env.observations["actor"], env.observations["critic"]
+    assert actor.shape == (2, TrackerObservation(ROBOT).size)
+    assert critic.shape[1] > actor.shape[1]
+    np.testing.assert_array_equal(critic[:, : actor.shape[1]], actor)
 
 
 def test_a_label_is_not_changed_by_a_later_reset() -> None:

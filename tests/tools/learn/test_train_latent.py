@@ -53,7 +53,7 @@ def made(synthetic_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     out = tmp_path_factory.mktemp("latent")
     before = torch.get_num_threads()
     world = ["--survival-worlds", 2, "--survival-seconds", 0.5]
-    train(latent, "--data", synthetic_dataset, "--out", out, *SMALL, *world, "--minutes", 0.02)
+    train(latent, "--data", synthetic_dataset, "--out", out, *SMALL, *world, "--steps", 40)
     torch.set_num_threads(before)
     return out / "latent.safetensors"
 
@@ -69,14 +69,15 @@ def test_the_file_says_what_was_measured(made: Path) -> None:
     assert (made.parent / "learning_curve.png").exists()
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_and_another_network_is_refused(synthetic_dataset: Path, tmp_path: Path) -> None:
     options = ["--data", synthetic_dataset, "--out", tmp_path, *SMALL, "--survival-worlds", 0]
-    train(latent, *options, "--minutes", 0.005)
+    train(latent, *options, "--steps", 4)
     first = read_header(tmp_path / "last.safetensors")["results"]["step"]
-    train(latent, *options, "--minutes", 0.01)
+    train(latent, *options, "--steps", 8)
     assert read_header(tmp_path / "last.safetensors")["results"]["step"] > first
     with pytest.raises(ConfigError, match="size was 5, is 7"):
-        train(latent, *options, "--minutes", 0.01, "--size", 7)
+        train(latent, *options, "--steps", 8, "--size", 7)
     with pytest.raises(ConfigError, match="beta must be positive"):
         train(latent, *options, "--beta", 0, 1)
 
@@ -123,13 +124,14 @@ def driven_by_the_present_state(path: Path) -> None:
     assert np.abs(target - space.decode(then, planned)).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_diffusion_model_learns_to_plan_latents_and_carries_their_decoder(
     made: Path, synthetic_dataset: Path, tmp_path: Path
 ) -> None:
     options = ["--data", synthetic_dataset, "--out", tmp_path, "--latent", made, "--layers", 1, "--width", 16]
     options += ["--batch", 16, "--threads", 1, "--survival-worlds", 0, "--evaluate-every", 0, "--actions", 12]
-    train(diffusion, *options, "--minutes", 0.004)
-    train(diffusion, *options, "--minutes", 0.008)  # goes on
+    train(diffusion, *options, "--steps", 4)
+    train(diffusion, *options, "--steps", 8)  # goes on
     model = load(tmp_path / "best.safetensors", ROBOT)
     assert model.config.action_size == 5
     assert model.config.action_horizon == 12
@@ -148,4 +150,4 @@ def test_a_diffusion_model_learns_to_plan_latents_and_carries_their_decoder(
         *options[6:],
     ]
     with pytest.raises(ConfigError, match="another network than the options ask for"):
-        train(diffusion, *begun, "--minutes", 0.001)
+        train(diffusion, *begun, "--steps", 2)

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
-from servoid.stack.estimation.odometry import OFFSETS, OdometryFeatures
+from servoid.policy.checkpoint import CheckpointError, read, read_header
+from servoid.stack.estimation.odometry import OFFSETS, OdometryFeatures, load_odometry
+from servoid.tools.learn.settings import OdometryTraining
 from servoid.tools.learn.trainers import odometry
+from servoid.tools.learn.trainers.odometry import OdometryTrainer
+from servoid.tools.learn.walks import drift, maker, record
 
 ROBOT = load_robot()
 
 
 @pytest.fixture(scope="module")
 def recorded() -> dict[str, np.ndarray]:
-    return odometry.record(ROBOT, odometry.maker(ROBOT, "gait"), 6, 4.0, seed=0)
+    return record(ROBOT, maker(ROBOT, "gait"), 6, 4.0, seed=0)
 
 
 def test_a_recording_is_what_the_network_will_see(recorded: dict[str, np.ndarray]) -> None:
@@ -36,40 +43,76 @@ def test_a_recording_is_what_the_network_will_see(recorded: dict[str, np.ndarray
         assert starts[world, tick + 1] == tick + 1
 
 
-def test_fitting_takes_a_systematic_slip_out(recorded: dict[str, np.ndarray], capsys: pytest.CaptureFixture) -> None:
+def trainer(data: dict[str, np.ndarray], out: Path, **changes: Any) -> OdometryTrainer:
+    settings = OdometryTraining(**{"steps": 25, "worlds": 6, "seconds": 4.0, **changes})
+    return OdometryTrainer(ROBOT, ["gait"], lambda: data, settings, out, "made up")
+
+
+@pytest.fixture
+def slipping(recorded: dict[str, np.ndarray]) -> Iterator[dict[str, np.ndarray]]:
+    """Walks whose legs slip by a rule that can be learned."""
     threads = torch.get_num_threads()
-    data = {**recorded, "errors": 0.3 * recorded["rows"][..., :3] + np.float32(0.1)}
-    network = odometry.fit(data, steps=25, seed=0)
+    yield {**recorded, "errors": 0.3 * recorded["rows"][..., :3] + np.float32(0.1)}
     torch.set_num_threads(threads)
+
+
+def test_fitting_takes_a_systematic_slip_out(slipping: dict[str, np.ndarray], tmp_path: Path) -> None:
+    trainer(slipping, tmp_path / "o.safetensors").run()
+    network = load_odometry(ROBOT, tmp_path / "o.safetensors")
     ticks = np.arange(30, 200, 10)
-    windows = data["rows"][:, ticks[:, None] - OFFSETS].reshape(6, len(ticks), -1)
-    slip = data["errors"][:, ticks]
+    windows = slipping["rows"][:, ticks[:, None] - OFFSETS].reshape(6, len(ticks), -1)
+    slip = slipping["errors"][:, ticks]
     assert np.square(slip - network(windows)).mean() < 0.25 * np.square(slip).mean()
-    assert "corrected: rms" in capsys.readouterr().out
+    results = read_header(tmp_path / "o.safetensors")["results"]
+    assert results["slow_rms"] < 0.5 * results["slow_rms_legs_alone"]
+    # Its run is beside it.
+    assert {"resume.pt", "log.csv", "learning_curve.png", "settings.yaml"} <= {
+        p.name for p in (tmp_path / "o").iterdir()
+    }
 
 
-def test_the_odometry_that_is_there_is_measured_and_nothing_is_trained(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    given = []
+@pytest.mark.slow
+def test_a_fit_that_was_interrupted_ends_as_one_that_was_not(slipping: dict[str, np.ndarray], tmp_path: Path) -> None:
+    whole, parted = tmp_path / "whole", tmp_path / "parted"
+    trainer(slipping, whole).run()
+    first = trainer(slipping, parted)
+    learn = first.learn
 
-    def drift(robot: object, drive: object, network: object, **options: object) -> odometry.Drift:
-        given.append(network)
-        return odometry.Drift(0.01, 0.02, 0.03, 64)
+    def interrupted() -> dict[str, float]:
+        if first.step == 10:
+            raise KeyboardInterrupt
+        return learn()
 
-    monkeypatch.setattr(odometry, "drift", drift)
+    first.learn = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        first.run()
+    again = trainer(slipping, parted)
+    again.start(resume=True)
+    assert again.step == 10
+    again.run()
+    ours, theirs = (read(folder / "odometry.safetensors")[1] for folder in (parted, whole))
+    for name, value in theirs.items():
+        np.testing.assert_array_equal(ours[name], value)
+
+
+def test_an_odometry_is_measured_and_nothing_is_trained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     parser = argparse.ArgumentParser()
     odometry.add_arguments(parser)
     out = tmp_path / "o.safetensors"
-    assert odometry.main(parser.parse_args(["--policy", "--measure", "--out", str(out)])) == 0
-    assert given[0] is None
-    assert given[1] is not None
-    assert "gait, corrected: displacement error 1.0 % of the path (median), 2.0 %" in capsys.readouterr().out
-    assert not out.exists()
+    options = ["--policy", "--out", str(out), "--walks", "2", "--walk-seconds", "1"]
+    assert odometry.main(parser.parse_args([*options, "--measure"])) == 0
+    said = capsys.readouterr()
+    assert "gait, corrected: 2 walks of 1 s ..." in said.err
+    assert "gait, legs alone: displacement error" in said.out
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(ConfigError, match="--measure trains nothing, so --steps, --worlds would be ignored"):
+        odometry.main(parser.parse_args(["--policy", "--measure", "--worlds", "3", "--steps", "3"]))
+    with pytest.raises(CheckpointError, match="no such checkpoint"):
+        odometry.main(parser.parse_args([*options, "--measure", str(tmp_path / "none.safetensors")]))
 
 
 def test_walks_that_cover_no_metre_do_not_count() -> None:
     """Sway is no path: two seconds of walking sway a metre, and cover none."""
-    result = odometry.drift(ROBOT, odometry.maker(ROBOT, "gait"), None, walks=4, seconds=2.0, seed=1)
+    result = drift(ROBOT, maker(ROBOT, "gait"), None, walks=4, seconds=2.0, seed=1)
     assert result.walks == 0
     assert np.isnan(result.p90)

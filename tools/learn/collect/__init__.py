@@ -101,7 +101,7 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
     from servoid.stack.estimation.odometry import load_odometry
     from servoid.tools.learn.collect.disturbances import DisturbanceSettings
     from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
-    from servoid.tools.learn.collect.lerobot import DatasetWriter
+    from servoid.tools.learn.collect.lerobot import DatasetWriter, Schema
     from servoid.tools.learn.collect.skills import SKILLS
 
     begin = time.perf_counter()
@@ -114,15 +114,8 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
         "odometry": {"name": "legs"} if odometry is None else _source(resolve("odometry")),
     }
     settings = DisturbanceSettings(scale=(args.noise[0], args.noise[1]))
-    writer = DatasetWriter(
-        args.out,
-        robot_type=robot.name,
-        fps=robot.rate,
-        features=_features(robot),
-        tasks=[skill.text for skill in SKILLS],
-        force=args.force,
-    )
-    with writer:
+    schema = Schema(robot.name, robot.rate, _features(robot), tuple(skill.text for skill in SKILLS))
+    with DatasetWriter(args.out, schema, args.force) as writer:
         fleet = Fleet(robot, args.worlds, odometry, randomise=args.randomise, seed=args.seed, threads=args.threads)
         cutter = EpisodeCutter(fleet, policy, settings, args.seconds)
         with tqdm(total=args.frames, desc="walking", unit="frame", mininterval=1.0) as bar:

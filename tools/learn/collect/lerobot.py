@@ -53,6 +53,16 @@ class Feature:
     info: Mapping[str, str] | None = None
 
 
+@dataclass(frozen=True)
+class Schema:
+    """What a dataset holds."""
+
+    robot_type: str
+    fps: int  # rows a second
+    features: Mapping[str, Feature]  # by column name
+    tasks: tuple[str, ...]  # the texts that `task_index` numbers
+
+
 def check_target(out: Path, force: bool) -> None:
     """Refuse a folder that may not be written. Raises ConfigError.
 
@@ -79,23 +89,12 @@ def _part(out: Path) -> Path:
 class DatasetWriter:
     """A dataset being written to `out`; as a context manager, it leaves nothing behind when the block raises.
 
-    `features` by column name; `tasks` are the texts that `task_index` numbers. Every method raises ConfigError when
-    the disk does not take what is written.
+    Every method raises ConfigError when the disk does not take what is written.
     """
 
-    def __init__(
-        self,
-        out: Path,
-        *,
-        robot_type: str,
-        fps: int,
-        features: Mapping[str, Feature],
-        tasks: Sequence[str],
-        force: bool = False,
-    ) -> None:
+    def __init__(self, out: Path, schema: Schema, force: bool = False) -> None:
         check_target(out, force)
-        self.out, self._part = out, _part(out)
-        self.robot_type, self.fps, self.features, self.tasks = robot_type, fps, dict(features), tuple(tasks)
+        self.out, self._part, self.schema = out, _part(out), schema
         self.episodes = 0
         self.frames = 0
         self._file = -1  # number of the newest data file
@@ -117,11 +116,11 @@ class DatasetWriter:
     def add(self, columns: Mapping[str, Array], task_index: Array) -> None:
         """Append an episode: a `(frames, size)` array for each feature, and the number of each frame's task."""
         frames = len(task_index)
-        for name, feature in self.features.items():
+        for name, feature in self.schema.features.items():
             if columns[name].shape != (frames, len(feature.names)):
                 raise ValueError(f"'{name}' is {columns[name].shape}, not {(frames, len(feature.names))}")
-        whole: dict[str, Array] = {name: columns[name].astype(np.float32) for name in self.features}
-        whole["timestamp"] = (np.arange(frames) / self.fps).astype(np.float32)
+        whole: dict[str, Array] = {name: columns[name].astype(np.float32) for name in self.schema.features}
+        whole["timestamp"] = (np.arange(frames) / self.schema.fps).astype(np.float32)
         whole["frame_index"] = np.arange(frames)
         whole["episode_index"] = np.full(frames, self.episodes)
         whole["index"] = self.frames + np.arange(frames)
@@ -136,7 +135,7 @@ class DatasetWriter:
         order = list(dict.fromkeys(whole["task_index"].tolist()))
         row: dict[str, Any] = {
             "episode_index": self.episodes,
-            "tasks": [self.tasks[i] for i in order],
+            "tasks": [self.schema.tasks[i] for i in order],
             "length": frames,
             "data/chunk_index": chunk,
             "data/file_index": file,
@@ -185,7 +184,7 @@ class DatasetWriter:
         (meta / "info.json").write_text(json.dumps(self._info(), indent=4) + "\n")
         statistics = {name: {key: total[key].tolist() for key in _STATISTICS} for name, total in self._total.items()}
         (meta / "stats.json").write_text(json.dumps(statistics, indent=4) + "\n")
-        pq.write_table(_tasks_table(self.tasks), meta / "tasks.parquet")
+        pq.write_table(_tasks_table(self.schema.tasks), meta / "tasks.parquet")
         path = self._part / EPISODES_PATH.format(chunk_index=0, file_index=0)
         path.parent.mkdir(parents=True)
         pq.write_table(pa.Table.from_pylist(self._rows), path)
@@ -194,21 +193,21 @@ class DatasetWriter:
 
     def _info(self) -> dict[str, Any]:
         features: dict[str, Any] = {}
-        for name, feature in self.features.items():
+        for name, feature in self.schema.features.items():
             features[name] = {"dtype": "float32", "shape": [len(feature.names)], "names": list(feature.names)}
             if feature.info:
                 features[name]["info"] = dict(feature.info)
         features |= {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in _INDEX.items()}
         return {
             "codebase_version": VERSION,
-            "robot_type": self.robot_type,
+            "robot_type": self.schema.robot_type,
             "total_episodes": self.episodes,
             "total_frames": self.frames,
-            "total_tasks": len(self.tasks),
+            "total_tasks": len(self.schema.tasks),
             "chunks_size": FILES_A_CHUNK,
             "data_files_size_in_mb": FILE_MEGABYTES,
             "video_files_size_in_mb": _VIDEO_FILE_MEGABYTES,
-            "fps": self.fps,
+            "fps": self.schema.fps,
             "splits": {"train": f"0:{self.episodes}"},
             "data_path": DATA_PATH,
             "video_path": None,

@@ -10,31 +10,35 @@ from servoid.hw.robot.mirror import Mirror
 from servoid.policy.mlp import Mlp
 from servoid.policy.references.gait import Gait
 from servoid.policy.tracker.observation import AHEAD, RESIDUAL, TrackerObservation
-from servoid.policy.tracker.rewards import Step, total
+from servoid.policy.tracker.rewards import TERMS, Step
 from servoid.stack.control.fleet import Fleet
-from servoid.tools.learn.settings import ExpertSettings
+from servoid.tools.learn.settings import TrackingSettings
+from servoid.tools.learn.terms import Terms
 
 _MIXED_SPEED = 0.7  # of the top speed forward
 
 
 class Tracking:
-    """`n` worlds. Observations are float32: `(n, size)` for the actor, with privileged truth added for the critic."""
+    """`n` worlds: see `servoid.tools.learn.trainers.ppo.Environment`. The critic sees privileged truth as well."""
 
-    def __init__(self, robot: Robot, n: int, odometry: Mlp | None, settings: ExpertSettings, seed: int = 0) -> None:
+    def __init__(self, robot: Robot, n: int, odometry: Mlp | None, settings: TrackingSettings, seed: int = 0) -> None:
+        """Call `reset` first."""
         self.robot, self.n, self.settings = robot, n, settings
         self.fleet = Fleet(robot, n, odometry, randomise=settings.randomised, seed=seed)
         self.gait = Gait(robot, (n,))
         self.observation = TrackerObservation(robot, (n,))
         joints, feet = Mirror.joints(robot), Mirror.feet(robot)
-        self.mirror_action, self.mirror_actor = joints, self.observation.mirror
-        self.mirror_critic = Mirror.join(
-            self.mirror_actor, Mirror.VECTOR, feet, Mirror.vectors(feet),
+        critic = Mirror.join(
+            self.observation.mirror, Mirror.VECTOR, feet, Mirror.vectors(feet),
             *[Mirror.PLANAR, Mirror.FLIPPED] * 2, *[Mirror.SCALAR] * 4, joints,
         )  # fmt: skip
+        self.mirrors = {"action": joints, "actor": self.observation.mirror, "critic": critic}
+        self.action_size = len(robot.joints)
         self.ticks = np.zeros(n, int)
         self._weight = robot.weight or self.fleet.worlds.weight
         self.limit = round(settings.episode_seconds / robot.dt)
         self.push_scale = 1.0
+        self.reward = Terms(settings.rewards, TERMS)
         self.terms: dict[str, float] = {}
         self._next_command, self._next_push = np.zeros(n, int), np.zeros(n, int)
         # Of the last cycle, newest at `ticks % cycle`: velocity and yaw rate, measured and asked.
@@ -42,20 +46,34 @@ class Tracking:
         self._twists = np.zeros((self._cycle, n, 6))
         self._twist = np.zeros((n, 6))
         self._targets = np.zeros((3, n, len(robot.joints)))
-        self._reset(np.ones(n, bool))
-        self.actor, self.critic = self._observe()
+        self.observations: dict[str, Array] = {}
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """Of the terms that count."""
+        return self.reward.names
+
+    def reset(self) -> None:
+        """Begin a new episode in every world."""
+        self._reset(np.ones(self.n, bool))
+        self._observe()
+
+    def schedule(self, progress: float) -> None:
+        """Pushes grow over the first fifth of the training."""
+        self.push_scale = min(1.0, 0.25 + 0.75 * progress / 0.2)
 
     def _reset(self, where: Array) -> None:
         fleet = self.fleet
         fleet.reset(where)
         self.gait.reset(where)
         self.observation.reset(where)
+        self.reward.reset(where)
         self.ticks[where] = self._next_command[where] = 0
         self._next_push[where] = 25
         self._twists[:, where], self._twist[where] = 0.0, 0.0
         self._targets[:, where] = fleet.applied[where]
 
-    def _observe(self) -> tuple[Array, Array]:
+    def _observe(self) -> None:
         state = self.fleet.observe()
         frames = self.gait.frames(AHEAD)
         self._reference = frames
@@ -79,7 +97,7 @@ class Tracking:
             ],
             -1,
         ).astype(np.float32)
-        return actor, np.concatenate([actor, privileged], -1)
+        self.observations = {"actor": actor, "critic": np.concatenate([actor, privileged], -1)}
 
     def _instruct(self) -> None:
         """Draw new commands and pushes where they are due, each world from its own stream."""
@@ -152,18 +170,18 @@ class Tracking:
             walking=self.robot.walking,
             weight=self._weight,
         )
-        reward, self.terms = total(step, self.settings.rewards)
+        reward, self.terms = self.reward(step)
         late = (self.ticks >= self.limit) & ~fallen
         done = fallen | late
         self._instruct()
         self.gait.advance()
         if done.any():
             self._reset(done)
-        self.actor, self.critic = self._observe()
+        self._observe()
         return reward * self.robot.dt, done, late
 
 
-def _draw(rng: np.random.Generator, s: ExpertSettings, walking: Walking) -> Array:
+def _draw(rng: np.random.Generator, s: TrackingSettings, walking: Walking) -> Array:
     """A command `(3,)`: standing, straight ahead, along one other axis, backward, or any mixture."""
     command = rng.uniform(walking.lower, walking.upper)
     slowest, fastest = -walking.backward, walking.forward

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 
 
-class Journal:
+class Logger:
     """Scalars of a run in its folder; a resumed run goes on in the same files."""
 
     def __init__(self, folder: Path, columns: Sequence[str], step: int = 0) -> None:
@@ -24,7 +24,7 @@ class Journal:
             writer.writerows(rows)
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
 
-    def __enter__(self) -> Journal:
+    def __enter__(self) -> Logger:
         return self
 
     def __exit__(

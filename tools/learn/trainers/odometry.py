@@ -1,86 +1,98 @@
-"""`servoid train odometry`: learn the correction of leg odometry in randomised worlds, and measure the drift left."""
+"""Learn the correction of leg odometry from walks in randomised worlds, and measure the drift that is left.
+
+With --measure nothing is trained: it says how far an odometry is off.
+"""
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
-from servoid.hw.contracts.control import Instruction
+from servoid.policy import checkpoint
+from servoid.policy.mlp import Mlp
+from servoid.tools.learn.flags import plain, read_settings
+from servoid.tools.learn.settings import OdometryTraining
+from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments
+from servoid.tools.learn.walks import drift, maker, mixed, record
 
 if TYPE_CHECKING:
-    from servoid.hw.contracts.control import Policy
+    import torch
 
-    MakePolicy = Callable[..., Policy]  # takes a shape
+    from servoid.hw.robot.description import Robot
+    from servoid.tools.learn.walks import MakePolicy
 
-_CHUNK = 50  # ticks whose mean error is penalised beside each tick's: the mean is what drifts
-_MEAN_WEIGHT = 20.0
+SHIPPED = "odometry"
+_MEASURING = ("policy", "seed", "walks", "walk_seconds")  # settings that --measure goes by
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
-    parser.add_argument(
-        "--policy", nargs="*", default=["expert", "diffusion"], metavar="NAME", help="what walks beside the gait"
+    """Add the options of `servoid train odometry`."""
+    out = Path("runs/odometry.safetensors")
+    run = add_run_arguments(
+        parser, OdometryTraining(), out, "checkpoint to write; its run is kept in the folder beside it"
     )
-    parser.add_argument("--out", type=Path, default=Path("runs/odometry.safetensors"), help="checkpoint to write")
-    parser.add_argument("--worlds", type=int, default=192)
-    parser.add_argument("--seconds", type=float, default=60.0, help="of walking a world (default: %(default)s)")
-    parser.add_argument("--steps", type=int, default=3000, help="of the optimiser (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
+    run.add_argument(
         "--measure",
-        action="store_true",
-        help="train nothing: how far is the odometry that is there off on these walks",
+        nargs="?",
+        const=SHIPPED,
+        metavar="CHECKPOINT",
+        help="train nothing: how far is this odometry off (default: the shipped one); "
+        "--policy, --walks, --walk-seconds and --seed choose the walks",
     )
 
 
 def main(args: argparse.Namespace) -> int:
+    """Train or measure; returns 0. Raises ConfigError."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # the worlds use the cores
     from servoid.hw.robot.description import load_robot
-    from servoid.policy import checkpoint
     from servoid.stack.estimation.odometry import load_odometry
 
-    robot = load_robot(args.robot)
-    names = ["gait", *(name for name in args.policy if name != "gait")]
+    settings, robot = read_settings(args, OdometryTraining()), load_robot(args.robot)
+    names = ["gait", *(name for name in settings.policy if name != "gait")]
     makers = {name: maker(robot, name) for name in names}
-    if args.measure:
-        _measure(robot, makers, load_odometry(robot), args.seed)
+    if args.measure is not None:
+        _refuse_unused(args)
+        measure(robot, makers, load_odometry(robot, args.measure), settings)
         return 0
-    known = _shipped(robot)
-    data: dict[str, Array] | None = None
-    for i, name in enumerate(names):  # every way of walking slips in its own way
-        part = record(robot, makers[name], args.worlds // len(names), args.seconds, args.seed + i, known)
-        data = part if data is None else mixed(data, part, args.seed)
-    assert data is not None
-    network = fit(data, args.steps, args.seed)
-    results = _measure(robot, makers, network, args.seed)
-    head = checkpoint.header(
-        "odometry",
-        robot,
-        config={"hidden": [len(bias) for _, bias in network.layers[:-1]]},
-        data=f"{args.worlds} randomised worlds, {args.seconds:g} s of {', '.join(names)}, seed {args.seed}",
-        licence="Apache-2.0",
-        results=results,
+    trainer = OdometryTrainer(
+        robot, names, partial(walked, robot, makers, settings), settings, args.out, _source(names), args.threads
     )
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    network.save(args.out, head)
-    print(f"wrote {args.out}")
+    trainer.judge = lambda path: measure(robot, makers, load_odometry(robot, path), settings)
+    trainer.start(args.resume)
+    trainer.run()
     return 0
 
 
-def _measure(robot: Any, makers: dict[str, MakePolicy], network: Any, seed: int) -> dict[str, float]:
-    """Print the drift of each way of walking, by legs alone and corrected; returns what the checkpoint says of it."""
+def _refuse_unused(args: argparse.Namespace) -> None:
+    """Raise ConfigError for options that --measure would ignore."""
+    given = [f.name for f in fields(OdometryTraining) if f.name in args and f.name not in _MEASURING]
+    if given:
+        flags = ", ".join("--" + name.replace("_", "-") for name in given)
+        raise ConfigError(
+            f"--measure trains nothing, so {flags} would be ignored: --walks and --walk-seconds set its walks"
+        )
+
+
+def measure(
+    robot: Robot, makers: Mapping[str, MakePolicy], network: Mlp, settings: OdometryTraining
+) -> dict[str, float]:
+    """Print the drift of each way of walking, by legs alone and corrected; returns the 90th percentiles."""
     results = {}
     for name, make in makers.items():
         for title, odometry in (("legs alone", None), ("corrected", network)):
-            result = drift(robot, make, odometry, walks=64, seconds=30.0, seed=seed + 1)
+            walks, seconds = settings.walks, settings.walk_seconds
+            print(f"{name}, {title}: {walks} walks of {seconds:g} s ...", file=sys.stderr)
+            result = drift(robot, make, odometry, walks=walks, seconds=seconds, seed=settings.seed + 1)
             key = f"drift_p90_{name}" + ("_legs_alone" if odometry is None else "")
             results[key] = round(result.p90, 4)
             print(
@@ -91,181 +103,178 @@ def _measure(robot: Any, makers: dict[str, MakePolicy], network: Any, seed: int)
     return results
 
 
-def _shipped(robot: Any) -> Any:
+def walked(robot: Robot, makers: Mapping[str, MakePolicy], settings: OdometryTraining) -> dict[str, Array]:
+    """Record walks of every kind, for every way of walking slips in its own: see `record`."""
+    known = _shipped(robot)
+    data: dict[str, Array] = {}
+    for i, (name, make) in enumerate(makers.items()):
+        worlds = settings.worlds // len(makers)
+        print(f"recording {name}: {worlds} robots, {settings.seconds:g} s ...", file=sys.stderr)
+        part = record(robot, make, worlds, settings.seconds, settings.seed + i, known)
+        data = mixed(data, part, settings.seed) if data else part
+    return data
+
+
+class OdometryTrainer(Trainer):
+    """Fits the correction to walks that are recorded first, the same ones whenever the run goes on."""
+
+    settings: OdometryTraining
+
+    LOSS = "slow_rms"
+    columns = ("loss", "learning_rate", "steps_per_s", "rms", "slow_rms", "rms_legs_alone", "slow_rms_legs_alone")
+    panels = (("loss",), ("rms", "rms_legs_alone"), ("slow_rms", "slow_rms_legs_alone"))
+
+    def __init__(
+        self,
+        robot: Robot,
+        names: Sequence[str],
+        walks: Callable[[], dict[str, Array]],
+        settings: OdometryTraining,
+        out: Path,
+        source: str,
+        threads: int = 1,
+    ) -> None:
+        """`walks` records those of the policies `names`. `out` is the checkpoint to write, or a folder for it."""
+        named = out.suffix == ".safetensors"
+        super().__init__(out.with_suffix("") if named else out, settings, source)
+        self.best_path = out if named else out / "odometry.safetensors"
+        self.robot, self.names, self.walks, self.threads = robot, names, walks, threads
+        self._saved: Mapping[str, Any] | None = None
+
+    @property
+    def title(self) -> str:
+        """See `Trainer.title`."""
+        walks = f"{self.settings.worlds} robots, {self.settings.seconds:g} s of {', '.join(self.names)}"
+        return f"odometry on the walks of {walks}"
+
+    @property
+    def following(self) -> str:
+        """See `Trainer.following`."""
+        return (
+            f"cp {self.best_path} {checkpoint.CHECKPOINTS / 'odometry.safetensors'}  # every run and training reads it"
+        )
+
+    def prepare(self) -> None:
+        """Record the walks and make the network."""
+        import torch
+        from torch import nn
+
+        s = self.settings
+        self.tensors = {name: torch.from_numpy(value) for name, value in self.walks().items()}
+        torch.manual_seed(s.seed)
+        torch.set_num_threads(self.threads)
+        sample = self._draw(400)[0].flatten(0, 1)
+        self.mean, self.std = sample.mean(0), sample.std(0).clamp_min(0.02)
+        sizes = (sample.shape[1], *s.hidden)
+        hidden = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ELU())]
+        self.network = nn.Sequential(*hidden, nn.Linear(sizes[-1], 3))
+        self.optimiser = torch.optim.AdamW(self.network.parameters(), s.learning_rate, weight_decay=s.weight_decay)
+        if self._saved is not None:
+            self.network.load_state_dict(self._saved["network"])
+            self.optimiser.load_state_dict(self._saved["optimiser"])
+            torch.set_rng_state(self._saved["generator"])
+
+    def _draw(self, size: int, held_out: bool = False) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Windows `(size, chunk, inputs)`, errors of the legs' velocity `(size, chunk, 3)`, and whether no fall
+        interrupts a chunk `(size, 1)`. An eighth of the worlds is held out."""
+        import torch
+
+        from servoid.stack.estimation.odometry import OFFSETS
+
+        rows, errors, starts = (self.tensors[name] for name in ("rows", "errors", "starts"))
+        worlds, ticks, _ = rows.shape
+        chunk, held = self.settings.chunk, max(worlds // 8, 1)
+        first, last = (worlds - held, worlds) if held_out else (0, worlds - held)
+        world = torch.randint(first, last, (size, 1))
+        at = torch.randint(0, ticks - chunk, (size, 1)) + torch.arange(chunk)
+        begin = starts[world, at]
+        index = torch.maximum(at[..., None] - torch.from_numpy(OFFSETS), begin[..., None])
+        whole = (begin[:, :1] == begin[:, -1:]).float()
+        return rows[world[..., None], index].flatten(2), errors[world, at], whole
+
+    def learn(self) -> dict[str, float]:
+        """See `Trainer.learn`."""
+        rate = self.settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * self.share))
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        x, y, whole = self._draw(self.settings.batch)
+        left = y - self.network((x - self.mean) / self.std)
+        loss = (left**2).mean() + self.settings.mean_weight * ((left.mean(1) ** 2) * whole).mean()
+        self.optimiser.zero_grad()
+        loss.backward()
+        self.optimiser.step()
+        self.step += 1
+        return {"loss": loss.item(), "learning_rate": rate}
+
+    def shown(self, means: Mapping[str, float], steps_per_s: float) -> tuple[dict[str, float], str]:
+        """See `Trainer.shown`."""
+        return {"steps_per_s": steps_per_s}, f"loss {means['loss']:.5f}, {steps_per_s:.0f} steps/s"
+
+    def held_out(self) -> dict[str, float]:
+        """Root mean square errors [m/s] in worlds that were held out: of each tick, and of the means of chunks."""
+        import torch
+
+        results = {}
+        with torch.no_grad(), torch.random.fork_rng([]):
+            torch.manual_seed(0)
+            x, y, whole = self._draw(1000, held_out=True)
+            left = y - self.network((x - self.mean) / self.std)
+            for name, error in (("", left), ("_legs_alone", y)):
+                results[f"rms{name}"] = (error**2).mean().sqrt().item()
+                results[f"slow_rms{name}"] = ((error.mean(1) ** 2) * whole).mean().sqrt().item()
+        return results
+
+    def fitted(self) -> Mlp:
+        """The network as it runs without torch."""
+        from torch import nn
+
+        dense = [m for m in self.network if isinstance(m, nn.Linear)]
+        layers = [(m.weight.detach().numpy().T.copy(), m.bias.detach().numpy().copy()) for m in dense]
+        return Mlp(layers, self.mean.numpy(), self.std.numpy())
+
+    def ship(self, path: Path, results: Mapping[str, Any]) -> None:
+        """See `Trainer.ship`."""
+        s = self.settings
+        head = checkpoint.header(
+            "odometry",
+            self.robot,
+            config={"hidden": list(s.hidden)},
+            data=f"{s.worlds} randomised worlds, {s.seconds:g} s of {', '.join(self.names)}, seed {s.seed}",
+            licence="Apache-2.0",
+            results=results,
+            training=plain(s),
+        )
+        self.fitted().save(path, head)
+
+    def state(self) -> dict[str, Any]:
+        """See `Trainer.state`."""
+        import torch
+
+        return {
+            "network": self.network.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "generator": torch.get_rng_state(),
+        }
+
+    def restore(self, path: Path, saved: Mapping[str, Any]) -> None:
+        """See `Trainer.restore`; the network is made when the walks are there."""
+        self._saved = saved
+
+
+def _source(names: Iterable[str]) -> str:
+    """What walks, by the hash of its network, and the odometry that it knows where it is by."""
+    from servoid.stack.log.provenance import sha256
+
+    files = {name: checkpoint.CHECKPOINTS / f"{name}.safetensors" for name in (*names, SHIPPED) if name != "gait"}
+    hashes = {name: sha256(path if path.is_file() else Path(name)) for name, path in files.items()}
+    return "walks of " + ", ".join(["gait", *(f"{name} {str(value)[:12]}" for name, value in hashes.items())])
+
+
+def _shipped(robot: Robot) -> Mlp | None:
     """The odometry that is there already, or None."""
-    from servoid.policy.checkpoint import CheckpointError
     from servoid.stack.estimation.odometry import load_odometry
 
     try:
         return load_odometry(robot)
-    except CheckpointError:
+    except checkpoint.CheckpointError:
         return None
-
-
-def maker(robot: Any, name: str) -> MakePolicy:
-    """What makes a policy for worlds of a `shape`, by the policy's name or a checkpoint's file. Raises ConfigError."""
-    from servoid.policy.checkpoint import read_header, resolve
-    from servoid.stack.control.gait import GaitPolicy
-    from servoid.stack.control.tracker import ExpertPolicy
-
-    if name == "gait":
-        return partial(GaitPolicy, robot)
-    if read_header(resolve(name))["kind"] == "tracker":
-        return partial(ExpertPolicy, robot, name)
-    from servoid.policy.diffusion.settings import load_settings
-    from servoid.stack.control.diffusion import diffusion_policy
-    from servoid.stack.tasks import load_task
-
-    settings = replace(load_settings(), checkpoint=name)
-    return partial(diffusion_policy, robot, settings, load_task("walk", {}, robot.dt).objective)
-
-
-def mixed(a: dict[str, Array], b: dict[str, Array], seed: int) -> dict[str, Array]:
-    """Worlds of two recordings in random order, so that those held out are of both."""
-    order = np.random.default_rng(seed).permutation(len(a["rows"]) + len(b["rows"]))
-    return {key: np.concatenate([a[key], b[key]])[order] for key in a}
-
-
-def record(
-    robot: Any, make: MakePolicy, worlds: int, seconds: float, seed: int, odometry: Any = None
-) -> dict[str, Array]:
-    """Walk randomised worlds; returns rows `(n, ticks, features)`, starts `(n, ticks)` and errors `(n, ticks, 3)`."""
-    from tqdm import trange
-
-    from servoid.stack.control.fleet import Fleet
-
-    fleet = Fleet(robot, worlds, odometry, randomise=0.7, seed=seed + 1000)
-    policy = make(shape=(fleet.n,))
-    ticks = round(seconds * robot.rate)
-    rows = np.zeros((worlds, ticks, fleet.estimator.features.size), np.float32)
-    errors = np.zeros((worlds, ticks, 3), np.float32)
-    starts = np.zeros((worlds, ticks), np.int32)
-    everything = np.ones(worlds, bool)
-    fleet.reset(everything)
-    policy.reset(None, fleet.seeds)
-    rng = np.random.default_rng(seed)
-    command, start = np.zeros((worlds, 3)), np.zeros(worlds, np.int32)
-    noise = rng.uniform(0.0, 0.1, (worlds, 1))
-    for k in trange(ticks, desc="walking", unit="tick", mininterval=5.0):
-        fleet.observe()
-        rows[:, k] = fleet.estimator.features.newest
-        errors[:, k] = fleet.truth.velocity - fleet.estimator.leg_velocity
-        starts[:, k] = start
-        due = rng.random(worlds) < 1 / 150
-        command[due] = rng.uniform([-0.15, -0.13, -1.0], [0.5, 0.13, 1.0], (int(due.sum()), 3))
-        command[due] *= rng.random((int(due.sum()), 3)) < 0.7
-        kicked = rng.random(worlds) < 1 / 100
-        angle, size = rng.uniform(-np.pi, np.pi, worlds), rng.uniform(0, 0.3, worlds) * kicked
-        fleet.worlds.push(np.stack([size * np.cos(angle), size * np.sin(angle)], -1))
-        target = policy.act(fleet.state, fleet.applied, Instruction(command))
-        fleet.step(target, noise * rng.standard_normal(target.shape))
-        fallen = fleet.truth.fallen
-        if fallen.any():
-            fleet.reset(fallen)
-            policy.reset(fallen, fleet.seeds)
-            start[fallen] = k + 1
-    return {"rows": rows, "starts": starts, "errors": errors}
-
-
-def fit(data: dict[str, Array], steps: int, seed: int) -> Any:
-    """Fit the network on chunks of `_CHUNK` ticks; prints the error on worlds that it did not see."""
-    import torch
-    from torch import nn
-    from tqdm import trange
-
-    from servoid.policy.mlp import Mlp
-    from servoid.stack.estimation.odometry import OFFSETS
-
-    torch.manual_seed(seed)
-    torch.set_num_threads(os.cpu_count() or 1)
-    rows, errors, starts = (torch.from_numpy(data[k]) for k in ("rows", "errors", "starts"))
-    worlds, ticks, _ = rows.shape
-    held = max(worlds // 8, 1)
-    offsets = torch.from_numpy(OFFSETS)
-
-    def batch(first: int, last: int, size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        world = torch.randint(first, last, (size, 1))
-        at = torch.randint(0, ticks - _CHUNK, (size, 1)) + torch.arange(_CHUNK)
-        begin = starts[world, at]
-        index = torch.maximum(at[..., None] - offsets, begin[..., None])
-        whole = (begin[:, :1] == begin[:, -1:]).float()  # chunks that no fall interrupts
-        return rows[world[..., None], index].flatten(2), errors[world, at], whole
-
-    sample = batch(0, worlds - held, 400)[0].flatten(0, 1)
-    mean, std = sample.mean(0), sample.std(0).clamp_min(0.02)
-    net = nn.Sequential(nn.Linear(sample.shape[1], 128), nn.ELU(), nn.Linear(128, 64), nn.ELU(), nn.Linear(64, 3))
-    optimiser = torch.optim.AdamW(net.parameters(), 2e-3, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-
-    def loss_of(x: torch.Tensor, y: torch.Tensor, whole: torch.Tensor) -> torch.Tensor:
-        left = y - net((x - mean) / std)
-        return (left**2).mean() + _MEAN_WEIGHT * ((left.mean(1) ** 2) * whole).mean()
-
-    bar = trange(steps, desc="fitting", mininterval=5.0)
-    for _ in bar:
-        loss = loss_of(*batch(0, worlds - held, 48))
-        optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimiser.step()
-        schedule.step()
-        bar.set_postfix(loss=f"{loss.item():.5f}")
-    with torch.no_grad():
-        x, y, whole = batch(worlds - held, worlds, 1000)
-        left = y - net((x - mean) / std)
-        for name, error in (("legs alone", y), ("corrected", left)):
-            rms, slow = (error**2).mean((0, 1)).sqrt(), ((error.mean(1) ** 2) * whole).mean(0).sqrt()
-            print(f"{name}: rms {rms.numpy().round(4)} m/s, of one-second means {slow.numpy().round(4)} m/s")
-    dense = [m for m in net if isinstance(m, nn.Linear)]
-    layers = [(m.weight.detach().numpy().T.copy(), m.bias.detach().numpy().copy()) for m in dense]
-    return Mlp(layers, mean.numpy(), std.numpy())
-
-
-@dataclass(frozen=True)
-class Drift:
-    """Displacement error as a share of the path, yaw drift in rad a minute."""
-
-    median: float
-    p90: float
-    yaw_p90: float
-    walks: int
-
-
-def drift(
-    robot: Any, make: MakePolicy, odometry: Any, *, walks: int, seconds: float, seed: int, randomise: float = 0.0
-) -> Drift:
-    """Walk with commands changed every 5 s and compare the estimate's end with the truth's.
-
-    Counts walks that stayed up and covered more than a metre. The path is measured from cycle to cycle: within one, the
-    gait's sway would add to it, up to its double.
-    """
-    from servoid.policy.references.gait import load_gait
-    from servoid.stack.control.fleet import Fleet
-
-    fleet = Fleet(robot, walks, odometry, randomise=randomise, seed=seed)
-    policy = make(shape=(fleet.n,))
-    everything = np.ones(walks, bool)
-    fleet.reset(everything)
-    policy.reset(None, fleet.seeds)
-    alive, path, command = everything.copy(), np.zeros(walks), np.zeros((walks, 3))
-    turned, start = np.zeros(walks), fleet.truth.position[:, :2].copy()
-    last, heading, state = start, fleet.truth.yaw.copy(), fleet.observe()
-    ticks, cycle = round(seconds * robot.rate), round(load_gait().cycle * robot.rate)
-    for k in range(ticks):
-        if k % (5 * robot.rate) == 0:
-            low, high = [-0.1, -0.1, -0.8], [0.3, 0.1, 0.8]
-            command = np.array([rng.uniform(low, high) for rng in fleet.rngs])
-        fleet.step(policy.act(state, fleet.applied, Instruction(command)))
-        state = fleet.observe()
-        truth = fleet.truth
-        if (k + 1) % cycle == 0 or k == ticks - 1:
-            path += np.linalg.norm(truth.position[:, :2] - last, axis=-1)
-            last = truth.position[:, :2].copy()
-        turned += (truth.yaw - heading + np.pi) % (2 * np.pi) - np.pi
-        heading = truth.yaw.copy()
-        alive &= ~truth.fallen
-    error = np.linalg.norm(state.displacement[:, :2] - (last - start), axis=-1)
-    use = alive & (path > 1.0)
-    if not use.any():
-        return Drift(np.nan, np.nan, np.nan, 0)
-    share, yaw = (error / path)[use], np.abs(state.yaw - turned)[use] * 60.0 / seconds
-    return Drift(float(np.median(share)), float(np.quantile(share, 0.9)), float(np.quantile(yaw, 0.9)), int(use.sum()))

@@ -13,10 +13,10 @@ from test_train_diffusion import CONFIG, QUICK, ROBOT, Measured, trainer
 from servoid.hw.config import ConfigError
 from servoid.policy.checkpoint import read_header
 from servoid.policy.diffusion.dataset import Windows, read_recording
-from servoid.policy.latent.actions import LatentConfig
 from servoid.policy.latent.dataset import Demonstrations
+from servoid.tools.learn.settings import LatentTraining
 from servoid.tools.learn.trainers import latent
-from servoid.tools.learn.trainers.diffusion import Trainer
+from servoid.tools.learn.trainers.diffusion import DiffusionTrainer
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def windows(synthetic_dataset: Path) -> Windows:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("committed", 1), ("far_actions", 0.0), ("monotone", 0.0), ("batch", 8), ("precision", "fp32")],
+    [("inference_delay", 1), ("far_actions", 0.0), ("monotone", 0.0), ("batch", 8), ("precision", "fp32")],
 )
 def test_a_run_goes_on_under_the_settings_that_it_began_with(
     windows: Windows, tmp_path: Path, name: str, value: Any
@@ -55,8 +55,8 @@ def test_latents_go_on_under_the_settings_that_they_began_with(synthetic_dataset
     pairs = Demonstrations(read_recording(synthetic_dataset, ROBOT), ROBOT)
 
     def run(**settings: Any) -> latent.LatentTrainer:
-        config = LatentConfig(5, 24, 1)
-        return latent.LatentTrainer(pairs, ROBOT, config, latent.Settings(**settings), tmp_path, "", "", None)
+        made = LatentTraining(size=5, width=24, layers=1, **settings)
+        return latent.LatentTrainer(pairs, ROBOT, made, tmp_path, "", None)
 
     run().save()
     assert run(minutes=1.0).resume()
@@ -66,28 +66,28 @@ def test_latents_go_on_under_the_settings_that_they_began_with(synthetic_dataset
 
 def test_a_checkpoint_says_what_it_was_begun_with_also_after_going_on(windows: Windows, tmp_path: Path) -> None:
     old = tmp_path / "old.safetensors"
-    Trainer(windows, ROBOT, CONFIG, QUICK, tmp_path, "old walks", "CC-BY-4.0", None)._ship(old, {"survival": 0.5})
+    licensed = replace(QUICK, licence="CC-BY-4.0")
+    DiffusionTrainer(windows, ROBOT, licensed, tmp_path, "old walks", None).ship(old, {"survival": 0.5})
 
-    def run(source: str = "new walks") -> Trainer:
-        return Trainer(windows, ROBOT, CONFIG, QUICK, tmp_path / "on", source, "Apache-2.0", None)
+    def run(source: str = "new walks") -> DiffusionTrainer:
+        return DiffusionTrainer(windows, ROBOT, QUICK, tmp_path / "on", source, None)
 
-    def header(of: Trainer) -> dict[str, Any]:
-        of._ship(tmp_path / "new.safetensors", {})
+    def header(of: DiffusionTrainer) -> dict[str, Any]:
+        of.ship(tmp_path / "new.safetensors", of.progress)
         return read_header(tmp_path / "new.safetensors")
 
     first = run()
-    first.begin_from(old)
+    first.start(resume=True, init=old)
     first.save()
     again = run()
-    assert again.resume()
+    again.start(resume=True, init=old)
     for head in (header(first), header(again)):
         assert (head["data"], head["licence"]) == ("new walks", "Apache-2.0")
         begun = head["results"]["begun_with"]
         assert (begun["checkpoint"], begun["data"], begun["licence"]) == ("old.safetensors", "old walks", "CC-BY-4.0")
         assert begun["results"]["survival"] == 0.5
-    again.require_begun_with(old)
     with pytest.raises(ConfigError, match=r"did not begin with .*new\.safetensors: give --no-resume"):
-        again.require_begun_with(tmp_path / "new.safetensors")
+        run().start(resume=True, init=tmp_path / "new.safetensors")
     assert "begun_with" not in header(run())["results"]
     with pytest.raises(ConfigError, match="trained on new walks, not on other walks"):
         run("other walks").resume()

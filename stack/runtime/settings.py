@@ -1,0 +1,48 @@
+"""What a run is asked for, and what a recorded one was told from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.stack.safety.event import Event
+
+MAX_GAIN = 2.0  # times the firmware's configured gain; above, a servo of this class rings
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What to run. Raises ConfigError for a gain that servos cannot have."""
+
+    task: str
+    backend: str = "sim"
+    robot: str = "op3"
+    policy: str = "diffusion"
+    randomise: bool = False  # draw the simulated robot's mass, friction, delays and so on
+    seconds: float | None = None  # instead of the task's own
+    seed: int = 0
+    gain: float = 1.0  # scales the servos' position gain: lower is softer
+    set: Mapping[str, str] = field(default_factory=dict)  # the task's settings, by name
+    start: bool = False  # move a real robot without asking
+    record: Path | None = None  # flight log to write
+    realtime: bool | None = None  # in step with the wall; None: only where there is hardware
+    port: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.gain <= MAX_GAIN:
+            raise ConfigError(f"gain: {self.gain:g} is outside 0 to {MAX_GAIN:g}: it scales the servos' position gain")
+        if "gain" in self.set:
+            raise ConfigError(f"--set gain={self.set['gain']}: gain is no setting of a task: give --gain G (gain=G)")
+
+
+@dataclass(frozen=True)
+class Script:
+    """What came to a recorded run from outside, for a run that repeats it."""
+
+    stops: tuple[Event, ...] = ()  # what ended it: Ctrl-C, a full disk
+    plans: Mapping[int, int] | None = None  # ticks of plan requests, and when their plans were adopted
+    velocities: Array | None = None  # (ticks, 3) that a person steered by,
+    ended: bool = False  # and whether the person ended the run
