@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -23,20 +23,11 @@ if TYPE_CHECKING:
 
 def maker(robot: Robot, name: str) -> MakePolicy:
     """What makes a policy for worlds of a `shape`, by the policy's name or a checkpoint's file. Raises ConfigError."""
-    from servoid.policy.checkpoint import read_header, resolve
-    from servoid.stack.control.gait import GaitPolicy
-    from servoid.stack.control.tracker import ExpertPolicy
-
-    if name == "gait":
-        return partial(GaitPolicy, robot)
-    if read_header(resolve(name))["kind"] == "tracker":
-        return partial(ExpertPolicy, robot, name)
-    from servoid.policy.diffusion.settings import load_settings
-    from servoid.stack.control.diffusion import diffusion_policy
+    from servoid.stack.control.policies import check_policy, make_policy
     from servoid.stack.tasks import load_task
 
-    settings = replace(load_settings(), checkpoint=name)
-    return partial(diffusion_policy, robot, settings, load_task("walk", {}, robot.dt).objective)
+    check_policy(name)
+    return partial(make_policy, name, robot, load_task("walk", {}, robot.dt), False)
 
 
 def mixed(a: dict[str, Array], b: dict[str, Array], seed: int) -> dict[str, Array]:
