@@ -19,8 +19,8 @@ def draw_levels(
     A share `forcing` of the windows has independent levels, clean included, and a noisy past, which they learn to mend
     (UniPhys, section 4.2). Of the others, which know their past, a third has independent levels of what is to come, and
     two thirds share one level, as they do when a plan is sampled; of these, a share `monotone` of all windows has
-    levels that rise along the window instead. In those two thirds the first 0 to `inference_delay` actions are clean:
-    they run while a plan is being made.
+    levels that rise along the window instead. In those two thirds the first 0 to `inference_delay` actions to come are
+    clean: they run while a plan is being made.
     """
     forced = round(objective.forcing * batch)
     together = round(TOGETHER * (batch - forced))

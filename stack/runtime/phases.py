@@ -79,11 +79,16 @@ class Phases:
 
     def _do_task(self, state: State) -> Proposal:
         tick = self.task_ticks
-        percept = self._look(state)
-        instruction = self._behaviour.instruct(tick, state, percept)
-        self._buffer.add(state, instruction, percept)
+        try:
+            percept = self._look(state)
+            instruction = self._behaviour.instruct(tick, state, percept)
+            self._buffer.add(state, instruction, percept)
+            done = self._behaviour.done(state)
+        except Exception as error:  # whatever a task raises, the robot must end safe
+            self._guard.give_up(_failed("task", error))
+            return Proposal()
         shown = Proposal(instruction=instruction, percept=percept)
-        if self._behaviour.done(state):
+        if done:
             return self._end("done", DONE, shown, state)
         if tick * self._robot.dt >= self._seconds:
             return self._end("time", f"{self._seconds:g} s are over", shown, state)
@@ -93,7 +98,7 @@ class Phases:
         try:
             target = self._policy.act(state, self._guard.applied, instruction)
         except Exception as error:  # whatever a controller raises, the robot must end safe
-            self._guard.give_up(_failed(error))
+            self._guard.give_up(_failed("policy", error))
             return shown
         self._tell()
         return Proposal(target, instruction, percept, self._policy.adopted)
@@ -103,7 +108,7 @@ class Phases:
         try:
             target = self._policy.act(state, self._guard.applied, Instruction(np.zeros(3)))
         except Exception as error:
-            self._guard.give_up(_failed(error))
+            self._guard.give_up(_failed("policy", error))
             return Proposal()
         self._tell()
         return Proposal(target, plan=self._policy.adopted)
@@ -122,6 +127,6 @@ class Phases:
         return replace(self._come_to_rest(state), instruction=shown.instruction, percept=shown.percept)
 
 
-def _failed(error: Exception) -> str:
+def _failed(what: str, error: Exception) -> str:
     where = traceback.extract_tb(error.__traceback__)[-1]
-    return f"the policy failed: {type(error).__name__}: {error} ({where.filename}:{where.lineno})"
+    return f"the {what} failed: {type(error).__name__}: {error} ({where.filename}:{where.lineno})"

@@ -25,6 +25,7 @@ from servoid.stack.runtime.realtime import undisturbed
 
 CURRENT, VELOCITY = 7, -11  # raw values that every servo reports
 ALERT_SECONDS = 0.02  # after a packet, in which the next is watched for and not slept for
+_HOPS = 300  # that are timed at the start
 _SPIN_NS = 150_000  # before an answer is due, in which the responder no longer sleeps
 _HEAD = struct.Struct("<4sBHB")
 
@@ -36,6 +37,9 @@ class Responder:
         self.pty = Pty()
         self._goals: dict[int, int] = {}
         self._free_ns = 0  # when the line is free again
+        # What a pty takes to hand bytes over, either way, is no part of a wire. The least that it ever takes is taken
+        # off, so that no answer is there before its last byte would be.
+        self._to_here_ns, self._to_host_ns = (self._hop_ns(to_host) for to_host in (False, True))
         self._buffer = bytearray()
 
     def serve(self) -> None:
@@ -61,7 +65,7 @@ class Responder:
 
     def _hear(self) -> int:
         """Take what the host wrote; returns when it was seen."""
-        now = time.monotonic_ns()
+        seen = time.monotonic_ns()
         self._buffer += self.pty.read()
         while len(self._buffer) >= 7:
             size = 7 + int.from_bytes(self._buffer[5:7], "little")
@@ -69,8 +73,8 @@ class Responder:
                 break
             packet = bytes(self._buffer[:size])
             del self._buffer[:size]
-            self._execute(packet, now)
-        return now
+            self._execute(packet, seen - self._to_here_ns)
+        return seen
 
     def _execute(self, packet: bytes, now: int) -> None:
         byte_ns = BITS * 1e9 / self.pty.baud
@@ -90,15 +94,30 @@ class Responder:
         self._free_ns += round(len(answer) * byte_ns)
         self._send(answer)
 
+    def _hop_ns(self, to_host: bool) -> int:
+        """The least time from before a write to when the other end can read it [ns]."""
+        pty = self.pty
+        source, end = (pty.master, pty.slave) if to_host else (pty.slave, pty.master)
+        least = _SPIN_NS
+        for _ in range(_HOPS):
+            began = time.monotonic_ns()
+            os.write(source, b"\0")
+            while not select.select([end], [], [], 0)[0]:
+                pass
+            least = min(least, time.monotonic_ns() - began)
+            os.read(end, 1)
+        return least
+
     def _present(self, id: int) -> bytes:
         return struct.pack("<hii", CURRENT, VELOCITY, self._goals.get(id, 0))
 
     def _send(self, answer: bytes) -> None:
         """Hand an answer over at the instant that its last byte has come."""
-        left = self._free_ns - time.monotonic_ns() - _SPIN_NS
+        due = self._free_ns - self._to_host_ns
+        left = due - time.monotonic_ns() - _SPIN_NS
         if left > 0:
             time.sleep(left * 1e-9)
-        while time.monotonic_ns() < self._free_ns:
+        while time.monotonic_ns() < due:
             pass
         os.write(self.pty.master, answer)
         select.select([self.pty.slave], [], [], 0)  # the kernel moves the bytes over at the latest when asked

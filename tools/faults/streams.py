@@ -67,7 +67,9 @@ def _instruction_packet(r: random.Random) -> bytes:
     id, address = _id(r), r.randrange(700) if r.random() < 0.3 else r.randrange(64, 150)
     length = r.choice((1, 2, 4, WIDTH, r.randrange(300)))
     ids = r.sample(IDS, r.randint(1, len(IDS)))
-    kind = r.randrange(9)
+    kind = r.randrange(10)
+    if kind == 9:
+        return codec.packet(id, 0x20, r.choice((b"\1CTRL", b"\2CTRL", r.randbytes(5))))  # control table backup
     if kind == 0:
         return codec.read(id, address, length)
     if kind == 1:
@@ -87,6 +89,15 @@ def _instruction_packet(r: random.Random) -> bytes:
         return codec.clear(id) if r.random() < 0.5 else codec.ping(id)
     spare = r.choice(list(Reset))
     return codec.factory_reset(id, spare) if r.random() < 0.1 and id != codec.BROADCAST else codec.ping(id)
+
+
+def _old_packet(r: random.Random) -> bytes:
+    """An instruction of protocol 1.0; before some of them a servo is told to speak it."""
+    kind = r.choice((1, 2, 3, 4, 5, 6, 8, 0x83, 0x92))
+    id, params = _id(r), bytes([r.randrange(64, 150), r.choice((1, 2, 4))]) + r.randbytes(r.randrange(8))
+    body = bytes([id, len(params) + 2, kind]) + params
+    turn = codec.write(id, 13, b"\1") if id != codec.BROADCAST and r.random() < 0.01 else b""
+    return turn + b"\xff\xff" + body + bytes([~sum(body) & 0xFF])
 
 
 def _answers(r: random.Random) -> bytes:
@@ -126,4 +137,5 @@ def _instruction(r: random.Random) -> int:
 
 _FAMILIES: tuple[Callable[[random.Random], bytes], ...] = (
     _noise, _any_packet, _instruction_packet, _instruction_packet, _answers, _answers, _witmotion, _bno08x,
+    _old_packet,
 )  # fmt: skip

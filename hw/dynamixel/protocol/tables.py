@@ -269,10 +269,11 @@ def _indirect_items(blocks: tuple[Indirect, ...]) -> list[Item]:
         "scale": 1.0,
         "limits": None,
     }
+    last = max((block.data + block.count - 1 for block in blocks), default=0)  # of the RAM, which they may point to
     for block in blocks:
         for i in range(block.count):
             address, data = block.address + 2 * i, block.data + i
-            items.append(Item(f"indirect_address_{number}", address, 2, range=(64, 661), default=data, **common))
+            items.append(Item(f"indirect_address_{number}", address, 2, range=(64, last), default=data, **common))
             items.append(Item(f"indirect_data_{number}", data, 1, range=(0, 255), default=0, **common))
             number += 1
     return items

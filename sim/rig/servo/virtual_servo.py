@@ -17,6 +17,7 @@ FIRMWARE = 52  # the newest that changed anything in the tables
 _HOMING_RANGE = 1024  # ticks that count in position mode
 _TURNS_RANGE = 1_048_575  # ticks of the modes that count turns
 _REVERSE, _TIME_BASED, _TORQUE_BY_GOAL = 1, 4, 8  # bits of the drive mode
+_STEP, _RECTANGLE, _TRAPEZOID = 0x00, 0x10, 0x30  # profile bits of the moving status
 _STARTUP_TORQUE = 1  # bit of the startup configuration
 _PROTOCOLS = (1, 2, 20, 21, 22)  # 1.0, 2.0 and those of remote controls, which fall back to 2.0 where they hear none
 _TRIPPED = 255  # what an expired bus watchdog reads
@@ -47,6 +48,7 @@ class VirtualServo(VirtualDevice):
         self._base = 0  # ticks of whole turns that do not count
         self._watch_ns: int | None = None  # when the bus was last heard, with torque on and the watchdog set
         self._locked_out = False  # by a shutdown, until reboot
+        self._started_ns = 0
         self._starts_torque = False  # once it has booted
         super().__init__(table(model), {"firmware_version": FIRMWARE, **eeprom})
         items = self.table
@@ -195,6 +197,7 @@ class VirtualServo(VirtualDevice):
         limits = self.get("min_voltage_limit"), self.get("max_voltage_limit")
         f.voltage_range[i] = [limit * self._voltage for limit in limits]
         velocity, acceleration = self.get("profile_velocity"), self.get("profile_acceleration")
+        self._profile = _STEP if not velocity else _TRAPEZOID if acceleration else _RECTANGLE
         if self.get("drive_mode") & _TIME_BASED:
             f.profile_time[i], f.profile_ramp[i] = velocity / 1000, acceleration / 1000
             f.profile_velocity[i] = f.profile_acceleration[i] = math.inf
@@ -228,9 +231,9 @@ class VirtualServo(VirtualDevice):
         _MEASURED.pack_into(
             self.memory,
             _MEASURED_AT,
-            now_ns // 1_000_000 % 32768,
+            (now_ns - self._started_ns) // 1_000_000 % 32768,
             moving,
-            int(arrived) | int(now.underway) << 1,
+            int(arrived) | int(now.underway) << 1 | self._profile,
             sign * round(now.duty * FULL_PWM),
             max(-32768, min(32767, current)),
             speed,
@@ -303,7 +306,7 @@ class VirtualServo(VirtualDevice):
         firmware, i = self.motors.firmware, self.index
         firmware.powered[i] = firmware.halted[i] = False
         firmware.error[i] = 0
-        self._watch_ns, self._locked_out = None, False
+        self._watch_ns, self._locked_out, self._started_ns = None, False, now_ns
         self._starts_torque = bool(self.startup & _STARTUP_TORQUE)
         self._base = self._whole_turns()
         self._configure()

@@ -19,7 +19,7 @@ from servoid.sim.rig.wire import protocol1
 from servoid.sim.rig.wire.half_duplex import FRAME_BITS, Wire, same_baud
 
 TURNAROUND_NS = 2_000  # from the last byte of a request to the first of the reply, at return delay 0
-_SILENCE_NS = 5_000_000  # a packet that stops for so long is given up
+_SILENCE_NS = 1_500_000  # a packet that stops for so long is given up
 _LONGEST_CHAIN_NS = 500_000_000  # after which the rest of a group has given up
 _LONGEST_FRAME = 4096  # bytes that a servo can count in a fast read
 _STATUS_BYTES = 11  # of a status without data

@@ -197,6 +197,25 @@ def test_a_broadcast_ping_is_answered_in_the_order_of_ids_whatever_the_return_de
     assert host.rig.wire.collisions == 0
 
 
+def test_a_servo_counts_its_time_from_its_start_and_tells_its_profile(host: Host) -> None:
+    host.wait(1.0)
+    host.ask(codec.reboot(1))
+    host.wait(0.48)
+    assert host.read(1, "realtime_tick") == pytest.approx(500, abs=5)
+    for velocity, acceleration, bits in ((0, 0, 0), (0, 10, 0), (50, 0, 0x10), (50, 10, 0x30)):
+        host.write(1, "profile_velocity", velocity)
+        host.write(1, "profile_acceleration", acceleration)
+        assert host.read(1, "moving_status") & 0x30 == bits
+
+
+def test_indirect_addresses_lead_no_farther_than_the_model_s_ram(rig: Rig) -> None:
+    for model, last in (("xm430-w350", 661), ("xl330-m288", 227)):
+        servo = VirtualServo(rig.motors, 0, model, {})
+        assert servo.write(168, last.to_bytes(2, "little"), 0) is StatusError.NONE
+        assert servo.write(168, (last + 1).to_bytes(2, "little"), 0) is StatusError.DATA_RANGE
+        assert servo.write(168, (63).to_bytes(2, "little"), 0) is StatusError.DATA_RANGE
+
+
 def test_small_servos_live_on_the_voltage_of_their_own_file(robot: Robot, tmp_path: Path) -> None:
     """An XL330 runs on 5 V, where one of 12 V would be dead."""
     file = tmp_path / "xl330.yaml"

@@ -232,9 +232,9 @@ def test_what_cannot_be_measured_is_refused_before_the_data_is_read(
     parser = argparse.ArgumentParser()
     diffusion.add_arguments(parser)
     options = ["--data", str(tmp_path), "--out", str(tmp_path), "--threads", "1", "--text", ""]
-    for delay in ("-1", "17"):
-        with pytest.raises(ConfigError, match=f"--inference-delay must .* not {delay}"):
-            diffusion.main(parser.parse_args([*options, "--inference-delay", delay]))
+    for committed in ("-1", "17"):
+        with pytest.raises(ConfigError, match=f"--inference-delay must .* not {committed}"):
+            diffusion.main(parser.parse_args([*options, "--committed", committed]))
     stabilised = replace(load_settings(), stabilization_level=9)
     monkeypatch.setattr("servoid.policy.diffusion.settings.load_settings", lambda: stabilised)
     with pytest.raises(ConfigError, match="stabilization_level must be at most 8"):
