@@ -60,10 +60,10 @@ def record(
         errors[:, k] = fleet.truth.velocity - fleet.estimator.leg_velocity
         starts[:, k] = start
         due = rng.random(worlds) < 1 / 150
-        command[due] = rng.uniform([-0.15, -0.13, -1.0], [0.5, 0.13, 1.0], (int(due.sum()), 3))
+        command[due] = rng.uniform(robot.walking.lower, robot.walking.upper, (int(due.sum()), 3))
         command[due] *= rng.random((int(due.sum()), 3)) < 0.7
         kicked = rng.random(worlds) < 1 / 100
-        angle, size = rng.uniform(-np.pi, np.pi, worlds), rng.uniform(0, 0.3, worlds) * kicked
+        angle, size = rng.uniform(-np.pi, np.pi, worlds), rng.uniform(0, 0.6 * robot.walking.forward, worlds) * kicked
         fleet.worlds.push(np.stack([size * np.cos(angle), size * np.sin(angle)], -1))
         target = policy.act(fleet.state, fleet.applied, Instruction(command))
         fleet.step(target, noise * rng.standard_normal(target.shape))
@@ -114,7 +114,7 @@ def drift(
     ticks, cycle = round(seconds * robot.rate), round(load_gait().cycle * robot.rate)
     for k in counted(ticks, "measuring"):
         if k % (5 * robot.rate) == 0:
-            low, high = [-0.1, -0.1, -0.8], [0.3, 0.1, 0.8]
+            low, high = np.array([[-0.2, -0.2, -0.8], [0.6, 0.2, 0.8]]) * robot.walking.scale
             command = np.array([rng.uniform(low, high) for rng in fleet.rngs])
         fleet.step(policy.act(state, fleet.applied, Instruction(command)))
         state = fleet.observe()
