@@ -27,6 +27,25 @@ HEAVY = {
     "mujoco": ("sim/",),
 }
 LONGEST = 400  # lines of a file
+ROOMIEST = 12  # modules of a folder beside its folders
+# Folders that are still larger, and groups of folders of a package that still import each other in a circle. Both may
+# only shrink.
+CROWDED = {"stack/tasks": 15}
+TANGLED = {
+    frozenset({"hw/robot", "hw/dynamixel/protocol"}),
+    frozenset({"sim/rig", "sim/rig/process", "sim/rig/servo", "sim/rig/wire"}),
+    frozenset({"policy/latent", "policy/diffusion", "policy/diffusion/engines", "policy/diffusion/model"}),
+    frozenset({"tools/commands", "tools/evaluate"}),
+}
+# Where an object is asked what it has, since it is not ours: by file, what it is asked for.
+ASKED = {
+    ("hw/clock.py", "prctl"),  # the C library's: Linux alone has it
+    ("hw/config.py", "__name__"),  # a type hint's
+    ("hw/setting.py", "__metadata__"),  # a type hint's
+    ("hw/dynamixel/transport/port.py", "errno"),  # pyserial's errors
+    ("tools/common/output.py", "tolist"),  # numpy's arrays and numbers
+    ("tools/commands/doctor.py", "sched_getaffinity"),  # the operating system's
+}
 MODULE_NAME = re.compile(rf"servoid\.({'|'.join(BELOW)})(\.\w+)+")
 
 
@@ -91,13 +110,12 @@ def test_an_upward_import_is_seen_wherever_it_hides(package: str, code: str) -> 
 def test_heavy_libraries_are_imported_where_they_are_used(library: str) -> None:
     """One import at the top of a shared module would slow every command by seconds."""
     for path in (path for package in BELOW for path in sources(package)):
-        name = path.relative_to(ROOT).as_posix()
-        if name.startswith(HEAVY[library]):
+        if name(path).startswith(HEAVY[library]):
             continue
         top = ast.Module(ast.parse(path.read_text()).body, [])
         direct = [n for n in top.body if isinstance(n, ast.Import | ast.ImportFrom)]
         modules = {module.split(".")[0] for _, module in imports(ast.Module(list(direct), []))}
-        assert library not in modules, f"{name} imports {library} when it is imported"
+        assert library not in modules, f"{name(path)} imports {library} when it is imported"
 
 
 def test_the_command_loads_neither_torch_nor_mujoco() -> None:
@@ -110,6 +128,81 @@ def test_files_stay_short() -> None:
     for path in (path for package in (*BELOW, "tests") for path in sources(package)):
         lines = len(path.read_text().splitlines())
         assert lines <= LONGEST, f"{path.relative_to(ROOT)} has {lines} lines: it is more than one concept"
+
+
+def test_folders_stay_small() -> None:
+    folders = {path.parent for package in BELOW for path in sources(package)}
+    modules = {name(at): sum(path.name != "__init__.py" for path in at.glob("*.py")) for at in folders}
+    assert {at: count for at, count in modules.items() if count > ROOMIEST} == CROWDED
+
+
+def name(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def asked(code: str) -> Iterator[tuple[int, str]]:
+    """Line and member of every question whether an object has a member that is named there."""
+    for node in ast.walk(ast.parse(code)):
+        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) > 1):
+            continue
+        member = node.args[1]
+        fixed = isinstance(member, ast.Constant)
+        if node.func.id == "hasattr" or (node.func.id == "getattr" and fixed):
+            yield node.lineno, str(member.value) if isinstance(member, ast.Constant) else ast.unparse(member)
+
+
+def test_no_object_is_asked_what_it_has() -> None:
+    """A contract declares its members: what is found by name is found by no type checker, and a typo goes unseen."""
+    found = {
+        (name(path), member) for package in BELOW for path in sources(package) for _, member in asked(path.read_text())
+    }
+    assert found == ASKED
+
+
+@pytest.mark.parametrize("code", ["hasattr(body, 'truth')", "hasattr(body, part)", "getattr(task, 'goal', None)"])
+def test_a_question_is_seen(code: str) -> None:
+    assert len(list(asked(code))) == 1
+
+
+def rooms(package: str) -> dict[str, set[str]]:
+    """The folders of a package, and those of the same package that each imports from."""
+    found: dict[str, set[str]] = {}
+    for path in sources(package):
+        here = found.setdefault(name(path.parent), set())
+        for _, module in imports(ast.parse(path.read_text())):
+            if module.startswith(f"servoid.{package}."):
+                here.add(room(module))
+    return {at: others - {at} for at, others in found.items()}
+
+
+def room(module: str) -> str:
+    """The folder of a module, or of a name in one."""
+    path = ROOT.joinpath(*module.split(".")[1:])
+    return name(path if path.is_dir() else path.parent if path.with_suffix(".py").is_file() else path.parent.parent)
+
+
+def circles(edges: dict[str, set[str]]) -> set[frozenset[str]]:
+    """Groups of folders each of which imports, over others, from each."""
+
+    def reached(start: str) -> set[str]:
+        seen: set[str] = set()
+        ahead = [start]
+        while ahead:
+            further = edges.get(ahead.pop(), set()) - seen
+            seen |= further
+            ahead += further
+        return seen
+
+    reach = {at: reached(at) for at in edges}
+    return {frozenset(b for b in edges if b in reach[a] and a in reach[b]) for a in edges if a in reach[a]}
+
+
+def test_folders_of_a_package_do_not_import_each_other_in_a_circle() -> None:
+    assert set().union(*(circles(rooms(package)) for package in BELOW)) == TANGLED
+
+
+def test_a_circle_is_seen() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == {frozenset("abc")}
 
 
 def test_configs_hold_data_alone() -> None:

@@ -56,7 +56,7 @@ def test_wheel_holds_code_and_data(wheel: Path) -> None:
 
 def test_wheel_runs_away_from_its_source(site: Path, tmp_path: Path) -> None:
     entry = next(site.glob("servoid-*.dist-info")) / "entry_points.txt"
-    assert "servoid = servoid.tools.cli:main" in entry.read_text()
+    assert "servoid = servoid.tools.start:main" in entry.read_text()
     code = (
         "import sys; from servoid.hw.config import CONFIGS; from servoid.hw.robot.description import load_robot; "
         "from servoid.tools.cli import main; "

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from types import ModuleType
 
+from servoid.hw.signals import ignore_interrupts
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import say
 from servoid.tools.common.parser import Parser, suggestion
@@ -101,11 +102,12 @@ def main(argv: list[str] | None = None) -> int:
     except SystemExit as stop:  # argparse: help or a usage error
         return stop.code if isinstance(stop.code, int) else exit_codes.DONE
     except BaseException as error:
+        ignore_interrupts()
         if isinstance(error, BrokenPipeError) and _reader_left():
             return 128 + signal.SIGPIPE
         if debug:
             traceback.print_exc()
-        for note in getattr(error, "__notes__", ()):  # a table, say: what the message is about
+        for note in vars(error).get("__notes__", ()):  # a table, say: what the message is about
             say(note, sys.stderr)
         say(f"servoid: {exit_codes.explain(error)}", sys.stderr)
         return exit_codes.exit_code(error)

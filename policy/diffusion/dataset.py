@@ -120,9 +120,9 @@ def read_recording(folder: Path, robot: Robot) -> Recording:
 class Captions:
     """Encoded phrasings of each tick's command: what the windows are told."""
 
-    def __init__(self, command: Array, encoder: str) -> None:
-        """`command` is `(rows, 3)`."""
-        self._motion = torch.from_numpy(motion_of(command))
+    def __init__(self, command: Array, encoder: str, top: Array) -> None:
+        """`command` is `(rows, 3)`, `top` `(3,)` the robot's top speeds."""
+        self._motion = torch.from_numpy(motion_of(command, top))
         self._mirrored = torch.from_numpy(mirrored(np.arange(len(MOTIONS))))
         self._count = torch.tensor([len(motion.phrasings) for motion in MOTIONS])
         reader, longest = load_encoder(encoder), int(self._count.max())
@@ -185,7 +185,7 @@ class Windows:
             self._both_sides(recording.raw, targets, Mirror.joints(robot))
             for targets in (recording.action, recording.applied)
         )
-        self.captions = Captions(recording.command, config.text) if config.text else None
+        self.captions = Captions(recording.command, config.text, robot.walking.scale) if config.text else None
         states, actions = self._fit()
         if emphasis:
             states = Emphasis.of(states, self.n_joints, emphasis, seed)

@@ -19,8 +19,8 @@ def draw_levels(
     A share `forcing` of the windows has independent levels, clean included, and a noisy past, which they learn to mend
     (UniPhys, section 4.2). Of the others, which know their past, a third has independent levels of what is to come, and
     two thirds share one level, as they do when a plan is sampled; of these, a share `monotone` of all windows has
-    levels that rise along the window instead. In those two thirds the first 0 to `committed` actions to come are clean:
-    they run while a plan is being made.
+    levels that rise along the window instead. In those two thirds the first 0 to `inference_delay` actions to come are
+    clean: they run while a plan is being made.
     """
     forced = round(objective.forcing * batch)
     together = round(TOGETHER * (batch - forced))
@@ -32,7 +32,7 @@ def draw_levels(
     states, actions = levels[:, :n_states], levels[:, n_states:]
     state_ticks, action_ticks = torch.from_numpy(config.state_ticks), torch.from_numpy(config.action_ticks)
     clean = torch.zeros(batch, 1, dtype=torch.long)
-    clean[:together] = torch.randint(objective.committed + 1, (together, 1), generator=generator)
+    clean[:together] = torch.randint(objective.inference_delay + 1, (together, 1), generator=generator)
     known = torch.arange(batch)[:, None] < batch - forced
     states = torch.where((state_ticks <= 0) & known, 0, states)
     actions = torch.where((action_ticks < clean) & known, 0, actions)

@@ -46,18 +46,19 @@ class Runtime:
         self,
         model: Model,
         settings: DiffusionSettings,
-        dt: float,
+        robot: Robot,
         cost: Cost | None = None,
         engine: Engine | None = None,
     ) -> None:
-        """`dt` is the length of a tick [s]; without `cost`, or with a guidance weight of 0, plans are unguided.
+        """Without `cost`, or with a guidance weight of 0, plans are unguided.
 
         `engine` is the one that the settings name, where it is loaded already. Raises ConfigError where settings and
         model do not fit, and where the engine cannot be loaded.
         """
         config = model.config
         settings.check(config, model.header.get("training"))
-        self.model, self.settings, self.dt = model, settings, dt
+        self.model, self.settings = model, settings
+        self._dt, self._top = robot.dt, robot.walking.scale
         self.cost = cost if settings.guidance.weight > 0 else None
         self.engine = engine or load_engine(settings.engine, model.denoiser)
         self.samples = settings.guidance.samples if self.cost else 1
@@ -235,9 +236,9 @@ class Runtime:
         if instruction.text is not None:
             sentences = [instruction.text] * batch
         elif velocity.ndim == 1:
-            sentences = [caption(velocity)] * batch
+            sentences = [caption(velocity, self._top)] * batch
         else:
-            sentences = [MOTIONS[i].phrasings[0] for i in motion_of(velocity)]
+            sentences = [MOTIONS[i].phrasings[0] for i in motion_of(velocity, self._top)]
         for sentence in set(sentences) - self._read.keys():
             phrasing = self._phrasebook.familiar(sentence) if self._phrasebook else sentence
             self._read[sentence] = torch.from_numpy(self._encoder.encode([phrasing])[0])
@@ -250,7 +251,7 @@ class Runtime:
 
         def of_states(states: Tensor) -> Tensor:
             tokens = normaliser.decode(states[:, history : history + self.horizon])
-            value: Tensor = cost(Trajectory.of(tokens, self._joints, self.dt), instruction)
+            value: Tensor = cost(Trajectory.of(tokens, self._joints, self._dt), instruction)
             return value
 
         settings = self.settings.guidance
@@ -260,7 +261,7 @@ class Runtime:
 
 def load_runtime(robot: Robot, settings: DiffusionSettings, cost: Cost | None = None) -> Runtime:
     """The runtime of the checkpoint that `settings` name, for `robot`. Raises ConfigError."""
-    return Runtime(load(resolve(settings.checkpoint), robot), settings, robot.dt, cost)
+    return Runtime(load(resolve(settings.checkpoint), robot), settings, robot, cost)
 
 
 def _repeat(instruction: Instruction, samples: int) -> Instruction:

@@ -164,7 +164,7 @@ class DiffusionSettings:
         if self.delay > (longest := _longest_delay(training, self.delay)):
             raise ConfigError(
                 f"diffusion policy: delay {self.delay} is asked for, and this checkpoint was trained for at most "
-                f"{longest} ticks: lower it, or train with --committed {self.delay}"
+                f"{longest} ticks: lower it, or train with --inference-delay {self.delay}"
             )
         if self.stabilization_level > network.levels:
             raise ConfigError(

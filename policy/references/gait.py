@@ -7,6 +7,7 @@ one robot or many worlds: arrays carry any leading dimensions.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -46,6 +47,7 @@ class GaitSettings:
     ankle_roll_gain: float
 
 
+@cache
 def load_gait(name: str = "gait") -> GaitSettings:
     """Load `configs/policies/<name>.yaml`. Raises ConfigError."""
     return load_yaml(CONFIGS / "policies" / f"{name}.yaml", GaitSettings)

@@ -1,6 +1,7 @@
 """The motions that can be asked for in words, and which of them a commanded or measured velocity is.
 
-A twist is `(..., 3)`: m/s forward, m/s left, rad/s to the left, as in `Instruction.velocity`.
+A twist is `(..., 3)`: m/s forward, m/s left, rad/s to the left, as in `Instruction.velocity`. What is fast depends on
+the robot: `top` `(3,)` are its top speeds (`Walking.scale`), and thresholds here are shares of them.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ Twist = tuple[float, float, float]
 class Motion:
     """A motion with a name. `phrasings` are for training, the first being canonical; `held_out` are for evaluation.
 
-    `typical` is a twist in the middle of those that `motion_of` calls so.
+    `typical` is a twist in the middle of those that `motion_of` calls so, as shares of the top speeds.
     """
 
     name: str
@@ -60,7 +61,7 @@ MOTIONS: tuple[Motion, ...] = (
     ),
     Motion(
         "forward slowly",
-        (0.08, 0.0, 0.0),
+        (0.16, 0.0, 0.0),
         (
             "walk forward slowly",
             "go slowly ahead",
@@ -75,7 +76,7 @@ MOTIONS: tuple[Motion, ...] = (
     ),
     Motion(
         "forward",
-        (0.18, 0.0, 0.0),
+        (0.36, 0.0, 0.0),
         (
             "walk forward",
             "go straight ahead",
@@ -92,7 +93,7 @@ MOTIONS: tuple[Motion, ...] = (
     ),
     Motion(
         "forward fast",
-        (0.32, 0.0, 0.0),
+        (0.64, 0.0, 0.0),
         (
             "walk forward fast",
             "hurry straight ahead",
@@ -107,7 +108,7 @@ MOTIONS: tuple[Motion, ...] = (
     ),
     Motion(
         "backward",
-        (-0.08, 0.0, 0.0),
+        (-0.16, 0.0, 0.0),
         (
             "walk backward",
             "go back",
@@ -122,7 +123,7 @@ MOTIONS: tuple[Motion, ...] = (
     ),
     *_both_sides(
         "side-step {}",
-        (0.0, 0.08, 0.0),
+        (0.0, 0.16, 0.0),
         (
             "side-step to the {}",
             "step {}",
@@ -155,7 +156,7 @@ MOTIONS: tuple[Motion, ...] = (
     ),
     *_both_sides(
         "arc {}",
-        (0.15, 0.0, 0.4),
+        (0.3, 0.0, 0.4),
         (
             "walk along an arc to the {}",
             "walk forward while turning {}",
@@ -172,7 +173,7 @@ MOTIONS: tuple[Motion, ...] = (
     ),
     *_both_sides(
         "diagonal {}",
-        (0.09, 0.075, 0.0),
+        (0.18, 0.15, 0.0),
         (
             "walk diagonally forward to the {}",
             "go diagonally {}",
@@ -193,7 +194,7 @@ MOTIONS: tuple[Motion, ...] = (
     ),
     *_both_sides(
         "backward arc {}",
-        (-0.08, 0.0, 0.4),
+        (-0.16, 0.0, 0.4),
         (
             "walk backward while turning {}",
             "back up along an arc to the {}",
@@ -209,16 +210,17 @@ MOTIONS: tuple[Motion, ...] = (
 )
 NAMES: tuple[str, ...] = tuple(motion.name for motion in MOTIONS)
 
-STILL_SPEED = 0.01  # m/s forward and to the left, below which a twist is standing, together with
-STILL_TURN = 0.05  # rad/s
-SLOW, FAST = 0.12, 0.25  # m/s: below is slow, from there on is fast
-SPOT_RADIUS = 0.10  # m: a turn tighter than this is on the spot
-SIDE_RADIUS = 0.30  # m: the same when the feet go sideways, for which there is no word while turning
-ARC_RADIUS = 1.0  # m: a turn wider than this is straight
+STILL_SPEED = 0.02  # of the top speed forward and to the left, below which a twist is standing, together with
+STILL_TURN = 0.05  # of the top rate of turning
+SLOW, FAST = 0.24, 0.5  # of the top speed: below is slow, from there on is fast
+# Radii of a path, in units of its radius at top speed while turning at the top rate:
+SPOT_RADIUS = 0.2  # a turn tighter than this is on the spot
+SIDE_RADIUS = 0.6  # the same when the feet go sideways, for which there is no word while turning
+ARC_RADIUS = 2.0  # a turn wider than this is straight
 _SECTOR = float(np.tan(np.pi / 8))  # a direction belongs to an axis within 22.5 degrees of it, else it is diagonal
 
 
-def motion_of(twist: Array) -> Array:
+def motion_of(twist: Array, top: Array) -> Array:
     """Index in `MOTIONS` of twists `(..., 3)`, `(...)` int. Every finite twist has one.
 
     Near zero it is standing. Otherwise the radius of the path (speed / |turning rate|) and its direction decide:
@@ -226,7 +228,7 @@ def motion_of(twist: Array) -> Array:
     straight, by direction. Sideways with a turn tighter than `SIDE_RADIUS` is turning. Diagonally backward counts as
     the nearer of backward and sideways. Forward has three speeds.
     """
-    forward, left, turn = np.moveaxis(np.asarray(twist, dtype=float), -1, 0)
+    forward, left, turn = np.moveaxis(np.asarray(twist, dtype=float) / top, -1, 0)
     speed, rate = np.hypot(forward, left), np.abs(turn)
     still = (np.abs(forward) < STILL_SPEED) & (np.abs(left) < STILL_SPEED) & (rate < STILL_TURN)
     ahead, aside = np.abs(forward), np.abs(left)
@@ -256,21 +258,21 @@ def mirrored(index: Array | int) -> Array:
     return _MIRRORED[index]
 
 
-def caption(twist: Array) -> str:
+def caption(twist: Array, top: Array) -> str:
     """The canonical phrasing of a twist `(3,)`."""
-    return MOTIONS[int(motion_of(twist))].phrasings[0]
+    return MOTIONS[int(motion_of(twist, top))].phrasings[0]
 
 
-def twist_of(index: int) -> Array:
+def twist_of(index: int, top: Array) -> Array:
     """A typical twist `(3,)` of a motion."""
-    return np.array(MOTIONS[index].typical)
+    return np.array(MOTIONS[index].typical) * top
 
 
-TOLERANCE = np.array([0.02, 0.02, 0.12])  # m/s, m/s, rad/s: drift that nobody would call another motion
+TOLERANCE = np.array([0.04, 0.04, 0.12])  # of the top speeds: drift that nobody would call another motion
 PART = 0.25  # of the typical twist that a motion must reach wherever that is not zero
 
 
-def followed(motion: int, mean_twist: Array) -> bool:
+def followed(motion: int, mean_twist: Array, top: Array) -> bool:
     """Whether a measured mean twist `(3,)` is what the motion's phrasings ask for.
 
     So it is when each component that makes the motion goes the right way with at least `PART` of the typical, and a
@@ -279,11 +281,11 @@ def followed(motion: int, mean_twist: Array) -> bool:
     measured = np.asarray(mean_twist, dtype=float)
     if measured.shape != (3,) or not np.isfinite(measured).all():
         raise ValueError(f"a mean twist is three finite numbers, not {mean_twist}")
-    typical = twist_of(motion)
+    typical = twist_of(motion, top)
     asked = typical != 0
     if (measured[asked] * np.sign(typical[asked]) < PART * np.abs(typical[asked])).any():
         return False
-    return bool((motion_of(measured + _NEIGHBOURS) == motion).any())
+    return bool((motion_of(measured + _NEIGHBOURS * top, top) == motion).any())
 
 
 def _sided(name: str, towards: Array) -> Array:

@@ -2,6 +2,6 @@
 
 import sys
 
-from servoid.tools.cli import main
+from servoid.tools.start import main
 
 sys.exit(main())

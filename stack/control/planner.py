@@ -18,6 +18,7 @@ from multiprocessing.util import Finalize
 from typing import Protocol
 
 from servoid.hw.contracts.control import Plan, PlanRequest
+from servoid.hw.signals import held_back
 
 Answer = Callable[[PlanRequest], Plan]
 
@@ -85,7 +86,8 @@ class ProcessPlanner:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, build), name="planner", daemon=True)
-        self._process.start()
+        with held_back(signal.SIGINT, signal.SIGTERM):  # to the whole group: the loop still plans while it ends the run
+            self._process.start()
         theirs.close()
         # At exit multiprocessing waits for its processes: without this, for ever for one that nobody closed.
         self._end = Finalize(self, _end, (self._pipe, self._process), exitpriority=0)
@@ -166,8 +168,6 @@ def _end(pipe: Connection, process: BaseProcess) -> None:
 
 def _serve(pipe: Connection, build: Callable[[], Answer]) -> None:
     """The planner process: answer requests until the other end of the pipe is gone."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # to the whole group: the loop still plans while it ends the run
-        signal.signal(number, signal.SIG_IGN)
     os.environ["OMP_NUM_THREADS"] = "1"  # before torch is imported
     try:
         answer = build()

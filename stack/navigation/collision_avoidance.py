@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.setting import Setting, check
+from servoid.policy.references.gait import load_gait
 
 _WAYS = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 25)  # rad to the left of the goal
 
@@ -20,7 +21,9 @@ class AvoidanceSettings:
     fade: Annotated[float, Setting("nearer than that which is as bad as a detour of 90 degrees", "m", above=0)] = 0.04
     horizon: Annotated[float, Setting("how far ahead the robot looks", "s", above=0)] = 4.0
     # Two cycles of the gait, which sways.
-    window: Annotated[float, Setting("time over which the others' velocity is measured", "s", above=0)] = 0.96
+    window: Annotated[float, Setting("time over which the others' velocity is measured", "s", above=0)] = field(
+        default_factory=lambda: 2 * load_gait().cycle
+    )
     # Two who meet head-on must not choose alike.
     right: Annotated[float, Setting("how much worse it is to pass on the left", least=0)] = 0.1
     steady: Annotated[float, Setting("how much worse it is to change the way by a radian", least=0)] = 0.1

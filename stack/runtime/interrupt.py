@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
+from servoid.hw.signals import importing
 from servoid.stack.safety.event import Event
 
 # Whatever ends a process, or freezes it, and can be handled: a robot that walks is brought to rest first. Of these a
@@ -34,8 +35,9 @@ class Interrupt:
     KeyboardInterrupt. Outside the main thread, where Python forbids handlers, it stays at zero unless `request` is
     called.
 
-    Before anything moves it may be `eager`, and raise at once. An exception can get lost in a library that is just
-    being imported or is cleaning up; what was counted is not lost, and `settle` raises it.
+    Before anything moves it may be `eager`, and raise at once, but not into a library that is being imported, which may
+    make another error of it; one that is cleaning up may lose it. What was counted is not lost: `check` and `settle`
+    raise it.
     """
 
     def __init__(self, *, eager: bool = False) -> None:
@@ -49,11 +51,15 @@ class Interrupt:
         """The same as one Ctrl-C."""
         self.count += 1
 
+    def check(self) -> None:
+        """Raise KeyboardInterrupt for a signal that came while it could not be raised."""
+        if self.count:
+            raise KeyboardInterrupt
+
     def settle(self) -> None:
         """End of being eager: signals are requests from here on. Raises KeyboardInterrupt for one that came before."""
         self.eager = False
-        if self.count:
-            raise KeyboardInterrupt
+        self.check()
 
     def __enter__(self) -> Interrupt:
         if threading.current_thread() is threading.main_thread():
@@ -71,7 +77,7 @@ class Interrupt:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if not self._same(number):
             self.count += 1
-        if self.eager or (self.count > 1 and self.breakable):
+        if (self.eager and not importing(frame)) or (self.count > 1 and self.breakable):
             raise KeyboardInterrupt
 
     def _same(self, number: int) -> bool:

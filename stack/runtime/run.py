@@ -161,12 +161,14 @@ class Run:
         self._open.enter_context(self._interrupt)
         self.policy = self._policy or make_policy(settings.policy, robot, task, self.realtime)
         self._open.callback(self.policy.close)
+        self._interrupt.check()
         if self._script.plans is not None:
             self.policy.repeat(self._script.plans)
         self._open.callback(body.close)
         self._open.callback(setattr, self._interrupt, "eager", False)  # a second Ctrl-C must not break off the closing
         self.policy.reset(None, np.array(settings.seed))
         sensors, motors = body.connect()
+        self._interrupt.check()
         if body.simulation is None and not settings.start and self._confirm is not None:
             known = f"{self._assembly}. " if self._assembly is not None else ""
             self._confirm(f"{known}{robot.name} will go to its home pose and then: {task.name}")

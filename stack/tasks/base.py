@@ -8,10 +8,11 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
+from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Behaviour, Episode, Objective, Trace
 from servoid.hw.contracts.world import Percept
-from servoid.hw.robot.description import Robot
+from servoid.hw.robot.description import Robot, load_robot
 from servoid.hw.setting import Setting, check
 from servoid.stack.tasks.guidance import Weights, total_cost
 
@@ -35,8 +36,8 @@ class Settings:
 class BaseTask:
     """A task but for what is asked and how a run is judged."""
 
-    name: str
-    description: str
+    name: str = ""
+    description: str = ""  # in a line
     settings_type: ClassVar[type[Settings]] = Settings
     steered: ClassVar[bool] = False  # by a person, who needs real time
     counts_undone: ClassVar[tuple[str, ...]] = ()  # metrics that hold of a run that never began, too
@@ -46,6 +47,11 @@ class BaseTask:
         """`dt` is the length of a control tick [s]. Raises ConfigError for what cannot be done, or not by `robot`."""
         self.settings, self.dt, self.robot = settings, dt, robot
         self.seconds: float = settings.seconds
+
+    @property
+    def top(self) -> Array:
+        """Top speeds `(3,)` of the robot, of the shipped one where none was given."""
+        return (self.robot or load_robot()).walking.scale
 
     def ticks(self, seconds: float) -> int:
         """The nearest number of ticks, at least one."""

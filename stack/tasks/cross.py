@@ -13,6 +13,7 @@ from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading, turned
 from servoid.hw.setting import Setting
+from servoid.policy.references.gait import load_gait
 from servoid.stack.navigation.collision_avoidance import AvoidanceSettings, Motion, bearing_past
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.tasks import metrics as measures
@@ -76,7 +77,7 @@ class Cross(BaseTask):
             "arrived": float(there),
             "apart_m": _apart(trace),
             "touched": float(self._touched(trace)),
-            "path_m": measures.path_length(trace, step=0.48),
+            "path_m": measures.path_length(trace, load_gait().cycle),
             "seconds_to_cross": len(trace.yaw) * trace.dt if there == self.settings.robots else float("nan"),
         }
 

@@ -15,6 +15,7 @@ from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Setting
+from servoid.policy.references.gait import load_gait
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.navigation.potential_field import FieldSettings, PotentialField
 from servoid.stack.tasks import metrics as measures
@@ -109,7 +110,7 @@ class Forest(BaseTask):
             "final_distance_m": _final_distance(trace, episode),
             "clearance_m": measures.clearance(trace),
             "touched": float(measures.touched(trace)),
-            "path_m": measures.path_length(trace, step=0.48),
+            "path_m": measures.path_length(trace, load_gait().cycle),
             "seconds_to_goal": len(trace.yaw) * trace.dt if self.success(trace, episode) else float("nan"),
         }
 

@@ -17,7 +17,8 @@ from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Range, Setting
-from servoid.policy.text.captions import twist_of
+from servoid.policy.references.gait import load_gait
+from servoid.policy.text.captions import MOTIONS
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
@@ -51,7 +52,7 @@ class Goal(BaseTask):
     def __init__(self, settings: GoalSettings, dt: float, robot: Robot | None = None) -> None:
         """Raises ConfigError for a text that names no motion, or none that goes anywhere."""
         super().__init__(settings, dt, robot)
-        if settings.text is not None and not twist_of(understood("text", settings.text)).any():
+        if settings.text is not None and not any(MOTIONS[understood("text", settings.text)].typical):
             raise ConfigError(f"--set text={settings.text}: a robot that stands reaches no goal; say how to walk")
 
     def scenario(self, rng: np.random.Generator) -> Episode:
@@ -77,7 +78,7 @@ class Goal(BaseTask):
         arrival = int(outside[-1]) + 1 if len(outside) else 0  # the tick from which it stayed within the radius
         return {
             "final_distance_m": float(distances[-1]),
-            "path_m": measures.path_length(trace, step=0.48),
+            "path_m": measures.path_length(trace, load_gait().cycle),
             "seconds_to_goal": arrival * trace.dt if arrival < len(trace.displacement) else float("nan"),
         }
 

@@ -14,6 +14,7 @@ from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.setting import Setting
+from servoid.policy.references.gait import load_gait
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 
@@ -79,7 +80,7 @@ class Path(BaseTask):
             "final_distance_m": end,
             "left_m": left,
             "length_m": _SPACING * (len(episode.points) - 1),
-            "path_m": measures.path_length(trace, step=0.48),
+            "path_m": measures.path_length(trace, load_gait().cycle),
         }
 
     def _errors(self, trace: Trace, points: Array) -> tuple[float, float, float]:

@@ -12,6 +12,7 @@ from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.setting import Setting
+from servoid.policy.references.gait import load_gait
 from servoid.stack.control.operator import Steering, open_steering
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
@@ -42,7 +43,7 @@ class Steer(BaseTask):
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
         return {
             "top_speed_mps": measures.top_speed(trace),
-            "distance_m": measures.path_length(trace, step=0.48),
+            "distance_m": measures.path_length(trace, load_gait().cycle),
         }
 
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
 
 from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Setting
+from servoid.policy.references.gait import load_gait
 from servoid.policy.text.captions import MOTIONS, followed, twist_of
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
@@ -27,7 +29,9 @@ class TextSettings(Settings):
         "held_out"
     )
     sentence: Annotated[str | None, Setting("what to do all the time, instead of sentences drawn")] = None
-    cycle: Annotated[float, Setting("length of a gait cycle: motion is measured over whole ones", "s", above=0)] = 0.48
+    cycle: Annotated[float, Setting("length of a gait cycle: motion is measured over whole ones", "s", above=0)] = (
+        field(default_factory=lambda: load_gait().cycle)
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -69,7 +73,7 @@ class Text(BaseTask):
         return Sentences(motions=tuple(motions), sentences=tuple(sentences))
 
     def behaviour(self, episode: Sentences) -> BaseBehaviour:
-        return _Tell(episode, self.ticks(self.settings.every))
+        return _Tell(episode, self.ticks(self.settings.every), self.top)
 
     def success(self, trace: Trace, episode: Sentences) -> bool:
         """Never fallen, and every sentence followed."""
@@ -85,28 +89,30 @@ class Text(BaseTask):
         """
         every, cycle = round(self.settings.every / self.dt), round(self.settings.cycle / self.dt)
         in_time = not trace.fallen and len(trace.yaw) >= round(self.seconds / self.dt)
-        verdicts = []
+        verdicts, top = [], self.top
         for number, motion in enumerate(episode.motions):
             first = number * every + round(self.settings.settle / self.dt)
             cycles = (min((number + 1) * every, len(trace.yaw)) - first) // cycle
             if cycles >= 1:
                 rows = slice(first, first + cycles * cycle)
                 twist = np.array([*trace.velocity[rows, :2].mean(0), trace.yaw_rate[rows].mean()])
-                verdicts.append(followed(motion, twist))
+                verdicts.append(followed(motion, twist, top))
             elif not in_time:
                 verdicts.append(False)
         return float(np.mean(verdicts)) if verdicts else float("nan")
 
 
 class _Tell(BaseBehaviour):
-    def __init__(self, episode: Sentences, ticks: int) -> None:
+    def __init__(self, episode: Sentences, ticks: int, top: Array) -> None:
         super().__init__(episode)
-        self._ticks = ticks
+        self._ticks, self._top = ticks, top
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
         """The sentence; with it the motion's typical velocity, for policies that do not read."""
         number = min(tick // self._ticks, len(self.episode.motions) - 1)
-        return Instruction(velocity=twist_of(self.episode.motions[number]), text=self.episode.sentences[number])
+        return Instruction(
+            velocity=twist_of(self.episode.motions[number], self._top), text=self.episode.sentences[number]
+        )
 
 
 def understood(name: str, sentence: str) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -15,6 +15,7 @@ from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.geometry import turned
 from servoid.hw.setting import Range, Setting
+from servoid.policy.references.gait import load_gait
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 
@@ -26,7 +27,9 @@ class VelocitySettings(Settings):
     turn: Annotated[Range, Setting("how far the direction changes each time", "rad")] = (-1.0, 1.0)
     every: Annotated[float, Setting("time between changes", "s", above=0)] = 8.7
     settle: Annotated[float, Setting("time after each change that does not count", "s", least=0)] = 2.1
-    cycle: Annotated[float, Setting("length of a gait cycle: velocity is averaged over it", "s", above=0)] = 0.48
+    cycle: Annotated[float, Setting("length of a gait cycle: velocity is averaged over it", "s", above=0)] = field(
+        default_factory=lambda: load_gait().cycle
+    )
     tolerance: Annotated[float, Setting("largest mean velocity error of a success", "m/s", above=0)] = 0.04
     turn_gain: Annotated[float, Setting("turning rate for each rad of wrong heading", "1/s", above=0)] = 1.5
     yaw_rate: Annotated[float, Setting("fastest turn", "rad/s", above=0)] = 0.8

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -13,6 +13,7 @@ from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.setting import Range, Setting
+from servoid.policy.references.gait import load_gait
 from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 
@@ -27,7 +28,9 @@ class WalkSettings(Settings):
     every: Annotated[float, Setting("time between changes of the command", "s", above=0)] = 5.0
     push: Annotated[Range, Setting("size of each push, in a random direction", "m/s", least=0)] = (0.0, 0.0)
     push_every: Annotated[float, Setting("time between pushes", "s", above=0)] = 1.0
-    cycle: Annotated[float, Setting("length of a gait cycle: velocity is averaged over it", "s", above=0)] = 0.48
+    cycle: Annotated[float, Setting("length of a gait cycle: velocity is averaged over it", "s", above=0)] = field(
+        default_factory=lambda: load_gait().cycle
+    )
     tolerance: Annotated[
         float | None, Setting("largest mean velocity error of a success; none: not falling is enough", "m/s", above=0)
     ] = 0.1

@@ -156,7 +156,7 @@ def _time(
         guidance = replace(settings.guidance, gradient=gradient if guided else "analytic")
         guidance = replace(guidance, weight=guidance.weight or 1.0)  # timed even where it is switched off
         chosen = replace(settings, engine=engine, guidance=guidance)
-        planner = Runtime(network.model, chosen, robot.dt, cost if guided else None, loaded)
+        planner = Runtime(network.model, chosen, robot, cost if guided else None, loaded)
         plan_ms, cpu_ms = _plan_times(planner, request, plans)
         rows.append(
             {

@@ -67,15 +67,10 @@ def main(args: argparse.Namespace) -> int:
         check_seed(args.seed)
         if args.video is not None:
             _prepare_video(args.video)
-        from servoid.stack.runtime.interrupt import Interrupt
-
-        with Interrupt(eager=True) as interrupt:  # these take a while, and a Ctrl-C meanwhile must not get lost
-            from servoid.stack.runtime.backends import backend_kind
-            from servoid.stack.runtime.run import RunSettings, run
-            from servoid.stack.tasks import find
-            from servoid.tools.common.live import LiveLine
-
-            interrupt.settle()
+        from servoid.stack.runtime.backends import backend_kind
+        from servoid.stack.runtime.run import RunSettings, run
+        from servoid.stack.tasks import find
+        from servoid.tools.common.live import LiveLine
 
         watched = (sys.stdout.isatty() and not args.json) or find(args.task).cls.steered
         plan = RunSettings(

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any, Literal, TypeVar
 
+from servoid.hw.signals import held_back
+
 Job = TypeVar("Job")
 Answer = TypeVar("Answer")
 
@@ -29,7 +31,7 @@ class Worker:
         context = mp.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, work), daemon=True)
-        with _one_thread():
+        with _one_thread(), held_back(signal.SIGINT):
             self._process.start()
         theirs.close()
 
@@ -157,7 +159,6 @@ def _answer(worker: Worker) -> Any:
 
 def _serve(pipe: Connection, work: Callable[[Any], Any]) -> None:
     """The process of a worker: answer until the other end is gone. Ctrl-C is the parent's."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
         try:
             job = pipe.recv()

@@ -156,6 +156,8 @@ def _check_training(path: Path, network: OwnNetwork) -> None:
     asked = plain(read_settings(args, DiffusionTraining()))
     header = read_header(path)
     given = {**header.get("config", {}), **header.get("training", {})}
+    if "committed" in given:  # in headers of before it was called inference_delay
+        given["inference_delay"] = given.pop("committed")
     whatever = {*_WHATEVER, "minutes"} if asked["steps"] else _WHATEVER  # then they say when to evaluate, and no more
     for name, value in given.items():
         if name in asked and name not in whatever and asked[name] != value:

@@ -66,13 +66,14 @@ def soak(report: Report, args: argparse.Namespace) -> dict[str, Any]:
         start=True,
     )
     outcome = "error"
-    events: list[Any] = []
+    events: list[str] = []
     with free_rig(args.robot, args.seed) as rig:
         body = DynamixelBackend(robot, port=rig.port)
         watch = SoakWatch(rig, robot.rate, args, report)
         try:
             result = run(settings, backend=body, on_tick=watch)
-            outcome, events = result.outcome, [e for e in result.events if e.kind not in ("phase", "task", "system")]
+            outcome = result.outcome
+            events = [event.text for event in result.events if event.kind not in ("phase", "task", "system")]
         except BackendError as error:
             events = [str(error)]
         counters = body.counters
@@ -97,7 +98,7 @@ def soak(report: Report, args: argparse.Namespace) -> dict[str, Any]:
         "rss_end_mb": watch.end_mb,
         "rig_rss_start_mb": watch.rig_start_mb,
         "rig_rss_end_mb": watch.rig_end_mb,
-        "events": [getattr(event, "text", event) for event in events],
+        "events": events,
     }
 
 

@@ -33,7 +33,8 @@ def add_setting_flags(parser: argparse.ArgumentParser, base: Run, run: argparse.
             default = getattr(base, f.name)
             shown = "" if isinstance(default, dict) else f" (default: {_shown(default)})"
             groups[title].add_argument(
-                "--" + f.name.replace("_", "-"),
+                *_flags(f.name),
+                dest=f.name,
                 default=argparse.SUPPRESS,
                 help=(text + shown).replace("%", "%%"),
                 **_parsed(kind),
@@ -61,6 +62,12 @@ def read_settings(args: argparse.Namespace, base: T) -> T:
 def plain(settings: Run) -> dict[str, Any]:
     """Settings as YAML has them, for a header, or for a file that `--config` takes."""
     return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(settings).items()}
+
+
+def _flags(name: str) -> tuple[str, ...]:
+    """The flag of a setting, and the one that it had before."""
+    older = {"inference_delay": ("--committed",)}
+    return "--" + name.replace("_", "-"), *older.get(name, ())
 
 
 def _owner(cls: type, name: str) -> type:

@@ -125,8 +125,10 @@ class DiffusionTraining(DecayedOptimiser, Objective, DiffusionNetwork, DataRun):
             part.__post_init__(self)
         if self.history < 2:
             raise ValueError(f"history must be at least 2, not {self.history}: what ran last is an action of the past")
-        if self.committed > self.horizon:
-            raise ValueError(f"committed must be 0 to the horizon of {self.horizon} ticks, not {self.committed}")
+        if self.inference_delay > self.horizon:
+            raise ValueError(
+                f"inference_delay must be 0 to the horizon of {self.horizon} ticks, not {self.inference_delay}"
+            )
         if self.warmup_steps < 1:
             raise ValueError(f"warmup_steps must be at least 1, not {self.warmup_steps}")
 

@@ -57,7 +57,7 @@ class DenoiserShape:
 class Objective:
     """What a denoiser is trained for, beside the plain squared error."""
 
-    committed: Annotated[int, "longest delay of a plan, in ticks, to train for: actions that run meanwhile"] = 2
+    inference_delay: Annotated[int, "longest delay of a plan to train for, in ticks, whose actions are given"] = 2
     near_actions: Annotated[int, "ticks to come whose actions count in full"] = 8
     far_actions: Annotated[float, "weight of the actions beyond; 0 cuts them, as Diffuse-CLoC does"] = 0.2
     min_snr: Annotated[float, "clip of the signal-to-noise ratio that weights tokens, 5 for one; 0: no weights"] = 0.0
@@ -70,8 +70,8 @@ class Objective:
     ] = 0.25
 
     def __post_init__(self) -> None:
-        if self.committed < 0:
-            raise ValueError(f"committed must not be negative, not {self.committed}")
+        if self.inference_delay < 0:
+            raise ValueError(f"inference_delay must not be negative, not {self.inference_delay}")
         if self.near_actions < 1:
             raise ValueError(f"near_actions must be at least 1 tick, not {self.near_actions}")
         for name in ("far_actions", "min_snr", "action_rate"):

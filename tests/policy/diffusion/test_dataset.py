@@ -111,7 +111,7 @@ def test_windows_are_told_what_was_asked_and_mirrored_ones_the_opposite(syntheti
     windows = Windows(left, ROBOT, config)
     _, _, text = windows.draw(400, torch.Generator().manual_seed(0))
     known = {
-        name: reader.encode(MOTIONS[motion_of(np.array([0.0, 0.0, turn]))].phrasings)
+        name: reader.encode(MOTIONS[motion_of(np.array([0.0, 0.0, turn]), load_robot().walking.scale)].phrasings)
         for name, turn in (("left", 0.8), ("right", -0.8))
     }
     counts = {name: sum((row == rows).all(1).any() for row in text.numpy()) for name, rows in known.items()}

@@ -131,12 +131,12 @@ def test_plans_are_those_of_torch(name: str, tolerance: float, schedule: str) ->
     )
     plans = []
     for which in (installed(name), REFERENCE):
-        runtime = Runtime(made, replace(settings, engine=which), ROBOT.dt, speed_cost)
+        runtime = Runtime(made, replace(settings, engine=which), ROBOT, speed_cost)
         first = runtime.plan(seeded_with(request(), 7))
         plans.append(runtime.plan(seeded_with(replace(request(tick=42), previous=first), 7)).actions)
     assert np.abs(plans[0] - plans[1]).max() <= tolerance
     assert (
-        np.abs(plans[1] - Runtime(made, settings, ROBOT.dt, speed_cost).plan(seeded_with(request(), 8)).actions).max()
+        np.abs(plans[1] - Runtime(made, settings, ROBOT, speed_cost).plan(seeded_with(request(), 8)).actions).max()
         > 0.1
     )
 
@@ -162,8 +162,8 @@ def test_what_is_not_installed_is_named_with_the_remedy(monkeypatch: pytest.Monk
     made = model()
     for name, extra in (("onnx", "onnx"), ("onnx-int8", "onnx"), ("openvino", "openvino")):
         with pytest.raises(ConfigError, match=rf"pip install 'servoid\[{extra}\]'"):
-            Runtime(made, DiffusionSettings(engine=name), ROBOT.dt)
-    Runtime(made, DiffusionSettings(), ROBOT.dt)  # torch needs nothing
+            Runtime(made, DiffusionSettings(engine=name), ROBOT)
+    Runtime(made, DiffusionSettings(), ROBOT)  # torch needs nothing
 
 
 def test_the_gradient_through_the_network_needs_torch() -> None:

@@ -56,7 +56,7 @@ def test_a_frame_keeps_its_noise_when_the_tick_goes_on() -> None:
 
 
 def test_a_plan_goes_on_from_the_one_that_runs_and_is_a_function_of_its_request() -> None:
-    runtime, asked = Runtime(model(), ROLLING, ROBOT.dt), request(delay=1)
+    runtime, asked = Runtime(model(), ROLLING, ROBOT), request(delay=1)
     warm = replace(asked, previous=previous_plan(39))
     first, again = runtime.plan(seeded_with(warm, 7)), runtime.plan(seeded_with(warm, 7))
     np.testing.assert_array_equal(first.actions, again.actions)
@@ -102,7 +102,7 @@ def test_what_goes_on_from_a_low_level_stays_near_the_plan_that_runs() -> None:
 
 
 def test_other_schedules_do_not_read_the_plan_that_runs() -> None:
-    runtime = Runtime(model(), replace(ROLLING, schedule="pyramid"), ROBOT.dt)
+    runtime = Runtime(model(), replace(ROLLING, schedule="pyramid"), ROBOT)
     asked = request(delay=1)
     plain, warm = (
         runtime.plan(seeded_with(asked, 7)),
@@ -119,7 +119,7 @@ def test_every_schedule_plans_and_a_shorter_horizon_plans_less(schedule: str) ->
     settings = DiffusionSettings(
         schedule=schedule, steps=3, history=2, horizon=8, execution_horizon=4, delay=2, stabilization_level=2
     )
-    plan = Runtime(model(), settings, ROBOT.dt).plan(request())
+    plan = Runtime(model(), settings, ROBOT).plan(request())
     assert plan.actions.shape == (8, 20)
     assert plan.states.shape == (8, raw_layout(20).size)
     assert plan.path.shape == (8, 2)
@@ -129,7 +129,7 @@ def test_every_schedule_plans_and_a_shorter_horizon_plans_less(schedule: str) ->
 
 def test_a_state_beyond_the_chosen_history_is_not_read() -> None:
     settings = DiffusionSettings(steps=3, history=2)
-    runtime, asked = Runtime(model(), settings, ROBOT.dt), request()
+    runtime, asked = Runtime(model(), settings, ROBOT), request()
     older, recent = asked.states.copy(), asked.states.copy()
     older[0, 2] += 0.1
     recent[2, 2] += 0.1
@@ -153,7 +153,7 @@ def test_keyframes_are_met_and_change_what_comes_before(emphasis: float) -> None
     if emphasis:
         plain = Normaliser(made.states.mean.numpy(), made.states.std.numpy())
         made = replace(model(state_size=108), states=Emphasis.of(plain, 20, emphasis, 0).to_torch())
-    runtime, asked = Runtime(made, DiffusionSettings(steps=3), ROBOT.dt), request()
+    runtime, asked = Runtime(made, DiffusionSettings(steps=3), ROBOT), request()
     without = runtime.plan(asked)
     whole, rows = with_keyframes(6, 12, 40)  # the last is beyond the horizon, and comes in later
     plan = runtime.plan(replace(asked, instruction=whole))
@@ -167,7 +167,7 @@ def test_keyframes_are_met_and_change_what_comes_before(emphasis: float) -> None
 
 
 def test_keyframes_that_make_no_sense_are_refused() -> None:
-    runtime, asked = Runtime(model(), DiffusionSettings(steps=3), ROBOT.dt), request()
+    runtime, asked = Runtime(model(), DiffusionSettings(steps=3), ROBOT), request()
     for ticks, match in (((0, 5), "at least 1 and rise"), ((6, 6), "at least 1 and rise")):
         with pytest.raises(ValueError, match=match):
             runtime.plan(replace(asked, instruction=with_keyframes(*ticks)[0]))
@@ -184,7 +184,7 @@ def test_keyframes_that_make_no_sense_are_refused() -> None:
 def test_the_best_of_many_samples_is_run_and_with_the_mean_the_first() -> None:
     def costs(choose: str, samples: int) -> np.ndarray:
         guidance = GuidanceSettings(weight=1e-6, samples=samples, choose=choose)
-        runtime = Runtime(model(), DiffusionSettings(steps=3, guidance=guidance), ROBOT.dt, speed_cost)
+        runtime = Runtime(model(), DiffusionSettings(steps=3, guidance=guidance), ROBOT, speed_cost)
         velocity = raw_layout(20).slice("velocity")
         plans = [runtime.plan(seeded_with(request(), seed)) for seed in range(5)]
         return np.array([np.square(plan.states[:, velocity][:, 0] - 0.2).mean() for plan in plans])
@@ -205,7 +205,7 @@ def test_samples_work_in_a_batch_whose_robots_have_their_own_commands() -> None:
         asked = torch.as_tensor(instruction.velocity, dtype=torch.float32)[:, None, :1]
         return (trajectory.velocity[..., :1] - asked).square().mean((1, 2))  # type: ignore[attr-defined]
 
-    runtime = Runtime(model(), DiffusionSettings(steps=3, guidance=guidance), ROBOT.dt, cost)
+    runtime = Runtime(model(), DiffusionSettings(steps=3, guidance=guidance), ROBOT, cost)
     both, _ = runtime.plan_batch(states, actions, Instruction(commands), [(5, 40), (5, 41)])
     for i in range(2):
         alone, _ = runtime.plan_batch(
@@ -216,7 +216,7 @@ def test_samples_work_in_a_batch_whose_robots_have_their_own_commands() -> None:
 
 def test_guidance_that_drives_a_plan_out_of_all_bounds_gives_no_plan() -> None:
     guidance = GuidanceSettings(weight=1e6, clip=1e9)
-    runtime = Runtime(model(), DiffusionSettings(steps=4, guidance=guidance), ROBOT.dt, speed_cost)
+    runtime = Runtime(model(), DiffusionSettings(steps=4, guidance=guidance), ROBOT, speed_cost)
     with pytest.raises(Diverged, match="lower the weight of guidance"):
         runtime.plan(request())
 
@@ -224,5 +224,5 @@ def test_guidance_that_drives_a_plan_out_of_all_bounds_gives_no_plan() -> None:
 def test_a_checkpoint_that_never_learned_far_actions_does_not_execute_them() -> None:
     made = replace(model(), header={"training": {"far_actions": 0.0, "near_actions": 4}})
     with pytest.raises(ConfigError, match="learned the actions of the next 4 only"):
-        Runtime(made, DiffusionSettings(steps=4, execution_horizon=4, delay=2), ROBOT.dt)
-    Runtime(made, DiffusionSettings(steps=4, execution_horizon=3, delay=1), ROBOT.dt)
+        Runtime(made, DiffusionSettings(steps=4, execution_horizon=4, delay=2), ROBOT)
+    Runtime(made, DiffusionSettings(steps=4, execution_horizon=3, delay=1), ROBOT)

@@ -59,7 +59,7 @@ def speed_cost(trajectory: Trajectory, instruction: Instruction) -> Any:
 
 
 def test_the_same_request_and_seed_give_the_same_plan() -> None:
-    runtime = Runtime(model(), SETTINGS, ROBOT.dt)
+    runtime = Runtime(model(), SETTINGS, ROBOT)
     first, again = runtime.plan(seeded_with(request(), 7)), runtime.plan(seeded_with(request(), 7))
     np.testing.assert_array_equal(first.actions, again.actions)
     np.testing.assert_array_equal(first.states, again.states)
@@ -69,7 +69,7 @@ def test_the_same_request_and_seed_give_the_same_plan() -> None:
 
 def test_an_empty_sentence_leaves_the_velocity_untold() -> None:
     pytest.importorskip("wordllama")
-    runtime = Runtime(model(text="words", text_size=load_encoder("words").size), SETTINGS, ROBOT.dt)
+    runtime = Runtime(model(text="words", text_size=load_encoder("words").size), SETTINGS, ROBOT)
 
     def first(text: str | None, velocity: float) -> Array:
         asked = replace(request(), instruction=Instruction(np.array([velocity, 0.0, 0.0]), text=text))
@@ -82,7 +82,7 @@ def test_an_empty_sentence_leaves_the_velocity_untold() -> None:
 
 def test_each_of_a_batch_is_told_the_name_of_its_own_motion() -> None:
     pytest.importorskip("wordllama")
-    runtime = Runtime(model(text="words", text_size=load_encoder("words").size), SETTINGS, ROBOT.dt)
+    runtime = Runtime(model(text="words", text_size=load_encoder("words").size), SETTINGS, ROBOT)
     ahead, turning, here = np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.0, 0.6]), request()
 
     def actions(velocity: Array, text: str | None = None) -> Array:
@@ -92,7 +92,7 @@ def test_each_of_a_batch_is_told_the_name_of_its_own_motion() -> None:
 
     both = actions(np.stack([ahead, turning]))
     for one, velocity in zip(both, (ahead, turning), strict=True):
-        np.testing.assert_allclose(one, actions(velocity, caption(velocity))[0], atol=1e-6)
+        np.testing.assert_allclose(one, actions(velocity, caption(velocity, ROBOT.walking.scale))[0], atol=1e-6)
     assert not np.allclose(both[0], both[1], atol=1e-3)
 
 
@@ -104,7 +104,7 @@ def test_a_sentence_is_read_as_the_nearest_that_was_trained_with_unless_told_oth
 
     def first(text: str, nearest: bool) -> Array:
         settings = replace(SETTINGS, text_nearest=nearest)
-        runtime = Runtime(model(text="words", text_size=load_encoder("words").size), settings, ROBOT.dt)
+        runtime = Runtime(model(text="words", text_size=load_encoder("words").size), settings, ROBOT)
         return runtime.plan(seeded_with(replace(request(), instruction=Instruction(np.zeros(3), text=text)), 7)).actions
 
     np.testing.assert_array_equal(first(told, True), first(known, True))
@@ -114,7 +114,7 @@ def test_a_sentence_is_read_as_the_nearest_that_was_trained_with_unless_told_oth
 
 def test_committed_actions_are_part_of_the_plan() -> None:
     asked = request(delay=2)
-    plan = Runtime(model(), SETTINGS, ROBOT.dt).plan(asked)
+    plan = Runtime(model(), SETTINGS, ROBOT).plan(asked)
     assert plan.tick == 40
     assert plan.actions.shape == (16, 20)
     assert plan.states.shape == (16, raw_layout(20).size)
@@ -123,11 +123,11 @@ def test_committed_actions_are_part_of_the_plan() -> None:
     assert plan.seconds > 0
     # What they are matters for what follows.
     changed = replace(asked, actions=asked.actions + 0.1 * (np.arange(5) >= 3)[:, None])
-    assert np.abs(Runtime(model(), SETTINGS, ROBOT.dt).plan(changed).actions[2:] - plan.actions[2:]).max() > 1e-4
+    assert np.abs(Runtime(model(), SETTINGS, ROBOT).plan(changed).actions[2:] - plan.actions[2:]).max() > 1e-4
 
 
 def test_a_plan_does_not_depend_on_where_odometry_began() -> None:
-    runtime, here = Runtime(model(), SETTINGS, ROBOT.dt), request()
+    runtime, here = Runtime(model(), SETTINGS, ROBOT), request()
     there = replace(here, states=moved(here.states, 30.0, -20.0, 2.0))
     a, b = runtime.plan(here), runtime.plan(there)
     np.testing.assert_allclose(a.actions, b.actions, atol=1e-4)
@@ -143,15 +143,15 @@ def test_a_plan_does_not_depend_on_where_odometry_began() -> None:
 def test_guidance_lowers_the_cost_of_the_prediction(gradient: str, weight: float) -> None:
     guidance = GuidanceSettings(weight=weight, clip=10.0, gradient=gradient)
     asked, velocity = request(), raw_layout(20).slice("velocity")
-    plain = Runtime(model(), SETTINGS, ROBOT.dt).plan(asked)
-    guided = Runtime(model(), replace(SETTINGS, guidance=guidance), ROBOT.dt, speed_cost).plan(asked)
+    plain = Runtime(model(), SETTINGS, ROBOT).plan(asked)
+    guided = Runtime(model(), replace(SETTINGS, guidance=guidance), ROBOT, speed_cost).plan(asked)
     error = [np.square(p.states[:, velocity][:, 0] - 0.2).mean() for p in (plain, guided)]
     assert error[1] < 0.8 * error[0]
     assert np.abs(guided.actions[2:] - plain.actions[2:]).max() > 1e-5
 
 
 def test_a_batch_plans_like_each_of_its_robots() -> None:
-    runtime = Runtime(model(), SETTINGS, ROBOT.dt)
+    runtime = Runtime(model(), SETTINGS, ROBOT)
     asked = [request(tick=t, seed=t) for t in (40, 41, 42)]
     states, actions = np.stack([r.states for r in asked]), np.stack([r.actions for r in asked])
     targets, _ = runtime.plan_batch(states, actions, asked[0].instruction, [(5, r.tick) for r in asked])
@@ -160,7 +160,7 @@ def test_a_batch_plans_like_each_of_its_robots() -> None:
 
 
 def test_requests_that_cannot_be_planned_are_refused() -> None:
-    runtime, asked = Runtime(model(), SETTINGS, ROBOT.dt), request()
+    runtime, asked = Runtime(model(), SETTINGS, ROBOT), request()
     broken = asked.states.copy()
     broken[0, 10] = np.nan
     with pytest.raises(ValueError, match="not finite"):
@@ -173,9 +173,9 @@ def test_requests_that_cannot_be_planned_are_refused() -> None:
 
 def test_settings_that_a_network_cannot_serve_are_refused() -> None:
     with pytest.raises(ConfigError, match="lower execution_horizon or delay"):
-        Runtime(model(horizon=8), replace(SETTINGS, execution_horizon=7, delay=2), ROBOT.dt)
+        Runtime(model(horizon=8), replace(SETTINGS, execution_horizon=7, delay=2), ROBOT)
     with pytest.raises(ConfigError, match="1 to 20"):
-        Runtime(model(), replace(SETTINGS, steps=21), ROBOT.dt)
+        Runtime(model(), replace(SETTINGS, steps=21), ROBOT)
     with pytest.raises(ValueError, match="delay must be 0 to execution_horizon"):
         DiffusionSettings(execution_horizon=2, delay=3)
     with pytest.raises(ValueError, match="gradient"):
@@ -185,8 +185,8 @@ def test_settings_that_a_network_cannot_serve_are_refused() -> None:
 def test_a_delay_that_a_network_was_not_trained_for_is_refused() -> None:
     trained = replace(model(), header={"training": {"committed": 1, "near_actions": 8}})
     with pytest.raises(ConfigError, match="trained for at most 1 ticks"):
-        Runtime(trained, SETTINGS, ROBOT.dt)
-    Runtime(trained, replace(SETTINGS, delay=1), ROBOT.dt)
+        Runtime(trained, SETTINGS, ROBOT)
+    Runtime(trained, replace(SETTINGS, delay=1), ROBOT)
 
 
 def test_the_shipped_settings_load() -> None:
@@ -202,7 +202,7 @@ def test_a_checkpoint_plans_as_what_was_saved(tmp_path: Path) -> None:
     checkpoint.save(path, weights, made.config, made.states, made.actions, ROBOT, **facts)
     loaded = checkpoint.load(path, ROBOT)
     assert loaded.config == made.config
-    a, b = (Runtime(m, SETTINGS, ROBOT.dt).plan(request()) for m in (made, loaded))
+    a, b = (Runtime(m, SETTINGS, ROBOT).plan(request()) for m in (made, loaded))
     np.testing.assert_array_equal(a.actions, b.actions)
     with pytest.raises(CheckpointError, match="joints do not fit"):
         checkpoint.load(path, replace(ROBOT, joints=ROBOT.joints[1:]))

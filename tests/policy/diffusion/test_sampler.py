@@ -231,7 +231,9 @@ def planner() -> tuple[Denoiser, Sampler]:
         states = z.repeat(1, 5, 1)
         states[:, 0] = 0.0  # the present says nothing
         loss = sum(
-            losses(denoiser, states, z.repeat(1, 4, 1), None, signal, generator, Objective(committed=0, monotone=0.0))
+            losses(
+                denoiser, states, z.repeat(1, 4, 1), None, signal, generator, Objective(inference_delay=0, monotone=0.0)
+            )
         )
         optimiser.zero_grad()
         loss.backward()

@@ -15,7 +15,7 @@ from servoid.policy.diffusion.schedule import cosine_signal
 
 WINDOWS, WORDS = 2000, 5
 CONFIG = DenoiserConfig(3, 2, width=16, heads=2, history=2, horizon=4, text="words", text_size=WORDS)
-OBJECTIVE = Objective(committed=0, monotone=0.0)
+OBJECTIVE = Objective(inference_delay=0, monotone=0.0)
 SIGNAL = torch.as_tensor(cosine_signal(CONFIG.levels), dtype=torch.float32)
 
 

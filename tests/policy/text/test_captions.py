@@ -7,20 +7,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from servoid.hw.robot.description import load_robot
 from servoid.policy.text.captions import MOTIONS, NAMES, caption, followed, mirrored, motion_of, twist_of
 
+TOP = load_robot().walking.scale
 TWIST = st.tuples(st.floats(-0.15, 0.6), st.floats(-0.13, 0.13), st.floats(-1.2, 1.2))
 FLIP = np.array([1.0, -1.0, -1.0])
 
 
 def name(*twist: float) -> str:
-    return NAMES[int(motion_of(np.array(twist)))]
+    return NAMES[int(motion_of(np.array(twist), TOP))]
 
 
 @given(TWIST)
 def test_the_mirror_image_of_a_twist_has_the_mirrored_motion(twist: tuple[float, float, float]) -> None:
-    index = motion_of(np.array(twist))
-    assert motion_of(FLIP * twist) == mirrored(index)
+    index = motion_of(np.array(twist), TOP)
+    assert motion_of(FLIP * twist, TOP) == mirrored(index)
     assert mirrored(mirrored(index)) == index
 
 
@@ -52,21 +54,29 @@ def test_which_motion_a_twist_is(twist: tuple[float, float, float], expected: st
     assert name(*twist) == expected
 
 
+def test_what_is_fast_for_a_small_robot_is_slow_for_a_large_one() -> None:
+    asked = np.array([0.13, 0.0, 0.0])
+    names = [NAMES[int(motion_of(asked, TOP * size))] for size in (0.5, 1.0, 2.0)]
+    assert names == ["forward fast", "forward", "forward slowly"]
+    assert followed(NAMES.index("forward fast"), asked, 0.5 * TOP)
+    assert not followed(NAMES.index("forward fast"), asked, TOP)
+
+
 def test_many_twists_at_once_are_named_as_each_alone() -> None:
     """A dataset is labelled in one call."""
     twists = np.random.default_rng(0).uniform([-0.15, -0.13, -1.2], [0.6, 0.13, 1.2], (4, 50, 3))
-    together = motion_of(twists)
+    together = motion_of(twists, TOP)
     assert together.shape == (4, 50)
     assert np.issubdtype(together.dtype, np.integer)
-    assert together[2, 7] == motion_of(twists[2, 7])
+    assert together[2, 7] == motion_of(twists[2, 7], TOP)
     assert set(np.unique(together)) <= set(range(len(MOTIONS)))
 
 
 def test_a_motion_is_its_typical_twist_and_no_other_follows_it() -> None:
     """Evaluation would count a robot that does something else, or nothing, as obedient."""
     for asked in range(len(MOTIONS)):
-        assert motion_of(twist_of(asked)) == asked
-        obeyed = [NAMES[done] for done in range(len(MOTIONS)) if followed(asked, twist_of(done))]
+        assert motion_of(twist_of(asked, TOP), TOP) == asked
+        obeyed = [NAMES[done] for done in range(len(MOTIONS)) if followed(asked, twist_of(done, TOP), TOP)]
         assert obeyed == [NAMES[asked]]
 
 
@@ -87,17 +97,17 @@ def test_a_motion_is_its_typical_twist_and_no_other_follows_it() -> None:
     ],
 )
 def test_what_counts_as_followed(motion: str, measured: tuple[float, float, float], expected: bool) -> None:
-    assert followed(NAMES.index(motion), np.array(measured)) is expected
+    assert followed(NAMES.index(motion), np.array(measured), TOP) is expected
 
 
 def test_a_run_that_was_not_measured_is_not_judged() -> None:
     with pytest.raises(ValueError, match="finite"):
-        followed(0, np.array([np.nan, 0.0, 0.0]))
+        followed(0, np.array([np.nan, 0.0, 0.0]), TOP)
 
 
 def test_the_caption_is_the_first_phrasing() -> None:
-    assert caption(np.array([0.2, 0.0, 0.0])) == "walk forward"
-    assert caption(np.array([0.0, 0.0, -0.5])) == "turn right on the spot"
+    assert caption(np.array([0.2, 0.0, 0.0]), TOP) == "walk forward"
+    assert caption(np.array([0.0, 0.0, -0.5]), TOP) == "turn right on the spot"
 
 
 def test_phrasings_are_enough_and_held_out_ones_were_never_trained() -> None:

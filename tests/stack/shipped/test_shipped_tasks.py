@@ -35,7 +35,7 @@ def guided_turn(planner: Asked) -> float:
     """How much further to the left plans turn [rad, mean] if the cost asks for it, than to the right; told the same."""
     turns = []
     for request in planner.requests[SOME]:
-        asked, told = request.instruction.velocity, caption(request.instruction.velocity)
+        asked, told = request.instruction.velocity, caption(request.instruction.velocity, ROBOT.walking.scale)
         plans = [planner.again(request, text=told, velocity=np.array([*asked[:2], rate])) for rate in (0.5, -0.5)]
         left, right = (float(plan.states[-1, LAYOUT.slice("yaw")][0]) for plan in plans)
         turns.append(left - right)

@@ -278,7 +278,7 @@ def test_text_changes_every_five_seconds_with_held_out_words() -> None:
     assert [i for i in range(1, 1500) if texts[i] != texts[i - 1]] == [250, 500, 750, 1000, 1250]
     for text, instruction in zip(texts[::250], told[::250], strict=True):
         (motion,) = [motion for motion in MOTIONS if text in motion.held_out]
-        assert instruction.velocity.tolist() == list(motion.typical)
+        assert instruction.velocity.tolist() == (motion.typical * load_robot().walking.scale).tolist()
 
 
 def test_text_is_judged_by_the_measured_motion() -> None:

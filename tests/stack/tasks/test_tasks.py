@@ -17,6 +17,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
+from servoid.hw.robot.description import load_robot
 from servoid.policy.text.captions import caption
 from servoid.stack.navigation.go_to_point import SpeedProfile
 from servoid.stack.tasks import find, load_settings, load_task, names
@@ -370,8 +371,8 @@ def test_survival_sets_a_robot_in_motion_and_then_tells_a_planner_nothing() -> N
     """Left alone at rest, a model that has seen standing stands for 3000 ticks: no survival of anything."""
     task = Drawn(load_task("survive", {}, DT))
     begun = task.instruct(0, state(), NOTHING)
-    assert begun.text == caption(begun.velocity)
-    assert begun.text != caption(np.zeros(3))
+    assert begun.text == caption(begun.velocity, load_robot().walking.scale)
+    assert begun.text != caption(np.zeros(3), load_robot().walking.scale)
     assert task.instruct(149, state(), NOTHING).text == begun.text
     asked = task.instruct(150, state(), NOTHING)
     assert asked.text == ""

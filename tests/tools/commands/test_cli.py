@@ -31,7 +31,7 @@ def test_help_loads_nothing_that_is_slow_to_load() -> None:
         "print(code, [m for m in heavy if m in sys.modules], *(m.split('.')[-1] for m in tools), file=sys.stderr)"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stderr.strip() == "0 [] cli common exit_codes parser"
+    assert result.stderr.strip() == "0 [] cli common exit_codes output parser"
     for verb in cli.VERBS:
         assert verb in result.stdout
 

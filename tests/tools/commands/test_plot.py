@@ -8,7 +8,6 @@ from servoid.hw.robot.description import load_robot
 from servoid.stack.control.gait import GaitPolicy
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.runtime.run import RunSettings, run
-from servoid.stack.tasks import load_task
 from servoid.tools.commands.plot import title
 
 
@@ -17,7 +16,6 @@ class Marcher(GaitPolicy):
 
 
 def test_a_programs_own_policy_is_not_taken_for_the_default(tmp_path: Path) -> None:
-    robot, log = load_robot(), tmp_path / "mine.mcap"
-    mine = Marcher(robot, task=load_task("walk", {}, robot.dt, robot), realtime=False)
-    run(RunSettings("walk", seconds=0.1, seed=3, record=log), policy=mine)
+    log = tmp_path / "mine.mcap"
+    run(RunSettings("walk", seconds=0.1, seed=3, record=log), policy=Marcher(load_robot()))
     assert title(read_log(log)).startswith("walk with Marcher on op3, seed 3: ")

@@ -233,7 +233,7 @@ def test_what_cannot_be_measured_is_refused_before_the_data_is_read(
     diffusion.add_arguments(parser)
     options = ["--data", str(tmp_path), "--out", str(tmp_path), "--threads", "1", "--text", ""]
     for committed in ("-1", "17"):
-        with pytest.raises(ConfigError, match=f"--committed must .* not {committed}"):
+        with pytest.raises(ConfigError, match=f"--inference-delay must .* not {committed}"):
             diffusion.main(parser.parse_args([*options, "--committed", committed]))
     stabilised = replace(load_settings(), stabilization_level=9)
     monkeypatch.setattr("servoid.policy.diffusion.settings.load_settings", lambda: stabilised)

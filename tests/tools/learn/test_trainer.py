@@ -26,7 +26,7 @@ def windows(synthetic_dataset: Path) -> Windows:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("committed", 1), ("far_actions", 0.0), ("monotone", 0.0), ("batch", 8), ("precision", "fp32")],
+    [("inference_delay", 1), ("far_actions", 0.0), ("monotone", 0.0), ("batch", 8), ("precision", "fp32")],
 )
 def test_a_run_goes_on_under_the_settings_that_it_began_with(
     windows: Windows, tmp_path: Path, name: str, value: Any

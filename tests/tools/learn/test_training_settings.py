@@ -110,7 +110,7 @@ def test_a_reward_that_is_no_term_is_refused_by_file_line_and_nearest_name(tmp_p
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--committed", "17"], "--committed must be 0 to the horizon of 16 ticks"),
+        (["--committed", "17"], "--inference-delay must be 0 to the horizon of 16 ticks"),
         (["--forcing", "1"], "monotone must be a share of 0 to 0, not 0.25, with --forcing 1"),
         (["--near-actions", "0"], "--near-actions must be at least 1 tick"),
         (["--minutes", "0"], "--minutes must be positive"),

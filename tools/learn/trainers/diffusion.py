@@ -215,7 +215,7 @@ class DiffusionTrainer(Trainer):
         states, actions, text = self.windows.held_out(count)
         # The same measure whatever else is trained for, so that runs can be compared.
         same = self.settings
-        measure = Objective(same.committed, same.near_actions, same.far_actions, monotone=0.0)
+        measure = Objective(same.inference_delay, same.near_actions, same.far_actions, monotone=0.0)
         with torch.inference_mode():
             given = states, actions, text, self.signal, torch.Generator().manual_seed(0)
             return losses(network, *given, measure)[1].item()
