@@ -97,7 +97,7 @@ def test_a_fall_is_exit_code_1(capsys):
         ([*RUN, "--record", "/proc/log.mcap"], "choose another place"),
         ([*RUN, "--seconds", "-3"], "not a positive number"),
         (["run", "cross", "--set", "robots=1"], "robots: must be 2 to 4, not 1"),
-        (["run", "cross", "--set", "robots=5"], "robots: 5 cannot cross: give 2 to 4"),
+        (["run", "cross", "--set", "robots=5"], "robots: must be 2 to 4, not 5"),
         (["run", "cross", "--set", "circle=0.3"], "circle: 0.3 m is too small a radius for 3 robots"),
         (["run", "cross", "--backend", "virtual"], "backend 'virtual' has one robot, and the task asks for 3"),
         (["run", "cross", "--backend", "dynamixel", "--port", "x", "--start"], "give --backend sim"),
