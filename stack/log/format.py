@@ -68,7 +68,7 @@ def _schema(properties: dict[str, Any]) -> dict[str, Any]:
 # JSON schema of each channel. Ticks count from the first of the run, those of plans from the start of the task.
 SCHEMAS: dict[str, dict[str, Any]] = {
     "/run": _schema({"format": _INTEGER, "settings": {"type": "object"}, "robot": {"type": "object"}}),
-    "/observation": _schema({"tick": _INTEGER} | _arrays(_OBSERVATION)),
+    "/observation": _schema({"tick": _INTEGER, "time_ns": _INTEGER} | _arrays(_OBSERVATION)),
     "/state": _schema({"tick": _INTEGER} | _arrays(_STATE)),
     "/command": _schema(
         {"tick": _INTEGER, "mode": _TEXT, "phase": _TEXT} | _arrays({"position": "rad", "gain": "of the firmware's"})
@@ -98,7 +98,14 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     ),
     "/result": _schema({"outcome": _TEXT, "success": {"type": "boolean"}, "metrics": {"type": "object"}}),
 }
-MACHINE_DEPENDENT = {"/run": None, "/timing": None, "/result": None, "/plan": ("seconds",)}  # what a replay may change
+# What a replay may change: channels, None standing for all of their fields. A rig's clock begins anywhere.
+MACHINE_DEPENDENT = {
+    "/run": None,
+    "/timing": None,
+    "/result": None,
+    "/plan": ("seconds",),
+    "/observation": ("time_ns",),
+}
 
 
 def pack(array: Any, dtype: str) -> dict[str, Any]:
@@ -136,7 +143,7 @@ def messages(record: TickRecord) -> list[tuple[str, dict[str, Any]]]:
     }
     command = {"position": pack(record.command.position, EXACT), "gain": pack(record.command.gain, EXACT)}
     out: list[tuple[str, dict[str, Any]]] = [
-        ("/observation", tick | observation),
+        ("/observation", tick | {"time_ns": record.observation.time_ns} | observation),
         ("/command", tick | {"mode": record.command.mode.name, "phase": str(record.phase)} | command),
     ]
     if record.state is not None:

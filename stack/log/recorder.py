@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import queue
 import threading
+import time
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -12,6 +13,7 @@ from mcap.writer import CompressionType, Writer
 
 from servoid.hw.config import ConfigError
 from servoid.stack.log.format import PROFILE, SCHEMAS, event_message, messages, plain
+from servoid.stack.log.foxglove import VIEWS, line, views
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.event import Event
 
@@ -21,14 +23,15 @@ CHUNK_BYTES = 40_000
 BACKLOG = 1500  # items waiting for the disk, half a minute at 50 Hz
 PATIENCE = 30.0  # s that closing waits for the disk
 
-Item = tuple[int, list[tuple[str, dict[str, Any]]]] | TickRecord
+Item = tuple[int, list[tuple[str, dict[str, Any]]] | TickRecord]
 
 
 class Recorder:
     """One flight log. Call it with each tick's record, then `close` it with the result.
 
     With `wait` a full backlog holds up the caller: for runs that nobody watches, which may outrun any disk. Otherwise
-    it counts as a failure: a log with holes repeats nothing. After a failure `error` says what happened and what
+    it counts as a failure: a log with holes repeats nothing. Messages have wall time: that of the start, and what the
+    body's clock says since. After a failure `error` says what happened and what
     to do, and everything that follows is dropped; the file stays readable up to its last complete chunk.
     """
 
@@ -39,7 +42,9 @@ class Recorder:
         self._file, self._name, self._wait = file, name, wait
         self._items: queue.Queue[Item | None] = queue.Queue(BACKLOG)
         self._closing = False  # the last item, None, was taken
-        self._time = 0
+        self._begun = time.time_ns()
+        self._first: int | None = None  # time of the first tick by the body's clock
+        self._time = self._begun
         self._thread = threading.Thread(target=self._work, args=(plain(header),), name="recorder", daemon=True)
         self._thread.start()
 
@@ -49,13 +54,16 @@ class Recorder:
         return cls(_make(path), header, wait=wait, name=str(path))
 
     def __call__(self, record: TickRecord) -> None:
-        self._time = record.observation.time_ns
-        self._put(record)
+        if self._first is None:
+            self._first = record.observation.time_ns
+        self._time = self._begun + record.observation.time_ns - self._first
+        self._put((self._time, record))
 
     def events(self, events: tuple[Event, ...]) -> None:
         """Record events that came after the last tick."""
         if events:
-            self._put((self._time, [("/event", event_message(event)) for event in events]))
+            lines = [line(event, self._time) for event in events]
+            self._put((self._time, [*(("/event", event_message(event)) for event in events), *lines]))
 
     def close(self, result: dict[str, Any]) -> None:
         """Write the result and finish the file. Returns within seconds even if the disk does not answer."""
@@ -110,6 +118,10 @@ class Recorder:
                 PROFILE + topic.replace("/", "."), "jsonschema", json.dumps(schema).encode()
             )
             channels[topic] = writer.register_channel(topic, "json", number)
+        for topic, (name, schema) in VIEWS.items():
+            number = writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
+            channels[topic] = writer.register_channel(topic, "json", number)
+        names = [joint["name"] for joint in header["robot"]["joints"]]
         sequence = 0
 
         def add(time_ns: int, topic: str, message: dict[str, Any]) -> None:
@@ -119,14 +131,13 @@ class Recorder:
             writer.add_message(channels[topic], time_ns, data, time_ns, sequence)
 
         # Larger than a chunk on purpose, with its padding of blanks, so that the header reaches the disk at once.
-        writer.add_message(channels["/run"], 0, json.dumps(header).encode().ljust(CHUNK_BYTES), 0, 0)
+        start = self._begun
+        writer.add_message(channels["/run"], start, json.dumps(header).encode().ljust(CHUNK_BYTES), start, 0)
         while (item := self._take()) is not None:
-            if isinstance(item, TickRecord):
-                for topic, message in messages(item):
-                    add(item.observation.time_ns, topic, message)
-            else:
-                for topic, message in item[1]:
-                    add(item[0], topic, message)
+            at, what = item
+            told = [*messages(what), *views(what, names, at)] if isinstance(what, TickRecord) else what
+            for topic, message in told:
+                add(at, topic, message)
         writer.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
 

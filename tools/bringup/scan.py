@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import BackendError
+from servoid.hw.robot.checks import MAX_ID
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.tools.bringup.line import add_line_arguments, open_line
 from servoid.tools.common import exit_codes
@@ -19,6 +20,7 @@ from servoid.tools.common.output import Report, reporting
 
 if TYPE_CHECKING:
     from servoid.hw.dynamixel.servos.bus_scan import Census, Device
+    from servoid.hw.dynamixel.transport.bus import Bus
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,15 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
-        from servoid.hw.dynamixel.servos.bus_scan import BAUDS, census, power_on
+        from servoid.hw.dynamixel.servos.bus_scan import BAUDS, census
 
         robot = load_robot(args.robot)
         for baud in args.baud:
             check_baud(baud)
         bauds = args.baud or _first(robot.bus.baud, BAUDS)
         with open_line(args, robot) as line:
-            power = power_on(line.bus, robot.bus.board_id, _first(robot.bus.baud, bauds))
-            report.line(power or f"no board with ID {robot.bus.board_id}: servos with a supply of their own may answer")
+            report.line(powered(line.bus, robot, bauds))
             found = census(line.bus, bauds, report.line)
         if not found.devices and not found.problems:
             raise BackendError(
@@ -47,7 +48,8 @@ def main(args: argparse.Namespace) -> int:
             )
         if found.skipped:
             report.line(f"this adapter cannot be set to {', '.join(map(str, found.skipped))} bit/s: nobody asked there")
-        problems = found.problems + [text for device in found.devices for text in misfits(device, robot)]
+        missing = absent(found, robot)
+        problems = found.problems + [text for each in found.devices for text in misfits(each, found, robot)]
         if not found.servos and not problems:
             problems.append(
                 "the board answers, but no servo does: is the cable from the board to the servos plugged in, and is "
@@ -57,7 +59,6 @@ def main(args: argparse.Namespace) -> int:
         stiff = [named(device, robot) for device in found.servos if device.get("torque_enable")]
         if stiff:
             report.line(f"torque is on at {', '.join(stiff)}: servoid bringup off turns it off")
-        missing = absent(found, robot)
         if missing:
             report.line(f"not on the bus at {robot.bus.baud} bit/s: {', '.join(missing)}")
         report.result(
@@ -71,6 +72,14 @@ def main(args: argparse.Namespace) -> int:
             }
         )
     return exit_codes.HARDWARE if problems else exit_codes.DONE
+
+
+def powered(bus: Bus, robot: Robot, bauds: tuple[int, ...] | list[int]) -> str:
+    """Switch the servos' power on where a board keeps it off; a line about it."""
+    from servoid.hw.dynamixel.servos.bus_scan import power_on
+
+    power = power_on(bus, robot.bus.board_id, _first(robot.bus.baud, bauds))
+    return power or f"no board with ID {robot.bus.board_id}: servos with a supply of their own may answer"
 
 
 def check_baud(baud: int) -> None:
@@ -100,8 +109,8 @@ def absent(found: Census, robot: Robot) -> list[str]:
     return [f"{joint.name} (ID {joint.id})" for joint in robot.joints if joint.name not in there]
 
 
-def misfits(device: Device, robot: Robot) -> list[str]:
-    """What a person should mend about a device, with the remedy."""
+def misfits(device: Device, found: Census, robot: Robot) -> list[str]:
+    """What a person should mend about a device, with the remedy; `found` are all."""
     from servoid.hw.faults import describe, remedy
 
     if device.is_board:
@@ -113,12 +122,16 @@ def misfits(device: Device, robot: Robot) -> list[str]:
     if error:
         texts.append(f"{device}: reports {', '.join(describe(error))}: {remedy(error)}")
     name = joint_of(device, robot)
+    also = device.get("secondary_id")
+    obeys = f"obeys ID {also} too (its secondary ID)" if also is not None and also <= MAX_ID else ""
     if name is None:
-        if device.baud == robot.bus.baud:
-            texts.append(f"{device}: no joint of {robot.name} has this ID: servoid bringup setup JOINT gives it one")
-        else:
-            texts.append(f"{device}: {robot.name} is at {robot.bus.baud} bit/s: servoid bringup setup JOINT adopts it")
+        there = device.baud == robot.bus.baud
+        what = f"no joint of {robot.name} has this ID" if there else f"{robot.name} is at {robot.bus.baud} bit/s"
+        setup = f"servoid bringup setup {_candidate(device, found, robot)}"
+        texts.append(f"{device}: {what}: {setup}" if not obeys else f"{device}: {obeys}: {setup}, then check --fix")
         return texts
+    if obeys:
+        texts.append(f"{device}: {obeys}: servoid bringup check --fix")
     servo = robot.servos[robot.names.index(name)]
     if device.model != servo.model_number:
         texts.append(f"{name} (ID {device.id}) is {device.name}, but the robot's file says {servo.name}: change either")
@@ -126,6 +139,15 @@ def misfits(device: Device, robot: Robot) -> list[str]:
     if volts is not None and not low <= volts <= high:
         texts.append(f"{name} (ID {device.id}) has {volts:.1f} V, outside {low:g} to {high:g} V: check the supply")
     return texts
+
+
+def _candidate(device: Device, found: Census, robot: Robot) -> str:
+    """The words of `setup` that make a servo that is no joint's yet one: of the joint whose ID it has at another baud,
+    or of the only one that is missing; else JOINT stands for what only a person knows."""
+    missing = [text.partition(" ")[0] for text in absent(found, robot)]
+    same = [joint.name for joint in robot.joints if joint.id == device.id and joint.name in missing]
+    joint = same[0] if same else missing[0] if len(missing) == 1 else "JOINT"
+    return f"{joint} --from {device.id} --from-baud {device.baud}"
 
 
 def described(device: Device, robot: Robot) -> dict[str, Any]:

@@ -11,12 +11,15 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.dynamixel.protocol.codec import MAX_ID, OVERHEAD
 from servoid.hw.dynamixel.protocol.tables import ControlTable, Item, table
-from servoid.hw.dynamixel.servos.register_check import RAM_BYTES, SERVO_BLOCKS, read_memory
+from servoid.hw.dynamixel.servos.register_check import EEPROM_BYTES, RAM_BYTES, SERVO_BLOCKS, read_memory
 from servoid.hw.dynamixel.transport.bus import LONGEST_RETURN_DELAY, Bus, Ping
+from servoid.hw.dynamixel.transport.openers import openers
 
 BAUDS = table("xm430-w350").bauds  # bit/s; the same for every model
 FACTORY_BAUD = 57600
 PATIENCE = 0.03  # s of margin for a bus on which nothing is known: adapters come with a latency timer of 16 ms
+LISTEN_SECONDS = 0.05  # to a line that should be silent
+ASKED = 6  # times that an ID is asked before two servos are blamed
 BOOT_SECONDS = 1.0  # after the servos' power was switched on
 BRAKE_SECONDS = 0.4  # with torque and without gain, before torque goes off: as a run ends
 OFF_TRIES = 4
@@ -196,6 +199,7 @@ def _ask_all(bus: Bus, baud: int, found: Census) -> None:
                 heard[id] = ping
             elif _broken(bus) - before > _ECHO:
                 garbled.add(id)
+    noise = _noise(bus)
     for ping in sorted(heard.values()):
         before = _broken(bus)
         device = _read(bus, ping, baud)
@@ -208,11 +212,48 @@ def _ask_all(bus: Bus, baud: int, found: Census) -> None:
             found.problems.append(
                 f"ID {ping.id} at {baud} bit/s answers a ping and nothing else: switch its power off and on"
             )
+    if not garbled:
+        return
+    shared = set() if noise else {id for id in garbled if _shared(bus, id)}
+    if others := openers(bus.port.name):
+        found.problems.append(
+            f"{', '.join(others)} uses the port as well and takes answers from here: end it first, then scan again"
+        )
+        return
     found.problems += [
-        f"ID {id} at {baud} bit/s answers garbled: two servos have this ID; unplug all but one of them and give it "
-        "another: servoid bringup setup"
-        for id in sorted(garbled)
+        f"ID {id} at {baud} bit/s answers garbled, however often it is asked: two servos have this ID; unplug all but "
+        f"one of them and give it another: servoid bringup setup --id N --from {id}"
+        for id in sorted(shared)
     ]
+    if damaged := sorted(garbled - shared):
+        heard_noise = f" (the line carries {noise} bytes that nobody asked for)" if noise else ""
+        found.problems.append(
+            f"answers of ID {', '.join(map(str, damaged))} at {baud} bit/s came damaged{heard_noise}: check cables, "
+            "plugs, termination and the ground, and what else is on the line; then scan again"
+        )
+
+
+def _noise(bus: Bus) -> int:
+    """Bytes that come while nobody was asked."""
+    bus.clock.sleep_until(bus.clock.now_ns() + round(LISTEN_SECONDS * 1e9))
+    bus.port.read()  # what was still due
+    bus.clock.sleep_until(bus.clock.now_ns() + round(LISTEN_SECONDS * 1e9))
+    return len(bus.port.read())
+
+
+def _shared(bus: Bus, id: int) -> bool:
+    """Whether what comes from an ID is never one whole answer: noise would let some through. What two servos measure
+    differs, though all that they are set to may be the same."""
+    for _ in range(ASKED):
+        counters = bus.counters
+        before = (counters.bad_crc, counters.garbage, counters.duplicates, counters.unexpected)
+        answer = bus.read(id, EEPROM_BYTES, RAM_BYTES, tries=1)
+        bus.clock.sleep_until(bus.clock.now_ns() + round(PATIENCE * 1e9))
+        more = bus.port.read()
+        after = (counters.bad_crc, counters.garbage, counters.duplicates, counters.unexpected)
+        if answer is not None and not more and after == before:
+            return False
+    return True
 
 
 def _read(bus: Bus, ping: Ping, baud: int) -> Device:

@@ -13,6 +13,7 @@ from servoid.hw.dynamixel.protocol.codec import MAX_ID
 from servoid.hw.dynamixel.protocol.tables import ControlTable, table
 from servoid.hw.dynamixel.protocol.units import Units
 from servoid.hw.dynamixel.transport.bus import Bus
+from servoid.hw.dynamixel.transport.openers import openers
 from servoid.hw.robot.description import Joint, Robot, Servo
 
 POSITION_MODE = 3
@@ -225,6 +226,8 @@ def _model(number: int) -> str:
 
 def _garbled(bus: Bus) -> str:
     counters = bus.counters
+    if others := openers(bus.port.name):
+        return f" ({', '.join(others)} uses the port as well: end it first)"
     if counters.bad_crc or counters.garbage:
         return " (something answers, but garbled: two servos may have the same ID, or another baud rate)"
     return ""

@@ -18,6 +18,7 @@ from typing import Protocol
 import serial
 
 from servoid.hw.contracts.body import BackendError, Clock
+from servoid.hw.dynamixel.transport.openers import openers
 
 WRITE_SECONDS = 0.02  # that an adapter may take to accept a packet: 40 times what the longest needs at 2 Mbit/s
 _POLL_NS = 50_000  # between looks while a line is drained
@@ -52,6 +53,8 @@ class SerialPort:
     def __init__(self, name: str | Path, baud: int) -> None:
         """Raises BackendError when it cannot be opened, with the remedy."""
         self.name = str(name)
+        if others := openers(self.name):
+            raise BackendError(f"{self.name}: another program has the port: {', '.join(others)}: end it first")
         try:
             self._serial = serial.Serial(self.name, baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
@@ -182,5 +185,7 @@ def _cannot_open(name: str, baud: int, error: Exception) -> str:
     if not os.access(name, os.R_OK | os.W_OK):
         return f"{name}: no permission: add yourself to the group that owns it (usually dialout) and log in again"
     if getattr(error, "errno", None) in (11, 16) or "lock" in str(error).lower():
-        return f"{name}: another program has the port: close it first ({error})"
+        return f"{name}: another program has the port: end it first (`sudo fuser -v {name}` names it)"
+    if "Inappropriate ioctl" in str(error):
+        return f"{name}: is no serial port: servoid bringup find-port lists them"
     return f"{name}: cannot be opened: {error}"

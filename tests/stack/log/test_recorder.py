@@ -29,7 +29,7 @@ from servoid.stack.safety.guard import Phase
 
 ROBOT = load_robot("op3")
 N = len(ROBOT.names)
-HEADER = {"format": FORMAT, "seed": 3}
+HEADER = {"format": FORMAT, "seed": 3, "robot": {"joints": [{"name": name} for name in ROBOT.names]}}
 
 
 def tick_record(tick: int, rng: np.random.Generator) -> TickRecord:

@@ -37,7 +37,7 @@ def bus_of(rig: RigProcess) -> Iterator[Bus]:
         port.close()
 
 
-def write(rig: RigProcess, id: int, **registers: int) -> None:
+def write(rig: RigProcess, id: int, /, **registers: int) -> None:
     with bus_of(rig) as bus:
         for name, value in registers.items():
             assert bus.write_item(id, XM430.item(name), value), name
@@ -62,7 +62,10 @@ def test_a_scan_lists_everybody_with_what_they_measure(rig: RigProcess, bringup:
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ({"kind": "id_conflict", "servo": "l_hip_yaw"}, "ID 8 at 2000000 bit/s answers garbled: two servos have this"),
+        (
+            {"kind": "id_conflict", "servo": "l_hip_yaw"},
+            "ID 8 at 2000000 bit/s answers garbled, however often it is asked: two",
+        ),
         ({"kind": "overheating", "servo": "l_knee"}, "ID 14, 2000000 bit/s: reports overheating: let it cool"),
     ],
 )
@@ -82,7 +85,7 @@ def test_a_servo_at_another_baud_is_found_there_and_missed_here(rig: RigProcess,
     assert found["missing"] == ["l_knee (ID 14)"]
     (stray,) = [device for device in found["devices"] if device["baud"] != 2000000]
     assert (stray["id"], stray["joint"]) == (KNEE, None)
-    assert "servoid bringup setup JOINT" in found["problems"][0]
+    assert f"servoid bringup setup l_knee --from 14 --from-baud {stray['baud']}" in found["problems"][0]
 
 
 def test_a_board_without_servos_and_a_line_without_anybody(rig: RigProcess, bringup: Any) -> None:
