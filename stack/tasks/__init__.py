@@ -67,11 +67,10 @@ def find(name: str) -> Known:
     plugin = load_plugin(name, GROUP, BaseTask, "task")
     if plugin is None:
         raise ConfigError(f"unknown task '{name}': {nearest(name, names())}")
-    own = {key: getattr(plugin.cls, key, None) for key in ("name", "description")}
-    for key, text in own.items():
-        if not isinstance(text, str):
-            raise plugin.error(f'{plugin.cls.__name__}: no {key}: add a line such as {key} = "..."')
-    return Known(str(own["name"]), plugin.cls, str(own["description"]), plugin)
+    cls: type[BaseTask] = plugin.cls
+    if not (cls.name and cls.description):
+        raise plugin.error(f'{cls.__name__}: say what it is: name = "..." and description = "..." in the class')
+    return Known(cls.name, cls, cls.description, plugin)
 
 
 def source(name: str) -> dict[str, Any] | None:

@@ -36,8 +36,8 @@ class Settings:
 class BaseTask:
     """A task but for what is asked and how a run is judged."""
 
-    name: str
-    description: str
+    name: str = ""
+    description: str = ""  # in a line
     settings_type: ClassVar[type[Settings]] = Settings
     steered: ClassVar[bool] = False  # by a person, who needs real time
     counts_undone: ClassVar[tuple[str, ...]] = ()  # metrics that hold of a run that never began, too

@@ -1,4 +1,4 @@
-"""Pass through keyframes of recorded motions at given times; what lies between them is the robot's affair."""
+"""Pass through keyframes of recorded motions at given times; how it gets from one to the next is up to the robot."""
 
 from __future__ import annotations
 

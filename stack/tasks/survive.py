@@ -18,7 +18,7 @@ from servoid.stack.tasks.walk import Commands, FollowCommands, Walk, WalkSetting
 class SurviveSettings(WalkSettings):
     told: Annotated[
         float,
-        Setting("time at the start in which a sentence says how to walk: at rest, a robot may rest on", "s", least=0),
+        Setting("time at the start in which a sentence says how to walk: at rest, a robot may stay so", "s", least=0),
     ] = 3.0
     tolerance: Annotated[
         float | None, Setting("largest mean velocity error of a success; none: not falling is enough", "m/s", above=0)

@@ -227,6 +227,8 @@ def _robel(host: SdkHost) -> None:
     """Torque one by one, goals in one write, ten bytes of each in a bulk read; without torque nothing moves."""
     ids = host.ids
     start = {id: read[2] for id, read in host.present(ids).items()}
+    for id, (_, velocity, _) in host.present(ids).items():
+        expect(f"velocity of ID {id} at rest", velocity, 0)
     for id in ids:
         host.check(f"torque {id}", *host.packets.write1ByteTxRx(host.port, id, _TORQUE, 1))
     for step in (10, 20, 0):

@@ -15,6 +15,7 @@ from typing import Any
 
 from servoid.hw.config import ConfigError, available
 from servoid.tools.common.exit_codes import exit_code, explain
+from servoid.tools.common.folder_lock import locked
 from servoid.tools.common.output import Report, add_json_argument, reporting
 from servoid.tools.common.parser import check_seed
 from servoid.tools.evaluate.report import HEAD, Measured, as_csv, cells, markdown, table
@@ -65,7 +66,8 @@ def main(args: argparse.Namespace) -> int:
         measured: Mapping[str, Measured]
         interrupt: Interrupted | None = None
         try:
-            measured = evaluate(rows, options, report.line)
+            with locked(options.out):
+                measured = evaluate(rows, options, report.line)
         except Interrupted as error:
             measured, interrupt = error.measured, error  # raised below, when what was done is told
         page = _Page(evaluation, options, rows, measured)

@@ -89,7 +89,9 @@ def interrupt(rig: Any, log: Path, dice: random.Random, again: bool) -> dict[str
             mark = controller.interrupt()
         code, guardian = controller.wait(), "servoid guardian" in controller.errors()
     off = first_taken(rig.control.accepted(), "torque_enable", 0, mark)
+    late = rig.control.call("lateness")
     return {
+        "rig_latest_ms": round(late["worst_ms"], 1),
         "at_s": round(at, 2),
         "torque": powered,
         "off": has_none(rig.control),
@@ -113,6 +115,7 @@ def summarise(every: list[dict[str, Any]]) -> dict[str, Any]:
         "guardian_needed": sum(row["guardian"] for row in rows),
         "median_ms": sorted(spent)[len(spent) // 2] if spent else None,
         "worst_ms": max(spent, default=None),
+        "rig_latest_ms": max((row["rig_latest_ms"] for row in rows), default=None),
         "void": len(every) - len(rows),
         "void_all_off": sum(row["off"] for row in every if "void" in row),
         "other_codes": sorted({row["code"] for row in rows if not (row["acknowledged"] or row["late"])}),

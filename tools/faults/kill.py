@@ -59,7 +59,8 @@ def measure(report: Report, kills: int, unguarded: int, dice: random.Random) -> 
                 void += 1
             else:
                 raise BackendError(f"{TRIES} walks in a row ended before they were killed: {row['void']}")
-    return summarise(rows, void)
+        late = rig.control.call("lateness")
+    return summarise(rows, void) | {"rig_late": late["times"], "rig_latest_ms": round(late["worst_ms"], 1)}
 
 
 def summarise(rows: list[dict[str, Any]], void: int) -> dict[str, Any]:

@@ -69,7 +69,7 @@ def soak(report: Report, args: argparse.Namespace) -> dict[str, Any]:
     events: list[str] = []
     with free_rig(args.robot, args.seed) as rig:
         body = DynamixelBackend(robot, port=rig.port)
-        watch = Watch(rig, robot.rate, args, report)
+        watch = SoakWatch(rig, robot.rate, args, report)
         try:
             result = run(settings, backend=body, on_tick=watch)
             outcome = result.outcome
@@ -78,6 +78,7 @@ def soak(report: Report, args: argparse.Namespace) -> dict[str, Any]:
             events = [str(error)]
         counters = body.counters
         struck = sum(each["count"] for each in rig.control.statistics()["struck"])
+        late_rig = rig.control.call("lateness")
     late = np.array(watch.late or [0.0])
     return {
         "minutes": watch.ticks / robot.rate / 60.0,
@@ -88,6 +89,8 @@ def soak(report: Report, args: argparse.Namespace) -> dict[str, Any]:
         "missed": watch.missed,
         "late_p50_ms": float(np.percentile(late, 50)),
         "late_p99_ms": float(np.percentile(late, 99)),
+        "rig_late": late_rig["times"],
+        "rig_latest_ms": late_rig["worst_ms"],
         "packets_struck": struck,
         "answers_lost": counters.lost,
         "answers_recovered": counters.recovered,
@@ -99,7 +102,7 @@ def soak(report: Report, args: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-class Watch:
+class SoakWatch:
     """Listens to a soak run: injects the losses, looks at the truth once a second, and at memory."""
 
     def __init__(self, rig: Any, rate: int, args: argparse.Namespace, report: Report) -> None:

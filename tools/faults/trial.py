@@ -138,7 +138,7 @@ def run_trial(trial: Trial) -> Verdict:
         seed=trial.seed,
         set={"vx": "0.1", "vy": "0", "yaw_rate": "0"},
     )
-    watch = _Watch(body, fault, tick)
+    watch = _TrialWatch(body, fault, tick)
     error = ""
     outcome = ""
     try:
@@ -152,7 +152,7 @@ def run_trial(trial: Trial) -> Verdict:
     return verdict
 
 
-class _Watch:
+class _TrialWatch:
     """Listens to a run, and injects the fault once."""
 
     def __init__(self, body: Witnessed, fault: dict[str, Any], tick: int) -> None:
@@ -178,7 +178,7 @@ class _Watch:
             self._body.inject(**self._fault)
 
 
-def _judge(verdict: Verdict, robot: Robot, body: Witnessed, watch: _Watch, outcome: str, error: str) -> None:
+def _judge(verdict: Verdict, robot: Robot, body: Witnessed, watch: _TrialWatch, outcome: str, error: str) -> None:
     if watch.began_ns is None:
         verdict.problems.append(f"the walk ended before the fault: {outcome} {error}".strip())
         return
@@ -220,7 +220,7 @@ def _off_seconds(accepted: list[dict[str, Any]], named_ns: int) -> float | None:
     return None if not first else (max(first.values()) - named_ns) * 1e-9
 
 
-def _detection(verdict: Verdict, body: Witnessed, watch: _Watch, error: str) -> int | None:
+def _detection(verdict: Verdict, body: Witnessed, watch: _TrialWatch, error: str) -> int | None:
     """Find what named the fault, and when by the rig's time [ns]. That of a servo must be named with its joint."""
     wanted = [] if verdict.joint is None else [verdict.joint]
     loud = [entry for entry in watch.events if entry[0].kind not in _QUIET_KINDS]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -23,20 +23,11 @@ if TYPE_CHECKING:
 
 def maker(robot: Robot, name: str) -> MakePolicy:
     """What makes a policy for worlds of a `shape`, by the policy's name or a checkpoint's file. Raises ConfigError."""
-    from servoid.policy.checkpoint import read_header, resolve
-    from servoid.stack.control.gait import GaitPolicy
-    from servoid.stack.control.tracker import ExpertPolicy
-
-    if name == "gait":
-        return partial(GaitPolicy, robot)
-    if read_header(resolve(name))["kind"] == "tracker":
-        return partial(ExpertPolicy, robot, name)
-    from servoid.policy.diffusion.settings import load_settings
-    from servoid.stack.control.diffusion import diffusion_policy
+    from servoid.stack.control.policies import check_policy, make_policy
     from servoid.stack.tasks import load_task
 
-    settings = replace(load_settings(), checkpoint=name)
-    return partial(diffusion_policy, robot, settings, load_task("walk", {}, robot.dt).objective)
+    check_policy(name)
+    return partial(make_policy, name, robot, load_task("walk", {}, robot.dt), False)
 
 
 def mixed(a: dict[str, Array], b: dict[str, Array], seed: int) -> dict[str, Array]:
@@ -69,10 +60,10 @@ def record(
         errors[:, k] = fleet.truth.velocity - fleet.estimator.leg_velocity
         starts[:, k] = start
         due = rng.random(worlds) < 1 / 150
-        command[due] = rng.uniform([-0.15, -0.13, -1.0], [0.5, 0.13, 1.0], (int(due.sum()), 3))
+        command[due] = rng.uniform(robot.walking.lower, robot.walking.upper, (int(due.sum()), 3))
         command[due] *= rng.random((int(due.sum()), 3)) < 0.7
         kicked = rng.random(worlds) < 1 / 100
-        angle, size = rng.uniform(-np.pi, np.pi, worlds), rng.uniform(0, 0.3, worlds) * kicked
+        angle, size = rng.uniform(-np.pi, np.pi, worlds), rng.uniform(0, 0.6 * robot.walking.forward, worlds) * kicked
         fleet.worlds.push(np.stack([size * np.cos(angle), size * np.sin(angle)], -1))
         target = policy.act(fleet.state, fleet.applied, Instruction(command))
         fleet.step(target, noise * rng.standard_normal(target.shape))
@@ -123,7 +114,7 @@ def drift(
     ticks, cycle = round(seconds * robot.rate), round(load_gait().cycle * robot.rate)
     for k in counted(ticks, "measuring"):
         if k % (5 * robot.rate) == 0:
-            low, high = [-0.1, -0.1, -0.8], [0.3, 0.1, 0.8]
+            low, high = np.array([[-0.2, -0.2, -0.8], [0.6, 0.2, 0.8]]) * robot.walking.scale
             command = np.array([rng.uniform(low, high) for rng in fleet.rngs])
         fleet.step(policy.act(state, fleet.applied, Instruction(command)))
         state = fleet.observe()

@@ -54,6 +54,7 @@ class Plant:
         self.constant = self.model.actuator_gainprm[:, _K].copy()  # V s/rad
         self.model.actuator_gainprm[:, _KP] = self.constant / self.resistance
         self._braking = np.array([servo.braking_torque for servo in robot.servos])
+        self._slowest = np.array([servo.velocity_unit / 2 for servo in robot.servos])  # rad/s that are no count
         self._noise = np.zeros((NOISE_ROWS, 6 + len(joints)))
         self._recent = np.zeros((max(round(robot.dt / TIMESTEP), 1), self.model.nsensordata))  # of the last tick
         views = (view[None] for view in (self.data.qpos, self.data.qvel, self.data.sensordata, self._recent))
@@ -173,9 +174,12 @@ class Plant:
 
     @property
     def encoder(self) -> tuple[Array, Array, Array]:
-        """What the servos have measured by now: angle [rad], speed [rad/s] with noise, torque [N m]."""
-        noise = VELOCITY_NOISE * self._row()[6:]
-        return self._angle[0] + self.body.zero, self._speed[0] + noise, self._force[0]
+        """What the servos have measured by now: angle [rad], speed [rad/s] with noise, torque [N m]. A servo that rests
+        measures no speed at all: its encoder shows the same tick again and again."""
+        speed = self._speed[0]
+        moving = np.abs(speed) > self._slowest
+        measured = np.where(moving, speed + VELOCITY_NOISE * self._row()[6:], 0.0)
+        return self._angle[0] + self.body.zero, measured, self._force[0]
 
     @property
     def imu(self) -> Array:

@@ -216,6 +216,22 @@ def test_indirect_addresses_lead_no_farther_than_the_model_s_ram(rig: Rig) -> No
         assert servo.write(168, (63).to_bytes(2, "little"), 0) is StatusError.DATA_RANGE
 
 
+def test_a_servo_at_rest_reads_no_velocity_and_one_that_moves_a_noisy_one(host: Host) -> None:
+    """Programs wait for zero to know that a joint has stopped."""
+    host.rig.auto_release = False
+    host.torque_on([19])
+    host.wait(0.5)
+    assert {host.read(id, "present_velocity") for id in host.ids for _ in range(5)} == {0}
+    host.write(19, "profile_velocity", 40)
+    host.write(19, "goal_position", host.read(19, "present_position") + 500)
+    host.wait(0.3)
+    moving = [host.read(19, "present_velocity") for _ in range(10)]
+    assert all(35 < velocity < 45 for velocity in moving)
+    assert len(set(moving)) > 1
+    host.wait(1.0)
+    assert [host.read(19, "present_velocity") for _ in range(5)] == [0] * 5
+
+
 def test_small_servos_live_on_the_voltage_of_their_own_file(robot: Robot, tmp_path: Path) -> None:
     """An XL330 runs on 5 V, where one of 12 V would be dead."""
     file = tmp_path / "xl330.yaml"

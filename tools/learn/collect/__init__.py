@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
+from servoid.tools.common.folder_lock import locked
 from servoid.tools.common.output import add_json_argument, reporting
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
     }
     settings = DisturbanceSettings(scale=(args.noise[0], args.noise[1]))
     schema = Schema(robot.name, robot.rate, _features(robot), tuple(skill.text for skill in SKILLS))
-    with DatasetWriter(args.out, schema, args.force) as writer:
+    with locked(args.out), DatasetWriter(args.out, schema, args.force) as writer:
         fleet = Fleet(robot, args.worlds, odometry, randomise=args.randomise, seed=args.seed, threads=args.threads)
         cutter = EpisodeCutter(fleet, policy, settings, args.seconds)
         with tqdm(total=args.frames, desc="walking", unit="frame", mininterval=1.0) as bar:

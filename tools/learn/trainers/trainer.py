@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import yaml
 
 from servoid.hw.config import ConfigError
+from servoid.tools.common.folder_lock import locked
 from servoid.tools.learn.flags import add_setting_flags, plain
 from servoid.tools.learn.progress import ProgressLine
 from servoid.tools.learn.settings import Run
@@ -172,6 +173,10 @@ class Trainer(ABC):
 
     def run(self) -> None:
         """Train until the budget is used up. Interrupted, it saves what is needed to go on, and the newest network."""
+        with locked(self.out):
+            self._run()
+
+    def _run(self) -> None:
         from servoid.tools.learn.trainers.logger import Logger
 
         print(f"training {self.title}, {self.length}, in {self.out}", file=sys.stderr)
@@ -233,6 +238,7 @@ class Trainer(ABC):
             text = ", ".join(f"{name} {value:.4g}" for name, value in results.items())
             line.write(f"step {self.step:,}, {self.seconds / 60:.1f} min: {text}{' (best)' if better else ''}")
         logger.plot(self.out / "learning_curve.png", self.panels, x="minutes")
+        line.note(f"step {self.step:,}")
 
     # -- files ---------------------------------------------------------------------------------------------------------
 
