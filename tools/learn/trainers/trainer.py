@@ -238,6 +238,7 @@ class Trainer(ABC):
             text = ", ".join(f"{name} {value:.4g}" for name, value in results.items())
             line.write(f"step {self.step:,}, {self.seconds / 60:.1f} min: {text}{' (best)' if better else ''}")
         logger.plot(self.out / "learning_curve.png", self.panels, x="minutes")
+        line.note(f"step {self.step:,}")
 
     # -- files ---------------------------------------------------------------------------------------------------------
 
