@@ -104,13 +104,14 @@ def _measure(
     """Zeros [rad] and directions `(n_joints,)`."""
     import numpy as np
 
-    from servoid.hw.dynamixel.servos.bus_scan import BAUDS, power_on
+    from servoid.hw.dynamixel.servos.bus_scan import BAUDS
     from servoid.hw.dynamixel.servos.register_check import find_servos
     from servoid.hw.dynamixel.transport.bus import LONGEST_RETURN_DELAY
     from servoid.tools.bringup.calibration.encoders import Encoders, short
     from servoid.tools.bringup.calibration.hands import Person, VirtualHands
+    from servoid.tools.bringup.scan import powered
 
-    power_on(line.bus, robot.bus.board_id, [robot.bus.baud, *BAUDS])
+    powered(line.bus, robot, BAUDS)
     if line.bus.port.baud != robot.bus.baud:
         line.bus.set_baud(robot.bus.baud)
     line.bus.return_delay = LONGEST_RETURN_DELAY  # until the servos' own is known

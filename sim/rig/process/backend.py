@@ -58,7 +58,7 @@ class VirtualBackend:
         if self._rig is not None:
             raise BackendError("the virtual rig is connected already")
         try:
-            rig = self._rig = RigProcess(self._robot, seed=self._seed, randomise=self._randomise)
+            rig = self._rig = RigProcess(on_the_board(self._robot), seed=self._seed, randomise=self._randomise)
             if self.stage is not None:
                 rig.control.furnish(self.stage.scene, self._seed, randomise=self._randomise)
             self._rig_truth = rig.truth(None if self.stage is None else self.stage.scene)

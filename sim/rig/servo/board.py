@@ -76,5 +76,8 @@ def _euler(w: float, x: float, y: float, z: float) -> tuple[float, float, float]
 
 
 def on_the_board(robot: Robot) -> Robot:
-    """The robot with its IMU on the bus, mounted as it is: a virtual rig has no other."""
-    return replace(robot, imu=replace(robot.imu, kind="opencr", port=None))
+    """The robot with its IMU on the bus, mounted as it is: a virtual rig has no other, and lends a robot without a
+    board one for its IMU. Without an IMU the robot is as it is."""
+    if robot.imu.kind == "none":
+        return robot
+    return replace(robot, bus=replace(robot.bus, board="opencr"), imu=replace(robot.imu, kind="opencr", port=None))
