@@ -100,7 +100,7 @@ def test_of_a_network_that_was_trained_by_steps_the_minutes_do_not_matter(tmp_pa
     ("share", "told"),
     [
         (0.42, r"last\.safetensors: only 42\.0% of its training is done; continue it: `servoid train .*--horizon 24`"),
-        (None, r"last\.safetensors does not record .* train it again: `servoid train .*--horizon 24 --no-resume`"),
+        (None, r"last\.safetensors: does not record .* train it again: `servoid train .*--horizon 24 --no-resume`"),
     ],
 )
 def test_a_half_trained_network_fills_no_row(tmp_path: Path, share: float | None, told: str) -> None:
