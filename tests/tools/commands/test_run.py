@@ -74,9 +74,14 @@ def test_live_line_summary_and_log_for_a_person(capsys):
     assert main(RUN) == 0
     out = capsys.readouterr().out
     assert "asked +0.10 +0.00 m/s" in out
-    assert "goal met after 2.0 s" in out
+    assert "goal met after 2.02 s (times count from the start of the task)" in out
     (log,) = [line.split()[-1] for line in out.splitlines() if "log:" in line]
     assert read_log(log).complete
+
+
+def test_what_the_robot_cannot_do_is_said_before_it_tries(capsys):
+    main(["run", "walk", "--policy", "gait", "--seconds", "0.2", "--set", "vx=9"])
+    assert capsys.readouterr().out.startswith("vx=9 is more than op3 can: 0.5 m/s at most that way")
 
 
 def test_a_fall_is_exit_code_1(capsys):
