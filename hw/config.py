@@ -109,6 +109,8 @@ def parse_number(text: str, hint: type[int] | type[float]) -> int | float:
         value = int(text, 0) if hint is int else float(text)
     except ValueError:
         kind = "a whole number" if hint is int else "a number"
+        if text.lower().lstrip("+-") in (".inf", ".nan"):  # as YAML writes them
+            raise ValueError("a finite number") from None
         unit = re.fullmatch(r"[-+]?[\d.]+(?:e[-+]?\d+)?\s*([a-z%°][\w/%°²^]*)", text, re.IGNORECASE)
         if unit:
             kind += f" without the unit '{unit[1]}': units are fixed (m, rad, s, N m, V, degrees C)"
@@ -174,6 +176,8 @@ class _Reader:
             line = name_node.start_mark.line + 1
             name_key = _join(key, str(name_node.value)) if isinstance(name_node, yaml.ScalarNode) else key
             self.marks.lines.setdefault(name_key, line)
+            if name_node.tag == "tag:yaml.org,2002:merge":
+                self.fail(name_key, "keys of another part cannot be merged in here: write them out")
             name = self.scalar(name_node, str, name_key, "key")
             if name in items:
                 first = self.marks.lines[_join(key, name)]

@@ -17,6 +17,7 @@ from servoid.hw.dynamixel.protocol import codec
 from servoid.hw.dynamixel.protocol.codec import ALERT, OVERHEAD
 from servoid.hw.dynamixel.protocol.tables import ControlTable
 from servoid.hw.dynamixel.transport.port import SerialPort
+from servoid.hw.user_folders import user_folder
 
 READY_SECONDS = 5.0  # that a busy machine may take to start it; torque waits for that
 CLOSE_SECONDS = guardian.GIVE_UP_SECONDS + 1.0
@@ -141,8 +142,8 @@ def plan(port: SerialPort, ids: Sequence[int], table: ControlTable, return_delay
 def log_path() -> Path | None:
     """Where guardians write down what they did, as the terminal may be gone with the controller; None for a user
     without a home."""
-    state = Path(os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state"))
-    return state / "servoid" / "guardian.log" if state.is_absolute() else None
+    folder = user_folder("XDG_STATE_HOME", ".local/state")
+    return None if folder is None else folder / "guardian.log"
 
 
 def _proofs(id: int) -> list[bytes]:

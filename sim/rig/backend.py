@@ -58,7 +58,7 @@ class VirtualBackend:
         if self._rig is not None:
             raise BackendError("the virtual rig is connected already")
         try:
-            rig = self._rig = RigProcess(self._robot, seed=self._seed, randomise=self._randomise)
+            rig = self._rig = RigProcess(on_the_board(self._robot), seed=self._seed, randomise=self._randomise)
             if self.stage is not None:
                 rig.control.furnish(self.stage.scene, self._seed, randomise=self._randomise)
             self._rig_truth = rig.truth(None if self.stage is None else self.stage.scene)
@@ -100,8 +100,11 @@ class VirtualBackend:
 
 
 def on_the_board(robot: Robot) -> Robot:
-    """The robot with its IMU on the bus, mounted as it is: a virtual rig has no other."""
-    return replace(robot, imu=replace(robot.imu, kind="opencr", port=None))
+    """The robot with its IMU on the bus, mounted as it is: a virtual rig has no other, and lends a robot without a
+    board one for its IMU. Without an IMU the robot is as it is."""
+    if robot.imu.kind == "none":
+        return robot
+    return replace(robot, bus=replace(robot.bus, board="opencr"), imu=replace(robot.imu, kind="opencr", port=None))
 
 
 class VirtualClock:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -62,6 +62,8 @@ class Rig:
         factory_state: FactoryState | None = None,
     ) -> None:
         self.factory_state, self.scenario = factory_state or FactoryState(), scenario or Scenario()
+        if robot.bus.board == "none":
+            self.factory_state = replace(self.factory_state, board=False)
         self.factory_state.check(robot)
         robot = self.robot = self.factory_state.assembled(robot, seed)
         self.plant = Plant(robot)

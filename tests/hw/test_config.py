@@ -62,6 +62,9 @@ def test_reads_what_people_write(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "line", "words"),
     [
+        (("  kp: 8", "  kp: .inf"), 5, "gains.kp: expected a finite number, got the number '.inf'"),
+        (("  kp: 8", "  kp: -.NaN"), 5, "gains.kp: expected a finite number"),
+        (("  kp: 8", "  <<: {kp: 8}"), 5, "gains.<<: keys of another part cannot be merged in here: write them out"),
         (("  kp: 8", "  kpp: 8"), 5, "gains.kpp: unknown key; did you mean 'kp'"),
         (("id: 7\n", ""), 1, "missing key 'id'"),
         (("  kp: 8", "  kd: 8"), 4, "gains: missing key 'kp'"),

@@ -30,7 +30,8 @@ def main(args: argparse.Namespace) -> int:
             find_board(line.bus, robot)
             found = find_servos(line.bus, robot)
             before = left = compare(robot, found)
-            report.line(f"{len(found)} servos and the board answer; {len(before)} registers differ")
+            board = "" if robot.bus.board == "none" else " and the board"
+            report.line(f"{len(found)} servos{board} answer; {len(before)} registers differ")
             if before:
                 report.line(as_table(before))
             stiff = [f"{servo.joint.name} (ID {servo.joint.id})" for servo in found if servo.get("torque_enable")]

@@ -89,7 +89,7 @@ def main(args: argparse.Namespace) -> int:
             result = run(plan, on_tick=live, confirm=partial(confirm, remedy="give --start to let the robot move"))
         finally:
             live.close()
-            _tell_lateness(report, args.port)
+            tell_lateness(report, args.port)
         files: dict[str, Any] = {"log": result.log}
         for text in summary(result, report.columns):
             report.line(text)
@@ -103,7 +103,7 @@ def main(args: argparse.Namespace) -> int:
     return EXIT_CODES[result.outcome]
 
 
-def _tell_lateness(report: Report, port: str | None) -> None:
+def tell_lateness(report: Report, port: str | None) -> None:
     """Of a virtual rig in real time: what it kept waiting is not the cable's fault."""
     if port is not None and Path(port + ".control").is_socket():  # where `servoid virtual --link` puts it
         from servoid.hw.contracts.body import BackendError

@@ -15,6 +15,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.robot.description import Robot, load_robot
+from servoid.sim.rig.backend import on_the_board
 from servoid.sim.rig.faults import EXPECTED, KINDS, NEEDS_SERVO, STATUS_KINDS, Outcome
 from servoid.sim.rig.in_process import InProcessBackend
 from servoid.sim.rig.rig import Rig
@@ -103,7 +104,7 @@ class Witnessed(InProcessBackend):
 @cache
 def _rig(robot: str) -> Rig:
     """A rig for one trial after the other."""
-    return Rig(load_robot(robot))
+    return Rig(on_the_board(load_robot(robot)))
 
 
 def fault_of(trial: Trial, robot: Robot) -> tuple[dict[str, Any], int, str | None]:
