@@ -156,7 +156,7 @@ def _prepare_video(path: Path) -> None:
 def _film(report: Report, log: Path, path: Path) -> dict[str, Path]:
     """Video and plot of a run; where they cannot be made, the reason. The run itself has succeeded or not before."""
     from servoid.stack.log.flightlog import read_log
-    from servoid.tools.common.video import VideoError, make_video
+    from servoid.tools.common.pictures.video import VideoError, make_video
 
     made: dict[str, Path] = {}
     failures = (VideoError, ConfigError, OSError, ValueError)  # a full disk, say, or no encoder

@@ -19,7 +19,7 @@ from servoid.stack.safety.guard import Phase
 from servoid.tools.cli import main
 from servoid.tools.commands import replay
 from servoid.tools.commands.rollout import episode, judge
-from servoid.tools.common import flightpath
+from servoid.tools.common.pictures import flightpath
 
 NEAR = {"robots": "2", "circle": "0.4", "spread": "0"}  # head-on, so that a run is short
 BLIND = NEAR | {"passing.apart": "0.001"}

@@ -17,8 +17,8 @@ from servoid.stack.log.flightlog import read_log
 from servoid.stack.runtime.run import RunSettings, prepare, run
 from servoid.tools.commands import replay
 from servoid.tools.commands.rollout import episode, simulation
-from servoid.tools.common import flightpath
 from servoid.tools.common.ground_truth import GroundTruth
+from servoid.tools.common.pictures import flightpath
 
 
 def test_who_walks_into_a_pillar_fails_by_the_truth() -> None:

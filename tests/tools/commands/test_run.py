@@ -17,7 +17,7 @@ import pytest
 from servoid.hw.config import ConfigError
 from servoid.stack.log.flightlog import read_log
 from servoid.tools.cli import main
-from servoid.tools.common.video import VideoError
+from servoid.tools.common.pictures.video import VideoError
 
 RUN = ["run", "walk", "--policy", "gait", "--seconds", "2", "--set", "vx=0.1"]
 
@@ -226,7 +226,7 @@ def test_a_disk_that_fills_up_ends_the_run_safe(tmp_path):
     ],
 )
 def test_without_a_way_to_draw_the_run_still_succeeds(error, tmp_path, monkeypatch, capsys):
-    from servoid.tools.common import video
+    from servoid.tools.common.pictures import video
 
     def broken(*_):
         raise error
@@ -240,7 +240,7 @@ def test_without_a_way_to_draw_the_run_still_succeeds(error, tmp_path, monkeypat
 
 
 def test_a_picture_that_cannot_be_written_leaves_the_result_alone(tmp_path, monkeypatch, capsys):
-    from servoid.tools.common import video
+    from servoid.tools.common.pictures import video
 
     monkeypatch.setattr(video, "make_video", lambda *_: None)
     (tmp_path / "a.png").mkdir()
