@@ -22,10 +22,9 @@ from servoid.stack.tasks.obstacle import Obstacle
 from servoid.stack.tasks.path import Path
 from servoid.stack.tasks.stand import Stand
 from servoid.stack.tasks.steer import Steer
-from servoid.stack.tasks.survive import Survive
 from servoid.stack.tasks.text import Text
 from servoid.stack.tasks.velocity import Velocity
-from servoid.stack.tasks.walk import Walk
+from servoid.stack.tasks.walk import Survive, Walk
 
 GROUP = "servoid.tasks"  # of entry points
 

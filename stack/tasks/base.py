@@ -15,7 +15,7 @@ from servoid.hw.contracts.task import Behaviour, Criterion, Episode, Objective, 
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.hw.setting import Setting, asks, check
-from servoid.stack.tasks.guidance import Weights, total_cost
+from servoid.stack.tasks.terms.guidance import Weights, total_cost
 
 
 @dataclass(frozen=True)

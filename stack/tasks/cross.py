@@ -16,8 +16,8 @@ from servoid.hw.setting import Setting
 from servoid.policy.references.gait import load_gait
 from servoid.stack.navigation.collision_avoidance import AvoidanceSettings, Motion, bearing_past
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
-from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.terms import metrics as measures
 
 _ROOM = 0.7  # m between neighbours at the start and at the end: none is in the way of another who stands
 

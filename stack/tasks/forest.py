@@ -18,8 +18,8 @@ from servoid.hw.setting import Setting
 from servoid.policy.references.gait import load_gait
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.navigation.potential_field import FieldSettings, PotentialField
-from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.terms import metrics as measures
 
 Pillar = tuple[float, float, float]
 _RENEWAL = 0.5  # s after which a field is computed anew where pillars are seen elsewhere: odometry drifts

@@ -20,8 +20,8 @@ from servoid.hw.setting import Range, Setting
 from servoid.policy.references.gait import load_gait
 from servoid.policy.text.captions import MOTIONS
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
-from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.terms import metrics as measures
 from servoid.stack.tasks.text import understood
 
 

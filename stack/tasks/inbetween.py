@@ -17,7 +17,7 @@ from servoid.hw.contracts.world import Percept
 from servoid.hw.geometry import to_heading, turned
 from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Setting
-from servoid.policy.diffusion.features import Layout, raw_layout
+from servoid.policy.features import Layout, raw_layout
 from servoid.stack.log.flightlog import FlightLog, read_log
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 

@@ -13,8 +13,8 @@ from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.setting import Setting
-from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.terms import metrics as measures
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.setting import Setting
 from servoid.policy.references.gait import load_gait
-from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.terms import metrics as measures
 
 Point = tuple[float, float]
 _SPACING = 0.01  # m between the points of a path

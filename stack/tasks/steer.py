@@ -14,8 +14,8 @@ from servoid.hw.contracts.world import Percept
 from servoid.hw.setting import Setting
 from servoid.policy.references.gait import load_gait
 from servoid.stack.control.operator import Controls, Steering, open_steering
-from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.terms import metrics as measures
 
 Stick = Literal["leftx", "lefty", "rightx", "righty"]
 

@@ -17,8 +17,8 @@ from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Setting
 from servoid.policy.references.gait import load_gait
 from servoid.policy.text.captions import MOTIONS, followed, twist_of
-from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.terms import metrics as measures
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from servoid.hw.contracts.world import Percept
 from servoid.hw.geometry import turned
 from servoid.hw.setting import Range, Setting
 from servoid.policy.references.gait import load_gait
-from servoid.stack.tasks import metrics as measures
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.terms import metrics as measures
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ def main(args: argparse.Namespace) -> int:
         id, baud, model = _wanted(args, robot)
         factory_state = None
         if is_virtual(args):
-            from servoid.sim.rig.factory_state import FactoryState
+            from servoid.sim.rig.servo.factory_state import FactoryState
 
             alone = (args.joint or robot.joints[0].name,)
             factory_state = FactoryState(fresh=alone, only=alone)

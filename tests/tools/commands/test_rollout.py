@@ -25,6 +25,7 @@ from servoid.stack.safety.guard import Phase
 from servoid.tools.cli import main
 from servoid.tools.commands import rollout
 from servoid.tools.common.ground_truth import GroundTruth
+from servoid.tools.evaluate.judge import judge
 
 WORDS = ["walk", "--policy", "gait", "--seconds", "3", "--episodes", "2", "--seed", "3"]
 KEYS = {
@@ -64,7 +65,7 @@ def test_an_episode_can_be_run_again_by_its_seed() -> None:
     seed = episode_seed(3, 1)
     assert seed == episode_seed(3, 1) != episode_seed(3, 0)
     job = RunSettings(task="walk", policy="gait", seconds=2.0, seed=seed, randomise=True, set={"push": "0.1"})
-    row = rollout.episode(job)
+    row = judge(job).row
     backend = SimBackend(load_robot(), seed=seed, randomise=True)
     ground_truth = GroundTruth(backend.simulation, 0.02)
     again = run(job, backend=backend, on_tick=ground_truth)
@@ -85,17 +86,18 @@ def test_an_episode_that_cannot_be_done_does_not_take_the_others_with_it(
 ) -> None:
     done = []
 
-    def episode(job: RunSettings) -> dict:
+    def episode(job: RunSettings) -> SimpleNamespace:
         if len(done) == 2:
             raise BackendError("the rig did not answer")
         done.append(job.seed)
-        return {
+        row = {
             "seed": job.seed, "success": True, "fell": False, "aborted": False, "fell_ending": False, "seconds": 3.0,
             "metrics": {},
             "odometry_error_m": 0.01,
         }  # fmt: skip
+        return SimpleNamespace(row=row)
 
-    monkeypatch.setattr(rollout, "episode", episode)
+    monkeypatch.setattr("servoid.tools.evaluate.judge.judge", episode)
     words = [*WORDS, "--json", "--workers", "1", "--episodes"]
     assert main(["rollout", *words, "5"]) == 3
     out, err = capfd.readouterr()
@@ -114,10 +116,10 @@ def test_many_episodes_take_no_more_memory_than_one() -> None:
     code = """
         from pathlib import Path
         from servoid.stack.runtime.run import RunSettings
-        from servoid.tools.commands.rollout import episode
+        from servoid.tools.evaluate.judge import judge
         sizes = []
         for seed in range(6):
-            episode(RunSettings("goal", seed=seed, seconds=0.5))
+            judge(RunSettings("goal", seed=seed, seconds=0.5))
             sizes.append(int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6)
         print(max(sizes[1:]) - sizes[0])
     """
@@ -142,7 +144,7 @@ def test_success_is_by_the_truth_and_only_of_whole_runs(
     monkeypatch.setattr("servoid.stack.runtime.run.run", lambda *a, **k: result)
     monkeypatch.setattr(GroundTruth, "trace", lambda self: trace(fallen))
     monkeypatch.setattr(GroundTruth, "odometry_error", lambda self, estimate: 0.01)
-    row = rollout.episode(RunSettings(task="walk", policy="gait"))
+    row = judge(RunSettings(task="walk", policy="gait")).row
     assert (row["success"], row["fell"], row["aborted"]) == (success, fell, outcome == "stopped")
 
 
@@ -157,7 +159,7 @@ def test_a_run_that_is_told_to_end_is_no_episode_even_where_its_task_was_done(mo
 
     monkeypatch.setattr(GroundTruth, "__call__", lambda self, record: told(record))
     with pytest.raises(KeyboardInterrupt):
-        rollout.episode(RunSettings(task="stand", policy="gait", seconds=0.5))
+        judge(RunSettings(task="stand", policy="gait", seconds=0.5))
     assert lowering
 
 
@@ -166,7 +168,7 @@ def test_a_run_that_never_began_is_counted_and_not_a_crash(monkeypatch: pytest.M
     for task in ("walk", "goal", "stand", "text"):
         result = SimpleNamespace(outcome="stopped", seconds=0.0, trace=trace(False), interrupted=False)
         monkeypatch.setattr("servoid.stack.runtime.run.run", lambda *a, result=result, **k: result)
-        row = rollout.episode(RunSettings(task=task, policy="gait"))
+        row = judge(RunSettings(task=task, policy="gait")).row
         assert (row["success"], row["fell"], row["aborted"]) == (False, False, True)
         assert row["metrics"] == ({"followed_share": 0.0} if task == "text" else {})
         good = {

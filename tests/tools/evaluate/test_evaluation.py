@@ -232,7 +232,7 @@ def test_an_episode_that_ctrl_c_ended_is_not_kept(tmp_path: Path, monkeypatch: p
     def judge(settings: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("servoid.tools.commands.rollout.judge", judge)
+    monkeypatch.setattr("servoid.tools.evaluate.judge.judge", judge)
     with pytest.raises(KeyboardInterrupt):
         evaluate([NEAR], options(tmp_path), do_episode)
     assert not any('"episode"' in path.read_text() for path in (tmp_path / "episodes").glob("*.jsonl"))
