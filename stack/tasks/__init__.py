@@ -108,5 +108,6 @@ def load_task(name: str, settings: dict[str, str] | None = None, dt: float = 0.0
 
 
 __all__ = [
-    "BaseBehaviour", "BaseTask", "Settings", "TaskEntry", "beyond", "find", "load_settings", "load_task", "names", "source",
+    "BaseBehaviour", "BaseTask", "Settings", "TaskEntry",
+    "beyond", "find", "load_settings", "load_task", "names", "source",
 ]  # fmt: skip
