@@ -16,6 +16,7 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
+from servoid.policy.checkpoint import Origin
 from servoid.policy.diffusion.model.config import DenoiserConfig, DenoiserShape, TrainingObjective
 from servoid.policy.features import token_layout
 from servoid.policy.text.encoder import load_encoder
@@ -223,21 +224,11 @@ class DiffusionTrainer(Trainer):
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
         """See `Trainer.ship`."""
-        from servoid.policy.diffusion.model import checkpoint
+        from servoid.policy.diffusion.model.checkpoint import Trained, save
 
-        checkpoint.save(
-            path,
-            self.average.weights,
-            self.config,
-            self.windows.states,
-            self.windows.actions,
-            self.robot,
-            data=self.source,
-            licence=self.settings.licence,
-            results=results,
-            training=plain(self.settings),
-            latents=self.windows.latents,
-        )
+        windows = self.windows
+        trained = Trained(self.average.weights, self.config, windows.states, windows.actions, windows.latents)
+        save(path, trained, self.robot, Origin(self.source, self.settings.licence, results, plain(self.settings)))
 
     def state(self) -> dict[str, Any]:
         """See `Trainer.state`."""
