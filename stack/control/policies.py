@@ -53,8 +53,16 @@ def _gait(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[in
     return policy
 
 
+def _clip(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
+    from servoid.policy.motion.clip import load
+    from servoid.stack.control.clip import ClipPolicy
+
+    policy: Policy = ClipPolicy(robot, load(Path(source), robot), shape)
+    return policy
+
+
 POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "gait": _gait}
-_KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert}  # of checkpoints
+_KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert, "clip": _clip}  # of .safetensors files
 
 
 def _own(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
@@ -81,7 +89,7 @@ def make_policy(name: str, robot: Robot, task: Task, realtime: bool, shape: tupl
     """A policy for a robot and a task, or for worlds of any leading `shape`.
 
     Raises ConfigError for an unknown name, or for a checkpoint that does not fit. `name` is one of POLICIES, the
-    .safetensors file of a diffusion model or a tracker, a .yaml file of diffusion settings, an installed package's, or
+    .safetensors file of a diffusion model, a tracker or a clip, a .yaml file of diffusion settings, an installed package's, or
     `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is
     for.
     """
@@ -99,7 +107,7 @@ def policy_fingerprint(name: str) -> dict[str, Any]:
     maker = _maker(name)
     planner = _planner(name) if maker is _diffusion else None
     own = _plugin(name) if maker is _own else None
-    named = name if maker is _expert else None if planner is None else planner.checkpoint
+    named = name if maker in (_expert, _clip) else None if planner is None else planner.checkpoint
     checkpoint = None if named is None else resolve(named)
     return {
         "name": name,
