@@ -11,7 +11,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Episode, Trace
+from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.setting import Range, Setting
 from servoid.policy.references.gait import load_gait
@@ -24,9 +24,12 @@ _COMPONENTS = ("vx", "vy", "yaw_rate")
 
 @dataclass(frozen=True)
 class WalkSettings(Settings):
-    vx: Annotated[Range, Setting("forward; with one component given, the others are 0", "m/s")] = (-0.1, 0.3)
-    vy: Annotated[Range, Setting("to the left", "m/s")] = (-0.1, 0.1)
-    yaw_rate: Annotated[Range, Setting("turning left", "rad/s")] = (-0.8, 0.8)
+    vx: Annotated[Range, Setting("forward; with one component given, the others are 0", "m/s", asks="forward")] = (
+        -0.1,
+        0.3,
+    )
+    vy: Annotated[Range, Setting("to the left", "m/s", asks="left")] = (-0.1, 0.1)
+    yaw_rate: Annotated[Range, Setting("turning left", "rad/s", asks="turning")] = (-0.8, 0.8)
     every: Annotated[float, Setting("time between changes of the command", "s", above=0)] = 5.0
     push: Annotated[Range, Setting("size of each push, in a random direction", "m/s", least=0)] = (0.0, 0.0)
     push_every: Annotated[float, Setting("time between pushes", "s", above=0)] = 1.0
@@ -69,11 +72,16 @@ class Walk(BaseTask):
     def behaviour(self, episode: Commands) -> BaseBehaviour:
         return FollowCommands(episode, self.ticks(self.settings.every))
 
-    def success(self, trace: Trace, episode: Episode) -> bool:
+    def criteria(self, trace: Trace, episode: Episode) -> list[Criterion]:
         """Never fallen, and the velocity followed, as far as the run was long enough for a gait cycle that counts."""
+        found = [
+            Criterion.never("fell", trace.fallen),
+            Criterion.never("ended before it began", len(trace.displacement) == 0),
+        ]
         error, tolerance = measures.velocity_error(trace, self.settings.cycle), self.settings.tolerance
-        followed = tolerance is None or not error > tolerance
-        return followed and not trace.fallen and len(trace.displacement) > 0
+        if tolerance is not None and not math.isnan(error):
+            found.append(Criterion("mean velocity error", error, "m/s", most=tolerance))
+        return found
 
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
         return {
