@@ -66,7 +66,7 @@ def look_up(args: Namespace, verb: Verb) -> None:
         given = settings(args) if hasattr(args, "set") else {}
         tasks.load_settings(task, given)
     if verb.module in ("servoid.tools.commands.run", "servoid.tools.commands.rollout"):
-        assert args.policy in POLICIES
+        assert args.policy in POLICIES or (ROOT / args.policy).is_file()
         assert args.backend in BACKENDS
 
 

@@ -89,9 +89,9 @@ def make_policy(name: str, robot: Robot, task: Task, realtime: bool, shape: tupl
     """A policy for a robot and a task, or for worlds of any leading `shape`.
 
     Raises ConfigError for an unknown name, or for a checkpoint that does not fit. `name` is one of POLICIES, the
-    .safetensors file of a diffusion model, a tracker or a clip, a .yaml file of diffusion settings, an installed package's, or
-    `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is
-    for.
+    .safetensors file of a diffusion model, a tracker or a clip, a .yaml file of diffusion settings, an installed
+    package's, or `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it answers at the tick that
+    its plan is for.
     """
     return _maker(name)(name, robot, task, realtime, shape)
 
