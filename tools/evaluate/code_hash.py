@@ -13,7 +13,6 @@ PACKAGES = ("hw", "sim", "policy", "stack")  # checkpoints among them are hashed
 JUDGES = (
     "tools/common/ground_truth.py",
     "tools/common/motion_quality.py",
-    "tools/commands/rollout.py",
     "tools/evaluate/episode.py",
 )
 
