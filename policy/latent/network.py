@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from servoid.hw.contracts.body import Array
-from servoid.policy.diffusion.features import Normaliser
+from servoid.policy.features import Normaliser
 from servoid.policy.latent.actions import LatentActions, LatentConfig
 from servoid.policy.latent.proprioception import proprioception
 from servoid.policy.mlp import Mlp

@@ -14,7 +14,7 @@ from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.control import Policy
 from servoid.hw.contracts.task import Assignment, Behaviour, Task
 from servoid.hw.contracts.world import Scene
-from servoid.hw.robot.calibration import calibrated
+from servoid.hw.dynamixel.calibration import calibrated
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.hw.seeds import Stream, generator
 from servoid.stack.control.policies import make_policy, policy_fingerprint

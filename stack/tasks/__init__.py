@@ -13,7 +13,7 @@ from servoid.hw.contracts.task import Task
 from servoid.hw.overrides import override
 from servoid.hw.plugins import Plugin, installed, load_plugin
 from servoid.hw.robot.description import Robot
-from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings, beyond
 from servoid.stack.tasks.cross import Cross
 from servoid.stack.tasks.forest import Forest
 from servoid.stack.tasks.goal import Goal
@@ -22,10 +22,9 @@ from servoid.stack.tasks.obstacle import Obstacle
 from servoid.stack.tasks.path import Path
 from servoid.stack.tasks.stand import Stand
 from servoid.stack.tasks.steer import Steer
-from servoid.stack.tasks.survive import Survive
 from servoid.stack.tasks.text import Text
 from servoid.stack.tasks.velocity import Velocity
-from servoid.stack.tasks.walk import Walk
+from servoid.stack.tasks.walk import Survive, Walk
 
 GROUP = "servoid.tasks"  # of entry points
 
@@ -108,4 +107,15 @@ def load_task(name: str, settings: dict[str, str] | None = None, dt: float = 0.0
     return task
 
 
-__all__ = ["BaseBehaviour", "BaseTask", "Known", "Settings", "find", "load_settings", "load_task", "names", "source"]
+__all__ = [
+    "BaseBehaviour",
+    "BaseTask",
+    "Known",
+    "Settings",
+    "beyond",
+    "find",
+    "load_settings",
+    "load_task",
+    "names",
+    "source",
+]

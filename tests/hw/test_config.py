@@ -135,7 +135,7 @@ def test_what_is_shipped_is_found_by_its_path_from_everywhere(tmp_path: Path, mo
     """The pages name it so; an installed package is not where one works."""
     monkeypatch.chdir(tmp_path)
     assert resolve("policies", "configs/policies/uniphys.yaml") == CONFIGS / "policies" / "uniphys.yaml"
-    with pytest.raises(ConfigError, match="configs/policies/unifys.yaml: no such file; .*shipped: .*uniphys"):
+    with pytest.raises(ConfigError, match=r"configs/policies/unifys\.yaml: no such file; .*shipped: .*uniphys"):
         resolve("policies", "configs/policies/unifys.yaml")
     own = tmp_path / "configs" / "policies" / "uniphys.yaml"
     own.parent.mkdir(parents=True)

@@ -23,8 +23,8 @@ from servoid.tools.common.output import Report, reporting
 from servoid.tools.common.prompt import confirm
 
 if TYPE_CHECKING:
+    from servoid.hw.dynamixel.calibration import Calibration, JointCalibration
     from servoid.hw.dynamixel.servos.register_check import Found
-    from servoid.hw.robot.calibration import Calibration, JointCalibration
     from servoid.tools.bringup.calibration.encoders import Encoders
     from servoid.tools.bringup.calibration.hands import Hands
 
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
-        from servoid.hw.robot.calibration import apply, calibration_path, check_writable
+        from servoid.hw.dynamixel.calibration import apply, calibration_path, check_writable
 
         robot = load_robot(args.robot)
         virtual = is_virtual(args)
@@ -71,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
         reference = _reference(args.pose, robot)
         factory_state = None
         if virtual:
-            from servoid.sim.rig.factory_state import FactoryState
+            from servoid.sim.rig.servo.factory_state import FactoryState
 
             factory_state = FactoryState(assembly="random")
         with open_line(args, robot, factory_state=factory_state, seed=args.seed) as line:
@@ -104,13 +104,14 @@ def _measure(
     """Zeros [rad] and directions `(n_joints,)`."""
     import numpy as np
 
-    from servoid.hw.dynamixel.servos.bus_scan import BAUDS, power_on
+    from servoid.hw.dynamixel.servos.bus_scan import BAUDS
     from servoid.hw.dynamixel.servos.register_check import find_servos
     from servoid.hw.dynamixel.transport.bus import LONGEST_RETURN_DELAY
     from servoid.tools.bringup.calibration.encoders import Encoders, short
     from servoid.tools.bringup.calibration.hands import Person, VirtualHands
+    from servoid.tools.bringup.scan import powered
 
-    power_on(line.bus, robot.bus.board_id, [robot.bus.baud, *BAUDS])
+    powered(line.bus, robot, BAUDS)
     if line.bus.port.baud != robot.bus.baud:
         line.bus.set_baud(robot.bus.baud)
     line.bus.return_delay = LONGEST_RETURN_DELAY  # until the servos' own is known
@@ -228,7 +229,7 @@ def keep(result: Calibration, path: Path) -> Path | None:
 
     Returns the earlier one's new name. Raises ConfigError.
     """
-    from servoid.hw.robot.calibration import as_text, save_calibration
+    from servoid.hw.dynamixel.calibration import as_text, save_calibration
 
     try:
         return save_calibration(result, path)
@@ -252,7 +253,7 @@ def _earlier(path: Path | None, robot: Robot, chosen: list[int], keep: bool) -> 
     whole = len(chosen) == len(robot.joints)
     if path is None or (whole and not (keep and path.exists())):
         return {}
-    from servoid.hw.robot.calibration import load_calibration
+    from servoid.hw.dynamixel.calibration import load_calibration
 
     if not path.exists():
         raise ConfigError(f"{path}: no such calibration yet: calibrate all joints first, without --joint")
@@ -272,7 +273,7 @@ def _calibration(
     earlier: Mapping[str, JointCalibration],
     pose: str,
 ) -> Calibration:
-    from servoid.hw.robot.calibration import Calibration, JointCalibration
+    from servoid.hw.dynamixel.calibration import Calibration, JointCalibration
 
     joints = {}
     for i, (joint, servo) in enumerate(zip(robot.joints, robot.servos, strict=True)):

@@ -39,7 +39,7 @@ def main(args: argparse.Namespace) -> int:
         robot = assembled(args, report)
         with open_line(args, robot, patient=False) as line, ExitStack() as stack:
             imu = None
-            if robot.imu.kind != "opencr" and not is_virtual(args):  # a virtual rig has it on its board
+            if robot.imu.kind not in ("opencr", "none") and not is_virtual(args):  # a virtual rig has it on its board
                 from servoid.hw.imu.serial_imu import SerialImu
 
                 imu = SerialImu(robot.imu, robot.rate, clock=line.clock)

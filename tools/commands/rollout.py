@@ -22,15 +22,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
+from servoid.tools.common.compare import difference_table, differences, summarise, table
 from servoid.tools.common.exit_codes import exit_code, explain
 from servoid.tools.common.folder_lock import locked
 from servoid.tools.common.output import Report, add_json_argument, reporting
 from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, positive, settings
 from servoid.tools.common.worker_pool import each
 from servoid.tools.evaluate.cache import EpisodeCache, depends_on, key
-from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult, judge
+from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult
+from servoid.tools.evaluate.judge import judge
 from servoid.tools.evaluate.progress import EpisodeBar, Forecast
-from servoid.tools.evaluate.summary import difference_table, differences, summarise, table
 
 if TYPE_CHECKING:
     from servoid.stack.runtime.run import RunSettings

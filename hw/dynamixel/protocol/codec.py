@@ -20,6 +20,7 @@ BROADCAST = 0xFE
 MAX_ID = 252
 ALERT = 0x80  # bit of the error byte: the hardware error register is not zero; the packet's data are valid
 MAX_LENGTH = 2048  # bytes of a packet that a parser waits for: above anything that 253 servos send in a control cycle
+FRAME_BITS = 10  # of a byte on the line: start, eight of data, stop
 OVERHEAD = 11  # bytes of a status packet without data
 FAST_HEAD, FAST_BLOCK = 8, 4  # bytes of a fast frame before its first block, and of a block without data
 

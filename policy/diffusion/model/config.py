@@ -14,8 +14,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError
-from servoid.policy.diffusion.features import raw_layout, token_layout
 from servoid.policy.diffusion.model.masks import check_mask
+from servoid.policy.features import raw_layout, token_layout
 from servoid.policy.text.encoder import code_size
 
 KIND = "diffusion"  # of a checkpoint

@@ -17,7 +17,7 @@ from servoid.hw.contracts.body import Array, BackendError
 from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.description import Robot, load_robot, save_robot
 from servoid.sim.model import build
-from servoid.sim.rig.factory_state import FactoryState
+from servoid.sim.rig.servo.factory_state import FactoryState
 from servoid.sim.scene import plain, scene_sensors
 from servoid.sim.truth import Truth
 
@@ -91,7 +91,7 @@ class Control:
         self.call("press", buttons=buttons)
 
     def inject(self, kind: str, **fault: Any) -> None:
-        """Inject a fault of `servoid.sim.rig.faults`, its times counted from now."""
+        """Inject a fault of `servoid.sim.rig.wire.faults`, its times counted from now."""
         self.call("inject", fault={"kind": kind, **fault})
 
     def accepted(self) -> list[dict[str, Any]]:

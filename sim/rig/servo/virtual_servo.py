@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 from servoid.hw.dynamixel.protocol.codec import StatusError
 from servoid.hw.dynamixel.protocol.tables import Item, table
-from servoid.sim.rig.factory_state import ticks_per_turn
 from servoid.sim.rig.servo.device import VirtualDevice
+from servoid.sim.rig.servo.factory_state import ticks_per_turn
 from servoid.sim.rig.servo.firmware import CURRENT, CURRENT_POSITION, EXTENDED, FULL_PWM, POSITION, PWM
 from servoid.sim.rig.servo.motor_bank import MotorBank
 

@@ -11,12 +11,12 @@ import struct
 from collections.abc import Iterable, Iterator, Sequence
 
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import HEADER, Instruction, Packet, Parser, Status, StatusError
+from servoid.hw.dynamixel.protocol.codec import FRAME_BITS, HEADER, Instruction, Packet, Parser, Status, StatusError
 from servoid.hw.dynamixel.protocol.crc import crc16
-from servoid.sim.rig.faults import MISSPOKEN, STATUS_KINDS, Chunk, FaultInjector
 from servoid.sim.rig.servo.device import VirtualDevice
 from servoid.sim.rig.wire import protocol1
-from servoid.sim.rig.wire.half_duplex import FRAME_BITS, Wire, same_baud
+from servoid.sim.rig.wire.faults import MISSPOKEN, STATUS_KINDS, Chunk, FaultInjector
+from servoid.sim.rig.wire.half_duplex import Wire, same_baud
 
 TURNAROUND_NS = 2_000  # from the last byte of a request to the first of the reply, at return delay 0
 _SILENCE_NS = 1_500_000  # a packet that stops for so long is given up

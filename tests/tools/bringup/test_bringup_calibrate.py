@@ -15,7 +15,7 @@ import pytest
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array, BackendError
-from servoid.hw.robot.calibration import (
+from servoid.hw.dynamixel.calibration import (
     Calibration,
     JointCalibration,
     calibrated,
@@ -25,8 +25,8 @@ from servoid.hw.robot.calibration import (
 )
 from servoid.hw.robot.description import load_robot
 from servoid.sim.model import build
-from servoid.sim.rig.factory_state import FactoryState
 from servoid.sim.rig.process.control import LockedClock, RigProcess
+from servoid.sim.rig.servo.factory_state import FactoryState
 from servoid.tools.bringup import calibrate
 from servoid.tools.bringup.calibrate import MOVED, check_range, directions_of, turned
 from servoid.tools.bringup.calibration.encoders import Encoders

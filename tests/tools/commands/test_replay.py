@@ -16,7 +16,7 @@ from servoid.stack.runtime.run import RunSettings, Script, run
 from servoid.stack.safety.event import Event
 from servoid.tools.cli import main
 from servoid.tools.commands.replay import changes, replay
-from servoid.tools.common.flightpath import plans
+from servoid.tools.common.pictures.flightpath import plans
 
 
 def test_what_a_policy_is_made_of_is_in_the_log_and_changes_are_named(tmp_path: Path) -> None:

@@ -24,9 +24,10 @@ from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.safety.guard import Phase
 from servoid.tools.commands import rollout
+from servoid.tools.common.compare import summarise
 from servoid.tools.common.ground_truth import GroundTruth
-from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult, judge
-from servoid.tools.evaluate.summary import summarise
+from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult
+from servoid.tools.evaluate.judge import judge
 
 WORDS = ["walk", "--policy", "gait", "--seconds", "3", "--episodes", "2", "--seed", "3"]
 KEYS = {
@@ -127,7 +128,7 @@ def test_many_episodes_take_no_more_memory_than_one() -> None:
     code = """
         from pathlib import Path
         from servoid.stack.runtime.run import RunSettings
-        from servoid.tools.evaluate.episode import judge
+        from servoid.tools.evaluate.judge import judge
         sizes = []
         for seed in range(6):
             judge(RunSettings("goal", seed=seed, seconds=0.5))

@@ -24,6 +24,7 @@ from servoid.tools.evaluate.spec import Experiment
         "configs/servos/xm430-w350.yaml",
         "tools/common/ground_truth.py",
         "tools/common/motion_quality.py",
+        "tools/evaluate/judge.py",
         "tools/evaluate/episode.py",
     ],
 )

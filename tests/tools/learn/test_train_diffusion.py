@@ -13,7 +13,7 @@ import torch
 from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import read_header
-from servoid.policy.diffusion.dataset import Windows, read_recording
+from servoid.policy.diffusion.dataset import Windows
 from servoid.policy.diffusion.model.checkpoint import load
 from servoid.policy.diffusion.model.config import DenoiserConfig, Objective
 from servoid.policy.diffusion.model.denoiser import Denoiser
@@ -28,6 +28,7 @@ from servoid.policy.diffusion.objective import (
 )
 from servoid.policy.diffusion.schedule import cosine_signal
 from servoid.policy.diffusion.settings import load_settings
+from servoid.policy.recording import read_recording
 from servoid.stack.control import fleet
 from servoid.tools.learn.settings import DiffusionTraining
 from servoid.tools.learn.survival import closed_loop_survival

@@ -12,8 +12,9 @@ from test_train_diffusion import CONFIG, QUICK, ROBOT, Measured, trainer
 
 from servoid.hw.config import ConfigError
 from servoid.policy.checkpoint import read_header
-from servoid.policy.diffusion.dataset import Windows, read_recording
+from servoid.policy.diffusion.dataset import Windows
 from servoid.policy.latent.dataset import Demonstrations
+from servoid.policy.recording import read_recording
 from servoid.tools.learn.progress import ProgressLine
 from servoid.tools.learn.settings import LatentTraining
 from servoid.tools.learn.trainers import latent

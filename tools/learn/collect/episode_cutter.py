@@ -10,7 +10,7 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Policy
-from servoid.policy.diffusion.features import raw_layout, raw_row
+from servoid.policy.features import raw_layout, raw_row
 from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.collect.disturbances import Disturbances, DisturbanceSettings
 from servoid.tools.learn.collect.skills import Commands

@@ -22,7 +22,7 @@ from servoid.tools.learn.progress import ProgressLine
 from servoid.tools.learn.settings import Run
 
 if TYPE_CHECKING:
-    from servoid.policy.diffusion.dataset import Recording
+    from servoid.policy.recording import Recording
     from servoid.tools.learn.trainers.logger import Logger
 
 # From a checkpoint's path to what was measured of it where it runs; "survival" in it is the share of worlds that stayed

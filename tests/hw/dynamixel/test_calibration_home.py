@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from servoid.hw.config import ConfigError
-from servoid.hw.dynamixel.guardian_client import log_path
-from servoid.hw.robot.calibration import (
+from servoid.hw.dynamixel.calibration import (
     Calibration,
     JointCalibration,
     as_text,
@@ -20,6 +19,7 @@ from servoid.hw.robot.calibration import (
     load_calibration,
     save_calibration,
 )
+from servoid.hw.dynamixel.guardian_client import log_path
 from servoid.hw.robot.description import load_robot
 from servoid.tools.bringup.calibrate import keep
 
