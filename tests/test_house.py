@@ -196,5 +196,18 @@ def test_a_circle_is_seen() -> None:
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == {frozenset("abc")}
 
 
+def classes(code: str) -> Iterator[str]:
+    return (node.name for node in ast.walk(ast.parse(code)) if isinstance(node, ast.ClassDef))
+
+
+def test_a_class_name_stands_for_one_thing() -> None:
+    """Two things of one name are told apart by their imports alone, and in a log or an error by nothing."""
+    where: dict[str, list[str]] = {}
+    for path in (path for package in BELOW for path in sources(package)):
+        for found in classes(path.read_text()):
+            where.setdefault(found, []).append(name(path))
+    assert {found: paths for found, paths in where.items() if len(paths) > 1} == {}
+
+
 def test_configs_hold_data_alone() -> None:
     assert {path.suffix for path in (ROOT / "configs").rglob("*") if path.is_file()} <= {".yaml", ".xml"}

@@ -32,7 +32,7 @@ Tick = dict[str, list[dict[str, Any]]]  # channel -> its messages of one tick
 
 
 @dataclass(frozen=True)
-class Difference:
+class Divergence:
     tick: int
     channel: str
     field: str
@@ -72,7 +72,7 @@ def main(args: argparse.Namespace) -> int:
     return exit_codes.DONE if difference is None else exit_codes.FAILED
 
 
-def replay(log: FlightLog, done: Callable[[], object] = lambda: None) -> tuple[int, Difference | None]:
+def replay(log: FlightLog, done: Callable[[], object] = lambda: None) -> tuple[int, Divergence | None]:
     """Repeat a log's run: how many ticks were compared, and the first difference. `done` hears of each tick.
 
     Raises ConfigError.
@@ -198,17 +198,17 @@ def _by_tick(log: FlightLog) -> dict[int, Tick]:
     return ticks
 
 
-def _difference(number: int, recorded: Tick | None, repeated: Tick | None) -> Difference | None:
+def _difference(number: int, recorded: Tick | None, repeated: Tick | None) -> Divergence | None:
     if recorded is None or repeated is None:
-        return Difference(number, "/run", "length: " + ("the repetition is longer" if repeated else "it ended earlier"))
+        return Divergence(number, "/run", "length: " + ("the repetition is longer" if repeated else "it ended earlier"))
     compared = [name for name in recorded.keys() | repeated.keys() if MACHINE_DEPENDENT.get(name, ()) is not None]
     for channel in sorted(compared):
         before, after = recorded.get(channel, []), repeated.get(channel, [])
         if len(before) != len(after):
-            return Difference(number, channel, f"{len(before)} messages, now {len(after)}")
+            return Divergence(number, channel, f"{len(before)} messages, now {len(after)}")
         ignored = MACHINE_DEPENDENT.get(channel) or ()
         for old, new in zip(before, after, strict=True):
             for field in sorted(old.keys() | new.keys()):
                 if field not in ignored and old.get(field) != new.get(field):
-                    return Difference(number, channel, field)
+                    return Divergence(number, channel, field)
     return None

@@ -14,7 +14,7 @@ from servoid.hw.config import CONFIGS
 from servoid.hw.contracts.body import BackendError, Command, Mode
 from servoid.hw.dynamixel.backend import DynamixelBackend
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import Instruction
+from servoid.hw.dynamixel.protocol.codec import InstructionCode
 from servoid.hw.dynamixel.servos.register_check import as_table
 
 
@@ -171,7 +171,7 @@ def test_a_robot_may_mix_models(robot: Robot, tmp_path: Path) -> None:
     motors.write(active())
     assert all(servo.get("torque_enable") for servo in robot.servos)
     assert robot.servos[0].get("position_d_gain") == 4000, "the model's own"
-    assert Instruction.FAST_SYNC_READ not in {p.instruction for p in robot.line.sent}
+    assert InstructionCode.FAST_SYNC_READ not in {p.instruction for p in robot.line.sent}
 
 
 def test_a_port_must_be_named() -> None:
@@ -213,7 +213,7 @@ def test_a_servo_that_has_torque_gets_no_gain_before_its_goal(robot: Robot) -> N
 
     def watch(packet: codec.Packet) -> None:
         robot.live()
-        goals = packet.instruction == Instruction.SYNC_WRITE and packet.params[:2] == b"\x68\x00"
+        goals = packet.instruction == InstructionCode.SYNC_WRITE and packet.params[:2] == b"\x68\x00"
         knee.answers = not (goals and deaf[0] > 0)
         deaf[0] -= goals
         if knee.get("torque_enable") and knee.get("position_p_gain"):
@@ -288,7 +288,7 @@ def test_goals_and_gains_follow_the_command(robot: Robot) -> None:
     target = ROBOT.home + 0.1
     sent = len(robot.line.sent)
     motors.write(active(target))
-    assert [p.instruction for p in robot.line.sent[sent:]] == [Instruction.SYNC_WRITE], "one packet a tick"
+    assert [p.instruction for p in robot.line.sent[sent:]] == [InstructionCode.SYNC_WRITE], "one packet a tick"
     elbow = robot.joint("l_el")
     assert elbow.get("goal_position") == 2048 + round((-0.5 + 0.1) / 2 / np.pi * 4096)
     motors.write(active(target, gain=0.25))
@@ -308,7 +308,7 @@ def test_damping_keeps_torque_with_no_gain_and_off_is_acknowledged(robot: Robot)
 
     def lose(packet: codec.Packet) -> None:
         """The first packets to switch torque off do not reach the left knee."""
-        off = packet.instruction == Instruction.SYNC_WRITE and packet.params[:2] == b"\x40\x00"
+        off = packet.instruction == InstructionCode.SYNC_WRITE and packet.params[:2] == b"\x40\x00"
         robot.joint("l_knee").answers = not (off and deaf[0] > 0)
         deaf[0] -= off
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
-from servoid.policy.diffusion.model.config import DenoiserConfig, DenoiserShape, Objective
+from servoid.policy.diffusion.model.config import DenoiserConfig, DenoiserShape, TrainingObjective
 from servoid.policy.features import token_layout
 from servoid.policy.text.encoder import load_encoder
 from servoid.tools.learn.flags import plain, read_settings
@@ -216,7 +216,7 @@ class DiffusionTrainer(Trainer):
         states, actions, text = self.windows.held_out(count)
         # The same measure whatever else is trained for, so that runs can be compared.
         same = self.settings
-        measure = Objective(same.inference_delay, same.near_actions, same.far_actions, monotone=0.0)
+        measure = TrainingObjective(same.inference_delay, same.near_actions, same.far_actions, monotone=0.0)
         with torch.inference_mode():
             given = states, actions, text, self.signal, torch.Generator().manual_seed(0)
             return losses(network, *given, measure)[1].item()
