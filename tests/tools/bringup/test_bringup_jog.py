@@ -97,7 +97,7 @@ def test_wrong_words(bringup: Any, words: tuple[str, ...], said: str) -> None:
 
 
 def test_beyond_the_range_is_refused_before_torque(rig: RigProcess, bringup: Any) -> None:
-    rig.control.move({"l_knee": 2.1})
+    rig.control.move({"l_knee": float(ROBOT.upper[ROBOT.names.index("l_knee")]) - 0.1})
     code, answer, _ = bringup("jog", "l_knee", "--by", "0.2", *VIRTUAL, "--start")
     assert code == 2
     assert "l_knee can go from -0.350 to +0.0" in answer["error"]
