@@ -18,6 +18,7 @@ from servoid.stack import tasks
 from servoid.stack.control.policies import names as policies
 from servoid.stack.runtime.backends import BACKENDS
 from servoid.tools.cli import VERBS, Verb, main
+from servoid.tools.commands import rollout
 from servoid.tools.common.parser import Parser, settings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -66,7 +67,8 @@ def look_up(args: Namespace, verb: Verb) -> None:
         given = settings(args) if hasattr(args, "set") else {}
         tasks.load_settings(task, given)
     if verb.module in ("servoid.tools.commands.run", "servoid.tools.commands.rollout"):
-        assert set(args.policy if isinstance(args.policy, list) else [args.policy or "diffusion"]) <= {*policies()}
+        given = [args.policy] if isinstance(args.policy, str) else rollout.policies(args.policy)
+        assert {*given} <= {*policies()}
         assert args.backend in BACKENDS
 
 
