@@ -60,9 +60,17 @@ def _gait(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[in
     return policy
 
 
+def _clip(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
+    from servoid.policy.motion.clip import load
+    from servoid.stack.control.clip import ClipPolicy
+
+    policy: Policy = ClipPolicy(robot, load(Path(source), robot), shape)
+    return policy
+
+
 # Policies of Servoid's own; besides there are the planner's other settings in configs/policies/.
 POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "gait": _gait}
-_KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert}  # of checkpoints
+_KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert, "clip": _clip}  # of .safetensors files
 
 
 def _own(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
@@ -101,9 +109,9 @@ def make_policy(
     """A policy for a robot and a task, or for worlds of any leading `shape`.
 
     Raises ConfigError for an unknown name, or for a checkpoint that does not fit. `name` is one of `names`, the
-    .safetensors file of a diffusion model or a tracker, a .yaml file of diffusion settings, or `FILE.py:Class`. With
-    `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is for. `planner` holds the
-    settings of a recorded diffusion policy: no file is read for them then.
+    .safetensors file of a diffusion model, a tracker or a clip, a .yaml file of diffusion settings, or
+    `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is
+    for. `planner` holds the settings of a recorded diffusion policy: no file is read for them then.
     """
     if planner is not None:
         return _planned(planner, robot, task, realtime, shape)
@@ -121,7 +129,7 @@ def policy_fingerprint(name: str) -> dict[str, Any]:
     maker = _maker(name)
     planner = _planner(name) if maker is _diffusion else None
     own = _plugin(name) if maker is _own else None
-    named = name if maker is _expert else None if planner is None else planner.checkpoint
+    named = name if maker in (_expert, _clip) else None if planner is None else planner.checkpoint
     checkpoint = None if named is None else resolve(named)
     return {
         "name": name,
@@ -151,7 +159,7 @@ def _maker(name: str) -> Maker:
     if file.suffix or file.name != name:
         what = "no file of a policy" if file.exists() else "no such file"
         raise ConfigError(
-            f"{name}: {what}: give a checkpoint (.safetensors), settings of the diffusion policy (.yaml), your own "
-            f"FILE.py:Class, or a name: {', '.join(names())}"
+            f"{name}: {what}: give a checkpoint or a clip (.safetensors), settings of the diffusion policy (.yaml), "
+            f"your own FILE.py:Class, or a name: {', '.join(names())}"
         )
     raise ConfigError(f"unknown policy '{name}': {nearest(name, names())}")
