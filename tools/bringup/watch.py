@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from servoid.hw.robot.description import Robot
 from servoid.tools.bringup.line import Line, add_line_arguments, assembled, is_virtual, open_line
-from servoid.tools.commands.run import positive
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, reporting
+from servoid.tools.common.parser import positive
 
 if TYPE_CHECKING:
     from servoid.hw.contracts.body import Observation
