@@ -13,7 +13,7 @@ import pytest
 from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import Imu, Joint, Limits, Link, Robot, Walking, load_robot
 from servoid.policy.checkpoint import REQUIRED
-from servoid.policy.diffusion.features import raw_layout
+from servoid.policy.features import raw_layout
 from servoid.sim.model import build
 from servoid.sim.worlds import Worlds
 from servoid.stack.log.format import SCHEMAS

@@ -43,7 +43,7 @@ class Observation:
     orientation: Array  # (..., 4) quaternion w x y z of the IMU's own fusion
     angular_velocity: Array  # (..., 3) rad/s, base frame
     specific_force: Array  # (..., 3) m/s2, base frame: +9.81 on z when level and still
-    imu_age: Array  # (...,) s
+    imu_age: Array  # (...,) s; NaN: the robot has no IMU
 
 
 @dataclass(frozen=True, slots=True)

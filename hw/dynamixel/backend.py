@@ -73,7 +73,7 @@ class DynamixelBackend:
             raise
 
     def _connect(self, bus: Bus) -> tuple[DynamixelSensors, DynamixelMotors]:
-        if self._robot.imu.kind != "opencr":
+        if self._robot.imu.kind not in ("opencr", "none"):
             self._imu = SerialImu(self._robot.imu, self._robot.rate, clock=self.clock)
         bus.return_delay = LONGEST_RETURN_DELAY  # until the servos' own is known
         find_board(bus, self._robot)

@@ -16,6 +16,7 @@ from servoid.hw.dynamixel.transport.bus import Bus
 from servoid.hw.dynamixel.transport.group_read import GroupRead
 from servoid.hw.faults import LATE
 from servoid.hw.imu.mounting import Mounting
+from servoid.hw.imu.reading import Reading
 from servoid.hw.imu.serial_imu import SerialImu
 from servoid.hw.robot.description import Robot
 
@@ -46,7 +47,9 @@ class DynamixelSensors:
     ) -> None:
         self._bus, self._units, self._monitor, self._present, self._imu = bus, units, monitor, present, imu
         self._block = BoardImu(table("opencr"), Mounting(robot.imu.signs, robot.imu.mounting))
-        self._board = GroupRead([(robot.bus.board_id, self._block.address, self._block.length)])
+        parts = [(robot.bus.board_id, self._block.address, self._block.length)] if robot.bus.board != "none" else []
+        self._board = GroupRead(parts)
+        self._no_imu = robot.imu.kind == "none"
         self._stop = sum({BUTTONS[name] for name in robot.bus.stop_buttons})
         self._late: deque[bool] = deque(maxlen=LATE_SPAN)
         self._short: deque[bool] = deque(maxlen=LATE_SPAN)
@@ -55,16 +58,13 @@ class DynamixelSensors:
         """All joints, the IMU, and a few servos' slow registers. A value that did not come at this tick is NaN."""
         bus, group = self._bus, self._present
         lost, stray = bus.counters.lost, bus.counters.stray
-        bus.sync_read(group, self._board)
+        bus.sync_read(*((group, self._board) if self._board.ids else (group,)))
         position, velocity, current = self._decode()
-        fresh = self._board.fresh[0]
-        reading = self._block.update(self._board.data[0] if fresh else None, self._board.time_ns[0])
-        if self._imu is not None:
-            reading = self._imu.read()
+        reading = self._read_imu()
         self._monitor.press(self._block.buttons & self._stop != 0)
         self._monitor.look(group.alert, hurry=not all(group.fresh))
         self._late.append(bus.counters.lost > lost and bus.counters.stray > stray)
-        self._short.append(not (fresh and all(group.fresh)))
+        self._short.append(not (all(self._board.fresh) and all(group.fresh)))
         late = LATE if sum(self._late) >= LATE_TICKS or sum(self._short) >= SHORT_TICKS else 0
         now = bus.clock.now_ns()
         return Observation(
@@ -79,8 +79,18 @@ class DynamixelSensors:
             orientation=reading.orientation,
             angular_velocity=reading.angular_velocity,
             specific_force=reading.specific_force,
-            imu_age=np.asarray(_age(now, reading.time_ns)),
+            imu_age=np.asarray(np.nan if self._no_imu else _age(now, reading.time_ns)),
         )
+
+    def _read_imu(self) -> Reading:
+        """The IMU's newest sample; the board's buttons are in the same block. Without an IMU nothing, and no fault."""
+        reading = Reading(None, 0)
+        if self._board.ids:
+            fresh = self._board.fresh[0]
+            reading = self._block.update(self._board.data[0] if fresh else None, self._board.time_ns[0])
+        if self._imu is not None:
+            return self._imu.read()
+        return Reading(None, 0) if self._no_imu else reading
 
     def _decode(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Raw position, velocity and current `(n_joints,)` as floats, NaN where they did not come."""

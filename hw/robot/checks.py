@@ -86,7 +86,9 @@ def _check_imu(robot: Robot, marks: Marks) -> None:
             raise marks.error(f"imu.signs[{i}]" if i < 3 else "imu.yaw_sign", f"must be 1 or -1, not {sign:g}")
     for i, angle in enumerate(imu.mounting):
         _require_radians(angle, f"imu.mounting[{i}]", marks)
-    if imu.kind == "opencr":
+    if imu.kind == "opencr" and robot.bus.board == "none":
+        raise marks.error("imu.kind", "the board's IMU, but bus.board is none: name another kind, or none")
+    if imu.kind in ("opencr", "none"):
         if imu.port is not None:
             raise marks.error(
                 "imu.port", "the board's IMU is on the servo bus: drop the port, or name another imu.kind"
@@ -101,7 +103,7 @@ def _check_imu(robot: Robot, marks: Marks) -> None:
 def _check_identity(robot: Robot, marks: Marks) -> None:
     """Names and servo IDs are unique, IDs exist on the bus, servo models are known."""
     names: dict[str, int] = {}
-    ids = {robot.bus.board_id: "the board (bus.board_id)"}
+    ids = {robot.bus.board_id: "the board (bus.board_id)"} if robot.bus.board != "none" else {}
     for i, joint in enumerate(robot.joints):
         if joint.name in names:
             first = marks.lines.get(f"joints[{names[joint.name]}]")

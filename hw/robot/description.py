@@ -105,7 +105,8 @@ class Imu:
 
     `average` [s] is the span that its low-pass filter averages over: samples at the loop's rate alone would alias.
     `signs` are those of the sensor's axes against the mounted ones, `mounting` [rad] the roll, pitch and yaw that then
-    turn these into the base's (hw/imu/mounting.py). The board's (`opencr`) is on the servo bus; another has a `port`.
+    turn these into the base's (hw/imu/mounting.py). The board's (`opencr`) is on the servo bus; another has a `port`,
+    and with `none` the robot is taken to be upright.
     """
 
     gyro_noise: float
@@ -116,7 +117,7 @@ class Imu:
     latency: float
     signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    kind: Literal["opencr", "witmotion", "bno08x"] = "opencr"
+    kind: Literal["opencr", "witmotion", "bno08x", "none"] = "opencr"
     port: str | None = None
     baud: int = 115200  # of that port
     yaw_sign: float = 1.0  # of a bno08x: -1 if its yaw counts clockwise
@@ -167,11 +168,13 @@ Button = Literal["mode", "start", "user"]
 
 
 @dataclass(frozen=True)
-class Bus:
-    """The servo bus. Any of the board's `stop_buttons` is an emergency stop."""
+class BusSettings:
+    """The servo bus. Any of the board's `stop_buttons` is an emergency stop. With `board` none the servos are on an
+    adapter such as a U2D2 and have a supply of their own."""
 
     baud: int
-    board_id: int
+    board_id: int = 200
+    board: Literal["opencr", "none"] = "opencr"
     stop_buttons: tuple[Button, ...] = ("mode", "start", "user")
 
 
@@ -185,7 +188,7 @@ class Robot:
     imu_site: str
     rate: int
     standing_height: float
-    bus: Bus
+    bus: BusSettings
     limits: Limits
     imu: Imu
     feet: dict[str, Foot]

@@ -43,10 +43,11 @@ def cycle_seconds(servos: int, baud: int, *, board: bool = True, return_delay: f
 
 def _check_bus(robot: Robot, marks: Marks) -> None:
     n, tick = len(robot.joints), robot.dt
-    needs = cycle_seconds(n, robot.bus.baud)
+    board = robot.bus.board != "none"
+    needs = cycle_seconds(n, robot.bus.baud, board=board)
     if needs <= BUS_SHARE * tick:
         return
-    fast = next((baud for baud in BAUDS if cycle_seconds(n, baud) <= BUS_SHARE * tick), None)
+    fast = next((baud for baud in BAUDS if cycle_seconds(n, baud, board=board) <= BUS_SHARE * tick), None)
     remedy = f"set {fast} or more" if fast else "lower the rate"
     raise marks.error(
         "bus.baud",

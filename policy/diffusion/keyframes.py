@@ -14,7 +14,7 @@ from torch import Tensor
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Keyframes
-from servoid.policy.diffusion.features import Normaliser, raw_layout, to_tokens
+from servoid.policy.features import Normaliser, raw_layout, to_tokens
 
 
 def keyframe_tokens(keyframes: Keyframes, present: Array, n_joints: int) -> tuple[Array, Array]:

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.seeds import wide_seed
-from servoid.policy.diffusion.features import Normaliser, joints_seen, to_tokens
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.schedule import DenoisingMatrix
+from servoid.policy.features import Normaliser, joints_seen, to_tokens
 
 _FRAME = 2**31  # sets the noise of frames apart from what is drawn for a plan
 

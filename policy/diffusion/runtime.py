@@ -21,7 +21,6 @@ from servoid.hw.contracts.control import Instruction, Plan, PlanRequest
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import resolve
 from servoid.policy.diffusion.engines import Engine, load_engine
-from servoid.policy.diffusion.features import Trajectory, joints_seen, raw_layout, to_raw, to_tokens
 from servoid.policy.diffusion.guidance import Diverged, Guidance, classifier_free
 from servoid.policy.diffusion.keyframes import imputation, keyframe_tokens
 from servoid.policy.diffusion.model.checkpoint import Model, load
@@ -29,6 +28,7 @@ from servoid.policy.diffusion.rolling import Previous, clean_start, frame_noise,
 from servoid.policy.diffusion.sampler import Known, Sampler
 from servoid.policy.diffusion.schedule import DenoisingMatrix, cosine_signal
 from servoid.policy.diffusion.settings import DiffusionSettings
+from servoid.policy.features import Trajectory, joints_seen, raw_layout, to_raw, to_tokens
 from servoid.policy.text.captions import MOTIONS, caption, motion_of
 from servoid.policy.text.encoder import load_encoder
 from servoid.policy.text.nearest_phrase import Phrasebook

@@ -9,9 +9,9 @@ from torch import Tensor
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.mirror import Mirror
-from servoid.policy.diffusion.dataset import DatasetError, Recording
-from servoid.policy.diffusion.features import Normaliser, raw_mirror
+from servoid.policy.features import Normaliser, raw_mirror
 from servoid.policy.latent.proprioception import proprioception
+from servoid.policy.recording import DatasetError, Recording
 
 
 class Demonstrations:

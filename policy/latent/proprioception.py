@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from servoid.policy.diffusion.features import AnyArray, Layout, raw_layout
+from servoid.policy.features import AnyArray, Layout, raw_layout
 
 _HEIGHT = 2  # index of z among the displacement's x, y, z, which come first in a row, with yaw after them
 
 
 def proprioception_layout(n_joints: int) -> Layout:
-    """The fields of `proprioception`, SI units, frames as in `servoid.policy.diffusion.features.raw_layout`."""
+    """The fields of `proprioception`, SI units, frames as in `servoid.policy.features.raw_layout`."""
     of_row = dict(raw_layout(n_joints).fields)
     kept = ("velocity", "angular_velocity", "gravity", "position", "joint_velocity")
     return Layout((("height", 1), *((name, of_row[name]) for name in kept)))

@@ -12,9 +12,9 @@ from servoid.hw.dynamixel.backend import DynamixelBackend
 from servoid.hw.dynamixel.motors import DynamixelMotors
 from servoid.hw.dynamixel.sensors import DynamixelSensors
 from servoid.hw.robot.description import Robot
-from servoid.sim.rig.backend import on_the_board
-from servoid.sim.rig.faults import Fault, Scenario
 from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.servo.board import on_the_board
+from servoid.sim.rig.wire.faults import Fault, Scenario
 
 _TOGETHER_NS = 80_000_000  # after which ticks of 20 ms and batches of 16 ms begin together again
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,14 +18,14 @@ from servoid.hw.config import nearest
 from servoid.hw.contracts.body import Array
 from servoid.hw.imu.mounting import Mounting
 from servoid.hw.robot.description import Robot
-from servoid.sim.rig.factory_state import FactoryState
-from servoid.sim.rig.faults import ALERTS, Fault, FaultInjector, Scenario
 from servoid.sim.rig.servo.board import VirtualBoard
 from servoid.sim.rig.servo.duplicate_id import DuplicateId
+from servoid.sim.rig.servo.factory_state import FactoryState
 from servoid.sim.rig.servo.motor_bank import STEP_NS, MotorBank
 from servoid.sim.rig.servo.plant import Plant
 from servoid.sim.rig.servo.virtual_servo import VirtualServo
 from servoid.sim.rig.wire.dispatcher import Dispatcher
+from servoid.sim.rig.wire.faults import ALERTS, Fault, FaultInjector, Scenario
 from servoid.sim.rig.wire.half_duplex import Wire
 
 BROWN_OUT, BOARD_BROWN_OUT = 0.5, 0.375  # of its servo's nominal voltage, below which a servo or the board is dead
@@ -62,6 +62,8 @@ class Rig:
         factory_state: FactoryState | None = None,
     ) -> None:
         self.factory_state, self.scenario = factory_state or FactoryState(), scenario or Scenario()
+        if robot.bus.board == "none":
+            self.factory_state = replace(self.factory_state, board=False)
         self.factory_state.check(robot)
         robot = self.robot = self.factory_state.assembled(robot, seed)
         self.plant = Plant(robot)

@@ -23,10 +23,10 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Adopted, Instruction, Plan, PlanRequest, State
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import read_header, resolve
-from servoid.policy.diffusion.features import raw_row
 from servoid.policy.diffusion.model.action_space import JOINT_TARGETS, ActionSpace, load_action_space
 from servoid.policy.diffusion.model.config import check_fit
 from servoid.policy.diffusion.settings import DiffusionSettings, load_settings
+from servoid.policy.features import raw_row
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.control.plan_buffer import History, Pace, PlanBuffer
 from servoid.stack.control.planner import Answer, InlinePlanner, Planner, ProcessPlanner

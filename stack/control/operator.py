@@ -18,8 +18,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 
 DEAD_ZONE = 0.1  # of a stick's way: worn ones do not come back to the middle
-FORWARD_AXIS, LEFT_AXIS, TURN_AXIS = 1, 0, 3  # of the usual two-stick pads; up and left are negative
-END_BUTTON = 1
+FULL = 32767  # of a stick's way; up and left are negative
 KEYS_HELP = "keys: w/s forward/back, a/d turn, q/e sideways, space stops, x ends"
 _STEP = 0.2  # of the whole way, by which a key changes the wish
 _KEYS = {
@@ -46,11 +45,26 @@ class Steering(Protocol):
     def close(self) -> None: ...
 
 
-class Gamepad:
-    """The first gamepad. One that is unplugged asks to stand, until it is back."""
+@dataclass(frozen=True)
+class Controls:
+    """Which stick walks and which turns, by SDL's names of a controller's parts: leftx, lefty, rightx, righty; a, b ...
 
-    def __init__(self) -> None:
-        """Raises ConfigError without pygame or without a gamepad."""
+    SDL knows where they are on each kind of pad. By its number an axis may be a stick on one, and on another a trigger,
+    which rests at its end.
+    """
+
+    forward: str = "lefty"
+    left: str = "leftx"
+    turn: str = "rightx"
+    end: str = "b"
+
+
+class Gamepad:
+    """The first gamepad. Its sticks count once they have been in the middle, all at the same time: one that is held, or
+    broken, moves nothing. A gamepad that is unplugged asks to stand, until it is back."""
+
+    def __init__(self, controls: Controls | None = None) -> None:
+        """Raises ConfigError without pygame, without a gamepad, and for one whose parts SDL has no names for."""
         # A robot's PC has no display, and a pad shall be heard although no window has the focus.
         if not os.environ.get("DISPLAY") and not os.environ.get("WAYLAND_DISPLAY"):
             os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -58,43 +72,59 @@ class Gamepad:
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         try:
             import pygame
+            from pygame._sdl2 import controller
         except ModuleNotFoundError:
             raise ConfigError("a gamepad needs the 'steer' extra: pip install 'servoid[steer]'") from None
-        self._pygame = pygame
+        self._pygame, self._sdl = pygame, controller
+        controls = controls or Controls()
+        named = (controls.forward, controls.left, controls.turn)
+        self._axes = [getattr(pygame, f"CONTROLLER_AXIS_{name.upper()}") for name in named]
+        self._end = getattr(pygame, f"CONTROLLER_BUTTON_{controls.end.upper()}")
         pygame.display.init()
         pygame.joystick.init()
+        controller.init()
         self._pad: Any = None
+        self._centred = self._told = False
         self._find()
+        if self._pad is None and pygame.joystick.get_count():
+            name = pygame.joystick.Joystick(0).get_name()
+            raise ConfigError(
+                f"where the sticks of the gamepad '{name}' are is not known: give SDL its mapping in the environment "
+                "variable SDL_GAMECONTROLLERCONFIG, or steer by keys with --set device=keyboard"
+            )
         if self._pad is None:
             raise ConfigError("no gamepad is connected: plug one in, or steer by keys with --set device=keyboard")
 
     def read(self) -> SteeringInput:
-        for event in self._pygame.event.get():
-            if event.type == self._pygame.JOYDEVICEREMOVED and self._pad is not None:
-                self._pad = None
-            elif event.type == self._pygame.JOYDEVICEADDED:
-                self._find()
+        self._pygame.event.get()  # lets SDL look at its devices
+        if self._pad is not None and not self._pad.attached():
+            self._pad = None
+        if self._pad is None:
+            self._find()
         if self._pad is None:
             return SteeringInput(np.zeros(3))
-        return SteeringInput(
-            np.array([self._axis(FORWARD_AXIS), self._axis(LEFT_AXIS), self._axis(TURN_AXIS)]),
-            self._pad.get_numbuttons() > END_BUTTON and bool(self._pad.get_button(END_BUTTON)),
-        )
+        way = np.array([self._stick(axis) for axis in self._axes])
+        self._centred = self._centred or not way.any()
+        if not self._centred:
+            if not self._told:
+                print("let go of the gamepad's sticks: they count once they are in the middle", file=sys.stderr)
+            self._told, way = True, np.zeros(3)
+        return SteeringInput(way, bool(self._pad.get_button(self._end)))
 
     def close(self) -> None:
         self._pad = None
+        self._sdl.quit()
         self._pygame.joystick.quit()
         self._pygame.display.quit()
 
     def _find(self) -> None:
-        if self._pad is None and self._pygame.joystick.get_count():
-            self._pad = self._pygame.joystick.Joystick(0)
+        numbers = [i for i in range(self._sdl.get_count()) if self._sdl.is_controller(i)]
+        if numbers:
+            self._pad, self._centred, self._told = self._sdl.Controller(numbers[0]), False, False
 
-    def _axis(self, number: int) -> float:
-        """Where a stick is, forward and left being positive, beyond its dead zone."""
-        if number >= self._pad.get_numaxes():
-            return 0.0
-        value = -float(self._pad.get_axis(number))
+    def _stick(self, axis: int) -> float:
+        """Where a stick is in -1..1, up and left being positive, beyond its dead zone."""
+        value = -float(self._pad.get_axis(axis)) / FULL
         beyond = max(abs(value) - DEAD_ZONE, 0.0) / (1.0 - DEAD_ZONE)
         return float(np.copysign(min(beyond, 1.0), value))
 
@@ -146,12 +176,13 @@ class Keyboard:
                 self._way[part] = np.clip(self._way[part] + change, -1.0, 1.0)
 
 
-def open_steering(device: str) -> Steering:
-    """The device of that kind: gamepad, keyboard, or auto for the first that is there. Raises ConfigError."""
+def open_steering(device: str, controls: Controls | None = None) -> Steering:
+    """The device of that kind: gamepad, with its `controls`, keyboard, or auto for the first that is there. Raises
+    ConfigError."""
     if device == "keyboard":
         return Keyboard()
     try:
-        return Gamepad()
+        return Gamepad(controls)
     except ConfigError:
         if device == "auto" and sys.stdin.isatty():
             return Keyboard()

@@ -7,6 +7,8 @@ feet and corners. Soles slip systematically, so a small network corrects the vel
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from servoid.hw.contracts.body import Array, Observation
@@ -18,6 +20,7 @@ from servoid.policy.mlp import Mlp
 from servoid.stack.estimation.attitude import Attitude
 from servoid.stack.estimation.odometry import OdometryFeatures
 
+_GRAVITY = 9.81  # m/s2
 _CORNER_SOFTNESS = 0.003  # m of height over which corners share the contact
 _FOOT_SOFTNESS = 0.001  # m of height over which feet share the load
 
@@ -63,6 +66,9 @@ class Estimator:
         some were missed, in which the robot is taken to have moved as it does now, for as long as a sample is no older
         than `stale`.
         """
+        if self.robot.imu.kind == "none":  # taken to be upright, and not to turn: nothing else is known
+            upright = np.broadcast_to([0.0, 0.0, _GRAVITY], (*self.shape, 3))
+            observation = replace(observation, angular_velocity=np.zeros((*self.shape, 3)), specific_force=upright)
         ticks = min(ticks, self.robot.limits.stale)
         dt = self.robot.dt * ticks
         q = np.where(np.isfinite(observation.position), observation.position, self._position)

@@ -28,7 +28,7 @@ class SampleHold:
     def update(self, observation: Observation) -> Observation:
         """The observation with gaps filled. Takes and returns one body, `(n_joints,)` arrays."""
         joints = np.isfinite(observation.position) & np.isfinite(observation.velocity)
-        imu = all(bool(np.isfinite(getattr(observation, name)).all()) for name in IMU_FIELDS)
+        imu = imu_valid(observation)
         last = self._last
         if last is None:
             filled = replace(
@@ -53,17 +53,23 @@ class SampleHold:
         return filled
 
 
+def imu_valid(observation: Observation) -> bool:
+    """Whether there is a sample of the IMU, or the robot has none: its age is NaN then."""
+    return bool(
+        np.isnan(observation.imu_age).all() or all(np.isfinite(getattr(observation, name)).all() for name in IMU_FIELDS)
+    )
+
+
 def complete(observation: Observation) -> bool:
     """Whether every joint and the IMU have a valid sample, however old."""
     return bool(
-        np.isfinite(observation.position).all()
-        and np.isfinite(observation.velocity).all()
-        and all(np.isfinite(getattr(observation, name)).all() for name in IMU_FIELDS)
+        np.isfinite(observation.position).all() and np.isfinite(observation.velocity).all() and imu_valid(observation)
     )
 
 
 def missing(observation: Observation, names: tuple[str, ...]) -> list[str]:
     """Names of the joints, and `IMU`, that have no valid sample."""
     joints = np.isfinite(observation.position) & np.isfinite(observation.velocity)
-    imu = all(bool(np.isfinite(getattr(observation, name)).all()) for name in IMU_FIELDS)
-    return [name for name, valid in zip(names, joints, strict=True) if not valid] + ([] if imu else ["IMU"])
+    return [name for name, valid in zip(names, joints, strict=True) if not valid] + (
+        [] if imu_valid(observation) else ["IMU"]
+    )

@@ -27,7 +27,7 @@ class Kind:
 
 BACKENDS = {
     "sim": Kind("servoid.sim.backend", "SimBackend", simulated=True, several=True),
-    "virtual": Kind("servoid.sim.rig.backend", "VirtualBackend", simulated=True),
+    "virtual": Kind("servoid.sim.rig.process.backend", "VirtualBackend", simulated=True),
     "dynamixel": Kind("servoid.hw.dynamixel.backend", "DynamixelBackend", simulated=False, options={"exact": True}),
 }
 

@@ -21,7 +21,7 @@ from servoid.stack.runtime.clock import Schedule
 from servoid.stack.runtime.interrupt import Interrupt, Stops
 from servoid.stack.runtime.loop import ControlledRobot, Loop
 from servoid.stack.runtime.phases import Phases
-from servoid.stack.runtime.settings import RunSettings
+from servoid.stack.runtime.settings import RunSettings, Script
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import ENDED, Guard, Phase
 
@@ -53,6 +53,7 @@ class Teammates:
         body: Backend,
         first: Guard,
         interrupt: Interrupt,
+        script: Script,
     ) -> None:
         """`body` is the first robot's, whose world has a body for each of `behaviours`, and `first` its guard."""
         assert body.simulation is not None
@@ -64,7 +65,7 @@ class Teammates:
         unpushed = replace(assignment, episode=replace(assignment.episode, pushes={}))  # it is the first that is pushed
         for number, (behaviour, other) in enumerate(zip(behaviours, body.simulation.teammates, strict=True), 1):
             # Its planner never runs beside the loop: the log, which is the first robot's, has to repeat it.
-            policy = make_policy(settings.policy, robot, assignment.task, realtime=False)
+            policy = make_policy(settings.policy, robot, assignment.task, realtime=False, planner=script.planner)
             self._open.callback(policy.close)
             policy.reset(None, np.array(teammate_seed(settings.seed, number)))
             sensors, motors = other.connect()

@@ -14,7 +14,7 @@ from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.control import Policy
 from servoid.hw.contracts.task import Assignment, Behaviour, Task
 from servoid.hw.contracts.world import Scene
-from servoid.hw.robot.calibration import calibrated
+from servoid.hw.dynamixel.calibration import calibrated
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.hw.seeds import Stream, generator
 from servoid.stack.control.policies import make_policy, policy_fingerprint
@@ -159,7 +159,9 @@ class Run:
         self.behaviour = self._behaviour()
         self._open.callback(self.behaviour.close)
         self._open.enter_context(self._interrupt)
-        self.policy = self._policy or make_policy(settings.policy, robot, task, self.realtime)
+        self.policy = self._policy or make_policy(
+            settings.policy, robot, task, self.realtime, planner=self._script.planner
+        )
         self._open.callback(self.policy.close)
         self._interrupt.check()
         if self._script.plans is not None:
@@ -185,7 +187,14 @@ class Run:
         clock = self.body.clock
         if behaviours := self.behaviour.teammates:
             clock = self._teammates = Teammates(
-                self.settings, self.robot, self.assignment, behaviours, self.body, self.guard, self._interrupt
+                self.settings,
+                self.robot,
+                self.assignment,
+                behaviours,
+                self.body,
+                self.guard,
+                self._interrupt,
+                self._script,
             )
             self._open.callback(self._teammates.close)
             listeners.append(self._teammates)

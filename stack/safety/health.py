@@ -78,7 +78,7 @@ class Health:
             name = self._names[int(np.flatnonzero(~joints)[0])]
             return [Finding("now", "stale", f"no fresh sample from {name} for {stale} ticks: check its cable", name)]
         tilt = tilt_of(observation, state)
-        if complete(observation) and float(observation.imu_age) <= oldest and math.isfinite(tilt):
+        if complete(observation) and not float(observation.imu_age) > oldest and math.isfinite(tilt):
             return []
         why = describe(int(np.bitwise_or.reduce(observation.fault)) & IMU)
         reason = f" ({', '.join(why)})" if why else ""

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
-from servoid.policy.diffusion.features import recorded_names
+from servoid.policy.features import recorded_names
 
 
 def episode(robot: Robot, ticks: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:

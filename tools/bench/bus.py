@@ -120,7 +120,7 @@ class ClientTimes:
 
 def wire_ms(mode: str, baud: int) -> float:
     """Time that the bytes of a cycle take on a wire, without any pause between them."""
-    from servoid.hw.dynamixel.transport.bus import BITS
+    from servoid.hw.dynamixel.protocol.codec import FRAME_BITS
     from servoid.hw.dynamixel.transport.group_read import GroupRead
     from servoid.tools.bench.bus_clients import BOARD, BOARD_BYTES, GOAL_BYTES, PRESENT, PRESENT_BYTES
 
@@ -128,7 +128,7 @@ def wire_ms(mode: str, baud: int) -> float:
     board = GroupRead([(BOARD_ID, BOARD, BOARD_BYTES)]).request_all()
     goals = 14 + SERVOS * (1 + GOAL_BYTES)
     count = goals + sum(len(request.packet) + request.answer for request in (present, board))
-    return 1e3 * BITS * count / baud
+    return 1e3 * FRAME_BITS * count / baud
 
 
 @contextmanager

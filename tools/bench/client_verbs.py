@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import dynamixel_sdk as sdk
 
-from servoid.sim.rig.factory_state import FactoryState
+from servoid.sim.rig.servo.factory_state import FactoryState
 from servoid.tools.bench.sdk_host import Refused, SdkHost, expect, near
 
 Verb = Callable[[SdkHost], None]

@@ -184,10 +184,10 @@ def _time(
 def _networks(args: argparse.Namespace, robot: Robot) -> list[Network]:
     """The checkpoint, or one with random weights without it, and the network of `--shape`."""
     from servoid.policy.checkpoint import CheckpointError, resolve
-    from servoid.policy.diffusion.features import Normaliser, token_layout
     from servoid.policy.diffusion.model.checkpoint import load
     from servoid.policy.diffusion.model.config import DenoiserConfig
     from servoid.policy.diffusion.settings import load_settings
+    from servoid.policy.features import Normaliser, token_layout
 
     name, model = RANDOM, None
     if args.checkpoint != RANDOM:
@@ -241,7 +241,7 @@ def _made_up(config: Any, states: Any, actions: Any) -> Model:
 def _request(robot: Robot, model: Model, delay: int) -> PlanRequest:
     """A robot that stands at home."""
     from servoid.hw.contracts.control import Instruction, PlanRequest
-    from servoid.policy.diffusion.features import raw_layout
+    from servoid.policy.features import raw_layout
 
     layout = raw_layout(len(robot.joints))
     row = np.zeros(layout.size, dtype=np.float32)

@@ -8,9 +8,9 @@ from typing import Any
 import dynamixel_sdk as sdk
 
 from servoid.hw.robot.description import Robot
-from servoid.sim.rig.factory_state import FactoryState
 from servoid.sim.rig.in_process import InProcessLine
 from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.servo.factory_state import FactoryState
 
 _LATENCY_MS = 16.0  # that the SDK allows an adapter, twice
 _BYTE_MS = 10_000.0  # of a byte at 1 bit/s

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import NamedTemporaryFile
 from typing import TYPE_CHECKING
 
 from servoid.hw.config import ConfigError, nearest
@@ -23,8 +23,8 @@ from servoid.tools.common.output import Report, reporting
 from servoid.tools.common.prompt import confirm
 
 if TYPE_CHECKING:
+    from servoid.hw.dynamixel.calibration import Calibration, JointCalibration
     from servoid.hw.dynamixel.servos.register_check import Found
-    from servoid.hw.robot.calibration import Calibration, JointCalibration
     from servoid.tools.bringup.calibration.encoders import Encoders
     from servoid.tools.bringup.calibration.hands import Hands
 
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
-        from servoid.hw.robot.calibration import apply, calibration_path, save_calibration
+        from servoid.hw.dynamixel.calibration import apply, calibration_path, check_writable
 
         robot = load_robot(args.robot)
         virtual = is_virtual(args)
@@ -71,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
         reference = _reference(args.pose, robot)
         factory_state = None
         if virtual:
-            from servoid.sim.rig.factory_state import FactoryState
+            from servoid.sim.rig.servo.factory_state import FactoryState
 
             factory_state = FactoryState(assembly="random")
         with open_line(args, robot, factory_state=factory_state, seed=args.seed) as line:
@@ -85,7 +85,7 @@ def main(args: argparse.Namespace) -> int:
             if not args.yes:
                 kept_text = ", and the earlier one kept beside it" if path.exists() else ""
                 confirm(f"{path} will be written{kept_text}: whatever drives {robot.name} will use it")
-            kept = save_calibration(result, path)
+            kept = keep(result, path)
             report.line(f"written to {path}" + (f"; the earlier one is {kept}" if kept else ""))
             report.line("next: servoid bringup check --fix, which sets the servos' own limits to match")
         report.result({"path": path, **asdict(result)})
@@ -104,13 +104,14 @@ def _measure(
     """Zeros [rad] and directions `(n_joints,)`."""
     import numpy as np
 
-    from servoid.hw.dynamixel.servos.bus_scan import BAUDS, power_on
+    from servoid.hw.dynamixel.servos.bus_scan import BAUDS
     from servoid.hw.dynamixel.servos.register_check import find_servos
     from servoid.hw.dynamixel.transport.bus import LONGEST_RETURN_DELAY
     from servoid.tools.bringup.calibration.encoders import Encoders, short
     from servoid.tools.bringup.calibration.hands import Person, VirtualHands
+    from servoid.tools.bringup.scan import powered
 
-    power_on(line.bus, robot.bus.board_id, [robot.bus.baud, *BAUDS])
+    powered(line.bus, robot, BAUDS)
     if line.bus.port.baud != robot.bus.baud:
         line.bus.set_baud(robot.bus.baud)
     line.bus.return_delay = LONGEST_RETURN_DELAY  # until the servos' own is known
@@ -223,16 +224,24 @@ def _chosen(names: list[str], robot: Robot) -> list[int]:
     return [i for i, name in enumerate(robot.names) if not names or name in names]
 
 
-def check_writable(path: Path) -> None:
-    """Raise ConfigError where no file can be written beside `path`: else twenty joints are measured for nothing."""
+def keep(result: Calibration, path: Path) -> Path | None:
+    """Save what was measured; where that fails after all, keep it where temporary files are, and say where.
+
+    Returns the earlier one's new name. Raises ConfigError.
+    """
+    from servoid.hw.dynamixel.calibration import as_text, save_calibration
+
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=path.parent):
-            pass
-    except OSError as error:
-        raise ConfigError(
-            f"{path}: cannot be written: {error.strerror}: set XDG_CONFIG_HOME to a folder of yours, or give --out FILE"
-        ) from error
+        return save_calibration(result, path)
+    except ConfigError as error:
+        text = as_text(result)
+        try:
+            with NamedTemporaryFile("w", prefix="servoid-calibration-", suffix=".yaml", delete=False) as file:
+                file.write(text)
+        except OSError:
+            error.add_note(text)  # printed: the last that is left
+            raise error from None
+        raise ConfigError(f"{error}; what was measured is kept in {file.name}: copy it to {path}") from error
 
 
 def _earlier(path: Path | None, robot: Robot, chosen: list[int], keep: bool) -> Mapping[str, JointCalibration]:
@@ -244,7 +253,7 @@ def _earlier(path: Path | None, robot: Robot, chosen: list[int], keep: bool) -> 
     whole = len(chosen) == len(robot.joints)
     if path is None or (whole and not (keep and path.exists())):
         return {}
-    from servoid.hw.robot.calibration import load_calibration
+    from servoid.hw.dynamixel.calibration import load_calibration
 
     if not path.exists():
         raise ConfigError(f"{path}: no such calibration yet: calibrate all joints first, without --joint")
@@ -264,7 +273,7 @@ def _calibration(
     earlier: Mapping[str, JointCalibration],
     pose: str,
 ) -> Calibration:
-    from servoid.hw.robot.calibration import Calibration, JointCalibration
+    from servoid.hw.dynamixel.calibration import Calibration, JointCalibration
 
     joints = {}
     for i, (joint, servo) in enumerate(zip(robot.joints, robot.servos, strict=True)):

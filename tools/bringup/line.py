@@ -16,8 +16,8 @@ from servoid.tools.common.output import Report, add_json_argument
 
 if TYPE_CHECKING:
     from servoid.hw.dynamixel.transport.bus import Bus
-    from servoid.sim.rig.factory_state import FactoryState
     from servoid.sim.rig.process.control import Control
+    from servoid.sim.rig.servo.factory_state import FactoryState
 
 VIRTUAL = "virtual"
 
@@ -55,7 +55,7 @@ def assembled(args: argparse.Namespace, report: Report) -> Robot:
     """The robot as its file says or, where there is hardware and it was calibrated, as it was measured."""
     robot = load_robot(args.robot)
     if not is_virtual(args):
-        from servoid.hw.robot.calibration import calibrated
+        from servoid.hw.dynamixel.calibration import calibrated
 
         robot, text = calibrated(robot)
         report.line(text)

@@ -76,8 +76,11 @@ def main(args: argparse.Namespace) -> int:
 
 def powered(bus: Bus, robot: Robot, bauds: tuple[int, ...] | list[int]) -> str:
     """Switch the servos' power on where a board keeps it off; a line about it."""
-    from servoid.hw.dynamixel.servos.bus_scan import power_on
+    from servoid.hw.dynamixel.servos.bus_scan import BOOT_SECONDS, power_on
 
+    if robot.bus.board == "none":
+        bus.clock.sleep_until(bus.clock.now_ns() + round(BOOT_SECONDS * 1e9))  # the supply may just have come on
+        return f"{robot.name} has no board: its servos have a supply of their own"
     power = power_on(bus, robot.bus.board_id, _first(robot.bus.baud, bauds))
     return power or f"no board with ID {robot.bus.board_id}: servos with a supply of their own may answer"
 

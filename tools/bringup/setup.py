@@ -42,7 +42,7 @@ def main(args: argparse.Namespace) -> int:
         id, baud, model = _wanted(args, robot)
         factory_state = None
         if is_virtual(args):
-            from servoid.sim.rig.factory_state import FactoryState
+            from servoid.sim.rig.servo.factory_state import FactoryState
 
             alone = (args.joint or robot.joints[0].name,)
             factory_state = FactoryState(fresh=alone, only=alone)
@@ -165,7 +165,7 @@ def _wanted(args: argparse.Namespace, robot: Robot) -> tuple[int, int, int | Non
         raise ConfigError("say which joint the servo is for (servoid bringup setup JOINT), or which --id it shall have")
     if not 0 <= args.id <= MAX_ID:
         raise ConfigError(f"--id {args.id}: servo IDs are 0..{MAX_ID}")
-    if args.id == robot.bus.board_id:
+    if args.id == robot.bus.board_id and robot.bus.board != "none":
         raise ConfigError(f"--id {args.id}: that is the board's (bus.board_id of the robot's file)")
     return args.id, baud, None
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 
 from servoid.hw.config import ConfigError
-from servoid.sim.rig.factory_state import add_factory_state_arguments
+from servoid.sim.rig.servo.factory_state import add_factory_state_arguments
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, add_json_argument, reporting
 from servoid.tools.common.parser import check_seed

@@ -13,7 +13,7 @@ PACKAGES = ("hw", "sim", "policy", "stack")  # checkpoints among them are hashed
 JUDGES = (
     "tools/common/ground_truth.py",
     "tools/common/motion_quality.py",
-    "tools/commands/rollout.py",
+    "tools/evaluate/judge.py",
     "tools/evaluate/episode.py",
 )
 

@@ -53,8 +53,8 @@ def do_episode(job: EpisodeJob) -> EpisodeResult:
 def record(settings: RunSettings) -> dict[str, Any]:
     """Do an episode and keep what any row could ask of it. Raises ConfigError."""
     from servoid.hw.robot.description import load_robot
-    from servoid.tools.commands.rollout import judge
     from servoid.tools.common.motion_quality import quality
+    from servoid.tools.evaluate.judge import judge
 
     judged = judge(settings)
     trace, assignment = judged.trace, judged.assignment

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from servoid.tools.commands.rollout import ENDED
+from servoid.tools.evaluate.judge import ENDED
 
 Record = Mapping[str, Any]
 

@@ -187,7 +187,7 @@ def _prepare(experiment: Experiment, policies: Policies, options: Options, say: 
         policy=_made_of(policies, experiment, settings.policy),
         limit=shortest,
         episodes=options.episodes or experiment.episodes,
-        cache=EpisodeCache(options.out / "episodes", kept, options.fresh),
+        cache=EpisodeCache(options.out / "episodes" / f"{key(kept)}.jsonl", kept, options.fresh),
     )
 
 

@@ -14,9 +14,9 @@ import time
 from typing import Any
 
 from servoid.hw.config import ConfigError, nearest
-from servoid.tools.commands.run import positive
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, add_json_argument, reporting
+from servoid.tools.common.parser import positive
 
 QUICK = (
     "drop",
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    from servoid.sim.rig.faults import KINDS
+    from servoid.sim.rig.wire.faults import KINDS
 
     with reporting(args.json) as report:
         if args.seeds < 1 or args.first < 0 or args.workers < 0:
@@ -85,7 +85,7 @@ def campaign(report: Report, kinds: tuple[str, ...], seeds: range, args: argpars
 
 def lost(trial: Any, loss: Any) -> Any:
     """The verdict on a trial that hung or died."""
-    from servoid.sim.rig.faults import EXPECTED
+    from servoid.sim.rig.wire.faults import EXPECTED
     from servoid.tools.faults.trial import Verdict
 
     return Verdict(trial.kind, trial.seed, EXPECTED[trial.kind].value, ended=loss.how, problems=[loss.text])

@@ -15,9 +15,10 @@ import numpy as np
 
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.robot.description import Robot, load_robot
-from servoid.sim.rig.faults import EXPECTED, KINDS, NEEDS_SERVO, STATUS_KINDS, Outcome
 from servoid.sim.rig.in_process import InProcessBackend
 from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.servo.board import on_the_board
+from servoid.sim.rig.wire.faults import EXPECTED, KINDS, NEEDS_SERVO, STATUS_KINDS, Outcome
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.safety.event import Event
@@ -103,7 +104,7 @@ class Witnessed(InProcessBackend):
 @cache
 def _rig(robot: str) -> Rig:
     """A rig for one trial after the other."""
-    return Rig(load_robot(robot))
+    return Rig(on_the_board(load_robot(robot)))
 
 
 def fault_of(trial: Trial, robot: Robot) -> tuple[dict[str, Any], int, str | None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.robot.description import Robot
-from servoid.policy.diffusion.features import raw_row
+from servoid.policy.features import raw_row
 from servoid.policy.latent.actions import LatentActions
 from servoid.stack.control.tracker import ExpertPolicy
 from servoid.stack.safety.limits import limit

@@ -71,7 +71,9 @@ def model_name(servo: Servo) -> str:
 
 
 def find_board(bus: Bus, robot: Robot) -> None:
-    """Find the board and switch the servos' power on. Raises BackendError with the remedy."""
+    """Find the board, where there is one, and switch the servos' power on. Raises BackendError with the remedy."""
+    if robot.bus.board == "none":
+        return
     id, board = robot.bus.board_id, table("opencr")
     ping = bus.ping(id, tries=3)
     if ping is None:

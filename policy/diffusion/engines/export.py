@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 
+from servoid.hw.user_folders import user_folder
 from servoid.policy.diffusion.model.denoiser import Denoiser
 
 OPSET = 18
@@ -41,14 +42,14 @@ def exported(denoiser: Denoiser) -> bytes:
 
 
 def cache_path(denoiser: Denoiser) -> Path:
-    """Where the graph of these weights is kept: under servoid/ in $XDG_CACHE_HOME, or ~/.cache."""
+    """Where the graph of these weights is kept: under servoid/ in $XDG_CACHE_HOME, or ~/.cache. For a user without a
+    home it is where nothing can be."""
     made_by = {"config": asdict(denoiser.config), "torch": torch.__version__, "opset": OPSET, "version": _VERSION}
     digest = hashlib.sha256(json.dumps(made_by, sort_keys=True).encode())
     for name, weights in sorted(denoiser.state_dict().items()):
         digest.update(name.encode() + weights.numpy().tobytes())
-    given = os.environ.get("XDG_CACHE_HOME", "")
-    base = Path(given) if os.path.isabs(given) else Path.home() / ".cache"  # a relative one is to be ignored
-    return base / "servoid" / "engines" / digest.hexdigest()[:32]
+    folder = user_folder("XDG_CACHE_HOME", ".cache") or Path(os.devnull)
+    return folder / "engines" / digest.hexdigest()[:32]
 
 
 def to_onnx(denoiser: Denoiser) -> bytes:

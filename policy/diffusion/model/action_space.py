@@ -16,7 +16,7 @@ PREFIX = "latent"  # of the tensors of latent actions in a diffusion checkpoint,
 
 
 class ActionSpace(Protocol):
-    """Joint targets [rad] <-> actions of a plan. Rows are raw ones (`servoid.policy.diffusion.features.raw_layout`)."""
+    """Joint targets [rad] <-> actions of a plan. Rows are raw ones (`servoid.policy.features.raw_layout`)."""
 
     def encode(self, rows: Array, targets: Array, /) -> Array:
         """Actions `(..., action size)` that joint targets `(..., n_joints)` are in states `(..., raw size)`."""

@@ -14,10 +14,10 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError
-from servoid.policy.diffusion.features import Normaliser, raw_layout, token_layout
 from servoid.policy.diffusion.model.action_space import JOINT_TARGETS, PREFIX, ActionSpace, latents_in
 from servoid.policy.diffusion.model.config import KIND, DenoiserConfig, check_fit
 from servoid.policy.diffusion.model.denoiser import Denoiser
+from servoid.policy.features import Normaliser, raw_layout, token_layout
 from servoid.policy.latent.actions import LatentActions
 
 

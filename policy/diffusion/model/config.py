@@ -14,8 +14,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError
-from servoid.policy.diffusion.features import raw_layout, token_layout
 from servoid.policy.diffusion.model.masks import check_mask
+from servoid.policy.features import raw_layout, token_layout
 from servoid.policy.text.encoder import code_size
 
 KIND = "diffusion"  # of a checkpoint
@@ -54,7 +54,7 @@ class DenoiserShape:
 
 
 @dataclass(frozen=True)
-class Objective:
+class TrainingObjective:
     """What a denoiser is trained for, beside the plain squared error."""
 
     inference_delay: Annotated[int, "longest delay of a plan to train for, in ticks, whose actions are given"] = 2

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from servoid.hw.config import nearest
-from servoid.sim.rig.faults import Fault
 from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.wire.faults import Fault
 from servoid.sim.scene import from_plain
 
 

@@ -29,13 +29,13 @@ from typing import Any, Literal
 from servoid.hw.clock import wake_sharply
 from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
-from servoid.sim.rig.factory_state import add_factory_state_arguments, factory_state_of
-from servoid.sim.rig.faults import Scenario, load_scenario
 from servoid.sim.rig.process import control_requests
 from servoid.sim.rig.process.control_requests import Connection
 from servoid.sim.rig.process.lateness import NOTICED_NS, Lateness, packets, sentence
 from servoid.sim.rig.process.pty import Pty
 from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.servo.factory_state import add_factory_state_arguments, factory_state_of
+from servoid.sim.rig.wire.faults import Scenario, load_scenario
 
 ClockKind = Literal["real", "locked"]
 PICK_UP_SECONDS = 3.0  # without torque anywhere, before somebody picks a free-running robot up

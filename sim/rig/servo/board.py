@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from servoid.hw.dynamixel.protocol.codec import StatusError
 from servoid.hw.dynamixel.protocol.tables import Item, table
 from servoid.hw.imu.mounting import Mounting
+from servoid.hw.robot.description import Robot
 from servoid.sim.rig.servo.device import VirtualDevice
 from servoid.sim.rig.servo.motor_bank import MotorBank
 
@@ -71,3 +73,11 @@ def _euler(w: float, x: float, y: float, z: float) -> tuple[float, float, float]
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
     return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def on_the_board(robot: Robot) -> Robot:
+    """The robot with its IMU on the bus, mounted as it is: a virtual rig has no other, and lends a robot without a
+    board one for its IMU. Without an IMU the robot is as it is."""
+    if robot.imu.kind == "none":
+        return robot
+    return replace(robot, bus=replace(robot.bus, board="opencr"), imu=replace(robot.imu, kind="opencr", port=None))

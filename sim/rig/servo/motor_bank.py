@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.dynamixel.protocol.codec import FRAME_BITS
 from servoid.hw.robot.description import Robot
 from servoid.sim.model import TIMESTEP
 from servoid.sim.rig.servo.firmware import Firmware
 from servoid.sim.rig.servo.plant import Plant
-from servoid.sim.rig.wire.half_duplex import FRAME_BITS
 
 BATTERY_RESISTANCE = 0.04  # Ohm: a 3S pack of the size that fits such a robot, with its wires
 STEP_NS = round(TIMESTEP * 1e9)

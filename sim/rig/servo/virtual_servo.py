@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 from servoid.hw.dynamixel.protocol.codec import StatusError
 from servoid.hw.dynamixel.protocol.tables import Item, table
-from servoid.sim.rig.factory_state import ticks_per_turn
 from servoid.sim.rig.servo.device import VirtualDevice
+from servoid.sim.rig.servo.factory_state import ticks_per_turn
 from servoid.sim.rig.servo.firmware import CURRENT, CURRENT_POSITION, EXTENDED, FULL_PWM, POSITION, PWM
 from servoid.sim.rig.servo.motor_bank import MotorBank
 
@@ -32,14 +32,19 @@ _MODE_RESETS = (  # registers that go back to their defaults with a new operatin
 )  # fmt: skip
 
 
-Accepted = Callable[[int, str, int, float, int], None]  # joint, register, value, goal angle [rad] or NaN, time [ns]
+OnAccepted = Callable[[int, str, int, float, int], None]  # joint, register, value, goal angle [rad] or NaN, time [ns]
 
 
 class VirtualServo(VirtualDevice):
     """Servo `index` of the rig's motors."""
 
     def __init__(
-        self, motors: MotorBank, index: int, model: int | str, eeprom: dict[str, int], accepted: Accepted | None = None
+        self,
+        motors: MotorBank,
+        index: int,
+        model: int | str,
+        eeprom: dict[str, int],
+        accepted: OnAccepted | None = None,
     ) -> None:
         """`accepted` is told of every write to a goal, the torque or the P gain that the servo took, and of the 255
         that an expired watchdog writes to its register."""

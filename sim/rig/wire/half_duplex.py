@@ -10,7 +10,8 @@ import heapq
 import itertools
 from dataclasses import dataclass, field
 
-FRAME_BITS = 10  # of a byte on the wire
+from servoid.hw.dynamixel.protocol.codec import FRAME_BITS
+
 BATCH_NS = 500_000  # what the adapter waits for more bytes when a reply follows upon another
 _GAP_NS = 100_000  # silence that ends such a burst
 _BAUD_TOLERANCE = 0.03  # of a UART

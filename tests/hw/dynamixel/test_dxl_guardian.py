@@ -22,7 +22,7 @@ from servoid.hw.contracts.body import BackendError
 from servoid.hw.dynamixel import guardian
 from servoid.hw.dynamixel.guardian_client import Lifeline
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import Instruction, Packet, Parser
+from servoid.hw.dynamixel.protocol.codec import InstructionCode, Packet, PacketParser
 from servoid.hw.dynamixel.protocol.tables import table
 from servoid.hw.dynamixel.transport.port import SerialPort
 
@@ -51,7 +51,7 @@ class Servos(threading.Thread):
         self.start()
 
     def run(self) -> None:
-        parser = Parser()
+        parser = PacketParser()
         while not self.over:
             if self.babble:
                 os.write(self.master, self.babble)
@@ -64,14 +64,14 @@ class Servos(threading.Thread):
         p = packet.params
         word = int.from_bytes(p[:2], "little")
         length = int.from_bytes(p[2:4], "little")
-        if packet.instruction == Instruction.SYNC_WRITE:
+        if packet.instruction == InstructionCode.SYNC_WRITE:
             if word == TORQUE and self.deaf:
                 self.deaf -= 1
                 return
             for at in range(4, len(p), 1 + length):
                 self.memory[p[at]].write(word, p[at + 1 : at + 1 + length])
-        elif packet.instruction in (Instruction.SYNC_READ, Instruction.READ):
-            for id in p[4:] if packet.instruction == Instruction.SYNC_READ else (packet.id,):
+        elif packet.instruction in (InstructionCode.SYNC_READ, InstructionCode.READ):
+            for id in p[4:] if packet.instruction == InstructionCode.SYNC_READ else (packet.id,):
                 servo = self.memory[id]
                 status = codec.status(id, servo.alert, bytes(servo.bytes[word : word + length]))
                 time.sleep(self.delay)

@@ -12,9 +12,9 @@ from servoid.hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
 from servoid.hw.dynamixel.motors import DynamixelMotors
 from servoid.hw.faults import LATE, TORQUE_LOST, WATCHDOG
 from servoid.hw.robot.description import load_robot
-from servoid.sim.rig.faults import Fault
 from servoid.sim.rig.in_process import InProcessLine
 from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.wire.faults import Fault
 
 ROBOT = load_robot("op3")
 TICK_NS = 20_000_000

@@ -14,7 +14,7 @@ from servoid.hw.robot.description import Walking, load_robot, load_servo, save_r
 
 PI = np.pi
 
-# name, servo ID, range; the order is that of every array
+# name, servo ID, range by the kinematics source; the order is that of every array
 TABLE = [
     ("head_pan", 19, -0.5 * PI, 0.5 * PI),
     ("head_tilt", 20, -0.5 * PI, 0.5 * PI),
@@ -38,6 +38,17 @@ TABLE = [
     ("r_ank_roll", 17, -0.45 * PI, 0.45 * PI),
 ]
 
+# Where the manufacturer's own motions go further (its action file), and so may this robot: low, high.
+FURTHER = {
+    "head_tilt": (-2.05, None),
+    "l_sho_pitch": (-2.85, 2.42),
+    "l_sho_roll": (-1.85, None),
+    "l_el": (-2.6, None),
+    "l_hip_pitch": (-1.97, None),
+    "l_knee": (None, 2.51),
+    "l_ank_pitch": (None, 1.84),
+}
+
 # joint, offset in its parent [m], axis
 LEFT_LEG = [
     ("l_hip_yaw", (0, 0.035, 0), (0, 0, -1)),
@@ -53,8 +64,15 @@ RIGHT_AXES = [(0, 0, -1), (-1, 0, 0), (0, -1, 0), (0, -1, 0), (0, 1, 0), (1, 0, 
 def test_joints_equal_the_table() -> None:
     robot = load_robot("op3")
     assert [(joint.name, joint.id) for joint in robot.joints] == [row[:2] for row in TABLE]
-    np.testing.assert_allclose(robot.lower, [row[2] for row in TABLE], atol=1e-4)
-    np.testing.assert_allclose(robot.upper, [row[3] for row in TABLE], atol=1e-4)
+    low, high = [row[2] for row in TABLE], [row[3] for row in TABLE]
+    for name, (lower, upper) in FURTHER.items():
+        i = robot.names.index(name)
+        low[i], high[i] = low[i] if lower is None else lower, high[i] if upper is None else upper
+        if name.startswith("l_"):
+            other = robot.names.index("r" + name[1:])
+            low[other], high[other] = -high[i], -low[i]
+    np.testing.assert_allclose(robot.lower, low, atol=1e-4)
+    np.testing.assert_allclose(robot.upper, high, atol=1e-4)
     assert {servo.name for servo in robot.servos} == {"xm430-w350"}
     assert robot.bus.board_id == 200
 
@@ -96,13 +114,13 @@ def edited(tmp_path: Path, kind: str, name: str, old: str, new: str) -> tuple[Pa
     return path, text[: text.index(old)].count("\n") + 1
 
 
-ROLL = "{name: l_sho_roll, servo: xm430-w350, id: 4, direction: 1, zero: 0.0, range: [-0.9425, 1.5708], home: 1.2"
+ROLL = "{name: l_sho_roll, servo: xm430-w350, id: 4, direction: 1, zero: 0.0, range: [-1.85, 1.5708], home: 1.2"
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (ROLL, ROLL.replace("[-0.9425, 1.5708]", "[1.5708, -0.9425]"), "joints[3].range: l_sho_roll: upside down"),
+        (ROLL, ROLL.replace("[-1.85, 1.5708]", "[1.5708, -1.85]"), "joints[3].range: l_sho_roll: upside down"),
         (ROLL, ROLL.replace("1.5708]", "90]"), "l_sho_roll: 90 is more than a turn: angles are in radians"),
         (ROLL, ROLL.replace("home: 1.2", "home: 45"), "joints[3].home: l_sho_roll: 45 is more than a turn"),
         (ROLL, ROLL.replace("home: 1.2", "home: 1.6"), "joints[3].home: l_sho_roll: 1.6 is outside the range"),

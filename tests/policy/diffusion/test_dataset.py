@@ -13,9 +13,10 @@ import torch
 
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.mirror import Mirror
-from servoid.policy.diffusion.dataset import DatasetError, Windows, read_recording
-from servoid.policy.diffusion.features import Emphasis, Normaliser, raw_mirror, token_layout
+from servoid.policy.diffusion.dataset import Windows
 from servoid.policy.diffusion.model.config import DenoiserConfig
+from servoid.policy.features import Emphasis, Normaliser, raw_mirror, token_layout
+from servoid.policy.recording import DatasetError, read_recording
 from servoid.policy.text.captions import MOTIONS, motion_of
 from servoid.policy.text.encoder import load_encoder
 

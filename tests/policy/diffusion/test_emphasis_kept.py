@@ -11,8 +11,8 @@ from test_runtime import ROBOT, model
 
 from servoid.hw.contracts.body import Array
 from servoid.policy.checkpoint import resolve
-from servoid.policy.diffusion.features import Emphasis, Normaliser, token_layout
 from servoid.policy.diffusion.model import checkpoint
+from servoid.policy.features import Emphasis, Normaliser, token_layout
 
 SIZE = token_layout(20).size
 

@@ -9,13 +9,13 @@ from test_runtime import ROBOT, model, moved, request, seeded_with, speed_cost
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Instruction, Keyframes, Plan
-from servoid.policy.diffusion.features import Emphasis, Normaliser, raw_layout
 from servoid.policy.diffusion.guidance import Diverged
 from servoid.policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise, seeded
 from servoid.policy.diffusion.runtime import Runtime
 from servoid.policy.diffusion.sampler import Known, Sampler
 from servoid.policy.diffusion.schedule import cosine_signal, rolling
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings
+from servoid.policy.features import Emphasis, Normaliser, raw_layout
 
 ROLLING = DiffusionSettings(schedule="rolling", steps=3, lead=1, execution_horizon=1, delay=1)
 

@@ -14,12 +14,12 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, PlanRequest
 from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import CheckpointError
-from servoid.policy.diffusion.features import Normaliser, Trajectory, raw_layout
 from servoid.policy.diffusion.model import checkpoint
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.runtime import Runtime
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings, load_settings
+from servoid.policy.features import Normaliser, Trajectory, raw_layout
 from servoid.policy.text.captions import MOTIONS, NAMES, caption
 from servoid.policy.text.encoder import code_size, load_encoder
 from servoid.policy.text.nearest_phrase import Phrasebook

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from servoid.hw.config import ConfigError
 from servoid.policy.diffusion.guidance import Diverged, Guidance, classifier_free
-from servoid.policy.diffusion.model.config import DenoiserConfig, Objective
+from servoid.policy.diffusion.model.config import DenoiserConfig, TrainingObjective
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.objective import losses
 from servoid.policy.diffusion.sampler import Known, Sampler
@@ -232,7 +232,13 @@ def planner() -> tuple[Denoiser, Sampler]:
         states[:, 0] = 0.0  # the present says nothing
         loss = sum(
             losses(
-                denoiser, states, z.repeat(1, 4, 1), None, signal, generator, Objective(inference_delay=0, monotone=0.0)
+                denoiser,
+                states,
+                z.repeat(1, 4, 1),
+                None,
+                signal,
+                generator,
+                TrainingObjective(inference_delay=0, monotone=0.0),
             )
         )
         optimiser.zero_grad()

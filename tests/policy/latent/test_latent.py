@@ -14,12 +14,12 @@ from synthetic_recording import write_dataset
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import CheckpointError, read_header
-from servoid.policy.diffusion.dataset import DatasetError, Recording, read_recording
-from servoid.policy.diffusion.features import Normaliser, raw_layout
+from servoid.policy.features import Normaliser, raw_layout
 from servoid.policy.latent.actions import LatentActions, LatentConfig, load_latents, same_latents, save_latents
 from servoid.policy.latent.dataset import Demonstrations
 from servoid.policy.latent.network import Gaussian, LatentNetwork
 from servoid.policy.latent.proprioception import proprioception, proprioception_layout
+from servoid.policy.recording import DatasetError, Recording, read_recording
 
 ROBOT = load_robot()
 N = len(ROBOT.joints)

@@ -6,8 +6,8 @@ import pytest
 from rig_host import Host
 
 from servoid.hw.robot.description import Robot, load_robot
-from servoid.sim.rig.faults import Scenario
 from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.wire.faults import Scenario
 
 
 @pytest.fixture(scope="session")

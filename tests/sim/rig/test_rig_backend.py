@@ -14,8 +14,8 @@ from servoid.hw.contracts.world import Scene
 from servoid.hw.dynamixel.backend import DynamixelBackend
 from servoid.hw.robot.description import load_robot
 from servoid.sim.backend import SimBackend
-from servoid.sim.rig.backend import VirtualBackend
 from servoid.sim.rig.process import control
+from servoid.sim.rig.process.backend import VirtualBackend
 from servoid.sim.rig.process.control import RigProcess
 
 ROBOT = load_robot()

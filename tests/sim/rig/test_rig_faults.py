@@ -11,8 +11,8 @@ from servoid.hw.config import ConfigError
 from servoid.hw.dynamixel.protocol import codec
 from servoid.hw.dynamixel.protocol.codec import parse_fast
 from servoid.hw.robot.description import Robot
-from servoid.sim.rig.faults import EXPECTED, KINDS, Fault, Outcome, load_scenario
 from servoid.sim.rig.rig import Rig
+from servoid.sim.rig.wire.faults import EXPECTED, KINDS, Fault, Outcome, load_scenario
 
 
 def inject(rig: Rig, kind: str, **values: object) -> None:

@@ -167,7 +167,7 @@ class FreeRig:
         for _ in range(20):  # the kernel may take a moment to hand the bytes over
             data += self.port.read(4096)
             time.sleep(0.01)
-        return [packet.id for packet in codec.Parser().feed(data)]
+        return [packet.id for packet in codec.PacketParser().feed(data)]
 
 
 def test_reads_that_a_late_rig_finds_together_were_not_sent_into_answers(rig: Rig, robot: Robot) -> None:

@@ -17,11 +17,11 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Plan, PlanRequest, State
 from servoid.hw.robot.description import load_robot
-from servoid.policy.diffusion.features import Normaliser, raw_layout
 from servoid.policy.diffusion.model import checkpoint
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings
+from servoid.policy.features import Normaliser, raw_layout
 from servoid.stack.control import planner as planner_module
 from servoid.stack.control.diffusion import DiffusionPolicy, diffusion_policy
 from servoid.stack.control.plan_buffer import Pace

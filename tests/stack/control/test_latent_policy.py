@@ -14,11 +14,11 @@ from test_diffusion_policy import INSTRUCTION, ROBOT, Spy, state
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Plan, PlanRequest
 from servoid.policy.checkpoint import CheckpointError, read, read_header, write
-from servoid.policy.diffusion.features import Normaliser, raw_layout, raw_row
 from servoid.policy.diffusion.model import checkpoint
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.settings import DiffusionSettings
+from servoid.policy.features import Normaliser, raw_layout, raw_row
 from servoid.policy.latent.actions import LatentActions, LatentConfig
 from servoid.policy.latent.network import LatentNetwork
 from servoid.policy.latent.proprioception import proprioception_layout

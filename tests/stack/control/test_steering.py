@@ -17,8 +17,7 @@ import pytest
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.task import Episode
 from servoid.hw.contracts.world import Percept
-from servoid.stack.control import operator as steering
-from servoid.stack.control.operator import Gamepad, Keyboard, open_steering
+from servoid.stack.control.operator import Controls, Gamepad, Keyboard, open_steering
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.tasks import load_task
@@ -26,6 +25,10 @@ from servoid.stack.tasks.steer import Steered, SteeredAgain
 from servoid.tools.commands import replay
 
 NOTHING = Percept("task", 0.0)
+# Axes of the virtual gamepad, as on one whose left trigger is axis 3.
+LEFT, FORWARD, TURN, TRIGGER = 0, 1, 2, 3
+END = 1
+MAPPING = "leftx:a0,lefty:a1,rightx:a2,lefttrigger:a3,righttrigger:a4,righty:a5,a:b0,b:b1,x:b2,y:b3,platform:Linux"
 
 
 # --- keys
@@ -105,10 +108,14 @@ class VirtualPad:
         pygame.display.init()
         pygame.joystick.init()
         self._sdl = _loaded_sdl()
-        self.index = self._sdl.SDL_JoystickAttachVirtual(1, 4, 4, 0)  # a game controller: 4 axes, 4 buttons
+        self.index = self._sdl.SDL_JoystickAttachVirtual(1, 6, 4, 0)  # a game controller: 6 axes, 4 buttons
         assert self.index >= 0, "this SDL has no virtual joysticks: the one that comes with pygame's wheel has"
         self._sdl.SDL_JoystickOpen.restype = ctypes.c_void_p
         self._pad = ctypes.c_void_p(self._sdl.SDL_JoystickOpen(self.index))
+        guid = pygame.joystick.Joystick(self.index).get_guid()
+        self._sdl.SDL_GameControllerAddMapping(f"{guid},virtual,{MAPPING}".encode())
+        self.push(TRIGGER, -1.0)  # where a trigger rests
+        self.push(5, 0.0)  # which SDL's own kind of pad has as a trigger
 
     def push(self, axis: int, value: float) -> None:
         self._sdl.SDL_JoystickSetVirtualAxis(self._pad, axis, ctypes.c_int16(round(32767 * value)))
@@ -138,13 +145,13 @@ def pad() -> Iterator[VirtualPad]:
 def test_sticks_walk_and_turn_and_a_button_ends(pad: VirtualPad) -> None:
     device = Gamepad()
     assert device.read().way.tolist() == [0, 0, 0]
-    pad.push(steering.FORWARD_AXIS, -1.0)  # up is negative
-    pad.push(steering.LEFT_AXIS, 0.05)  # within the dead zone
-    pad.push(steering.TURN_AXIS, 0.55)
+    pad.push(FORWARD, -1.0)  # up is negative
+    pad.push(LEFT, 0.05)  # within the dead zone
+    pad.push(TURN, 0.55)
     way = device.read().way
     np.testing.assert_allclose(way, [1.0, 0.0, -0.5], atol=1e-3)
     assert not device.read().ends
-    pad.press(steering.END_BUTTON)
+    pad.press(END)
     assert device.read().ends
     device.close()
 
@@ -152,7 +159,8 @@ def test_sticks_walk_and_turn_and_a_button_ends(pad: VirtualPad) -> None:
 def test_a_gamepad_that_is_unplugged_asks_to_stand(pad: VirtualPad) -> None:
     """Its last stick would otherwise walk the robot on for ever."""
     device = Gamepad()
-    pad.push(steering.FORWARD_AXIS, -1.0)
+    device.read()  # with its sticks in the middle
+    pad.push(FORWARD, -1.0)
     assert device.read().way[0] == pytest.approx(1.0, abs=1e-3)
     pad.unplug()
     device.read()
@@ -160,13 +168,49 @@ def test_a_gamepad_that_is_unplugged_asks_to_stand(pad: VirtualPad) -> None:
     device.close()
 
 
+def test_a_trigger_at_rest_turns_nothing(pad: VirtualPad) -> None:
+    """By its number it was the stick that turns: the robot turned untouched."""
+    device = Gamepad()
+    for _ in range(3):
+        assert device.read().way.tolist() == [0, 0, 0]
+    device.close()
+
+
+def test_sticks_count_once_they_have_been_in_the_middle(pad: VirtualPad, capsys: pytest.CaptureFixture[str]) -> None:
+    pad.push(FORWARD, -1.0)
+    device = Gamepad()
+    for _ in range(3):
+        assert device.read().way.tolist() == [0, 0, 0]
+    assert capsys.readouterr().err.count("let go of the gamepad's sticks") == 1
+    pad.push(FORWARD, 0.0)
+    assert device.read().way.tolist() == [0, 0, 0]
+    pad.push(FORWARD, -1.0)
+    assert device.read().way[0] == pytest.approx(1.0, abs=1e-3)
+    device.close()
+
+
+def test_other_sticks_and_buttons_may_be_chosen(pad: VirtualPad) -> None:
+    device = Gamepad(Controls(forward="righty", turn="leftx", left="rightx", end="x"))
+    device.read()
+    pad.push(5, -1.0)
+    pad.push(LEFT, -0.55)
+    np.testing.assert_allclose(device.read().way, [1.0, 0.0, 0.5], atol=1e-3)
+    pad.press(END)
+    assert not device.read().ends
+    pad.press(2)
+    assert device.read().ends
+    device.close()
+    task = load_task("steer", {"turning_stick": "leftx", "end_button": "x"})
+    assert (task.settings.turning_stick, task.settings.end_button) == ("leftx", "x")
+
+
 def test_a_run_is_steered_by_the_gamepad_and_can_be_replayed(pad: VirtualPad, tmp_path: Path) -> None:
     def steer(record: Any) -> None:
         if record.proposal.instruction is not None:
             ticks.append(record.tick)
-            pad.push(steering.FORWARD_AXIS, -0.8 if len(ticks) > 25 else 0.0)
+            pad.push(FORWARD, -0.8 if len(ticks) > 25 else 0.0)
             if len(ticks) == 150:
-                pad.press(steering.END_BUTTON)
+                pad.press(END)
 
     ticks: list[int] = []
     settings = RunSettings("steer", policy="gait", set={"device": "gamepad"}, record=tmp_path / "steer.mcap")

@@ -30,7 +30,11 @@ from servoid.stack.safety.guard import Phase
 
 ROBOT = load_robot("op3")
 N = len(ROBOT.names)
-HEADER = {"format": FORMAT, "seed": 3, "robot": {"joints": [{"name": name} for name in ROBOT.names]}}
+CHOSEN = {"task": "walk", "backend": "sim", "robot": "op3", "policy": "gait", "seed": 3}
+HEADER = {
+    "format": FORMAT, "seed": 3, "settings": CHOSEN, "task": {}, "backend": "sim", "policy": {"name": "gait"},
+    "robot": {"joints": [{"name": name} for name in ROBOT.names], "rate": ROBOT.rate, "feet": []},
+}  # fmt: skip
 
 
 def tick_record(tick: int, rng: np.random.Generator) -> TickRecord:

@@ -18,15 +18,15 @@ from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Phase
 from servoid.tools.cli import main
 from servoid.tools.commands import replay
-from servoid.tools.commands.rollout import episode, judge
-from servoid.tools.common import flightpath
+from servoid.tools.common.pictures import flightpath
+from servoid.tools.evaluate.judge import judge
 
 NEAR = {"robots": "2", "circle": "0.4", "spread": "0"}  # head-on, so that a run is short
 BLIND = NEAR | {"passing.apart": "0.001"}
 
 
 def test_two_that_walk_at_each_other_touch_and_it_is_seen() -> None:
-    row = episode(RunSettings("cross", policy="gait", seconds=8.0, set=BLIND))
+    row = judge(RunSettings("cross", policy="gait", seconds=8.0, set=BLIND)).row
     assert row["metrics"]["touched"] == 1.0
     assert not row["success"]
 

@@ -13,7 +13,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.world import Truth
 from servoid.hw.robot.description import load_robot
 from servoid.sim.backend import SimBackend
-from servoid.sim.rig.backend import VirtualBackend
+from servoid.sim.rig.process.backend import VirtualBackend
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, run

@@ -10,7 +10,7 @@ import pytest
 
 from servoid.hw.contracts.body import Mode
 from servoid.hw.robot.description import load_robot
-from servoid.sim.rig.backend import VirtualBackend
+from servoid.sim.rig.process.backend import VirtualBackend
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import Result, RunSettings, run
 from servoid.stack.safety.guard import Phase

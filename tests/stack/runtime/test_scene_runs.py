@@ -16,16 +16,16 @@ from servoid.sim.backend import SimBackend
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.runtime.run import RunSettings, prepare, run
 from servoid.tools.commands import replay
-from servoid.tools.commands.rollout import episode, simulation
-from servoid.tools.common import flightpath
 from servoid.tools.common.ground_truth import GroundTruth
+from servoid.tools.common.pictures import flightpath
+from servoid.tools.evaluate.judge import judge, simulation
 
 
 def test_who_walks_into_a_pillar_fails_by_the_truth() -> None:
     """The robot is told of another pillar: its own velocity leads it into the one that stands there."""
     forest = {"places": "0.3,0,0.05", "x": "1", "field.body": "0.001", "field.strength": "0.001"}
     job = RunSettings("forest", policy="gait", seconds=8.0, set=forest)
-    row = episode(job)
+    row = judge(job).row
     assert not row["success"]
     assert row["metrics"]["touched"] == 1.0 or row["fell"]
 
@@ -109,7 +109,7 @@ def test_a_backend_without_the_scene_is_refused() -> None:
     "name", ["goal-near", "goal-far", "velocity", "path", "perturb", "survive", "text", "obstacle"]
 )
 def test_every_task_runs_with_the_gait(name: str) -> None:
-    row = episode(RunSettings(name, policy="gait", seconds=3.0, seed=1))
+    row = judge(RunSettings(name, policy="gait", seconds=3.0, seed=1)).row
     assert row["outcome"] in ("timed_out", "succeeded", "failed")
     assert not row["fell"]
     assert row["metrics"]

@@ -17,10 +17,10 @@ from shipped_runs import ROBOT, Asked, Driven, drive, walked
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Plan, PlanRequest
-from servoid.policy.diffusion.features import Trajectory, raw_layout, to_tokens
+from servoid.policy.features import Trajectory, raw_layout, to_tokens
 from servoid.policy.text.captions import caption
 from servoid.stack.runtime.run import RunSettings, run
-from servoid.stack.tasks.guidance import Weights, obstacle_cost
+from servoid.stack.tasks.terms.guidance import Weights, obstacle_cost
 
 LAYOUT = raw_layout(len(ROBOT.joints))
 SOME = slice(2, None, 5)  # of a run's requests: those that are planned again

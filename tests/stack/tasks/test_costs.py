@@ -11,7 +11,7 @@ from task_bodies import DT, moves
 
 from servoid.hw.contracts.control import Instruction
 from servoid.stack.tasks import load_settings, load_task
-from servoid.stack.tasks.guidance import Weights, goal_cost, ground_cost, obstacle_cost, path_cost, total_cost
+from servoid.stack.tasks.terms.guidance import Weights, goal_cost, ground_cost, obstacle_cost, path_cost, total_cost
 
 TWIST = tuple(f"cost.{name}" for name in ("velocity", "yaw_rate", "displacement", "yaw", "stand"))
 

@@ -14,7 +14,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot, load_robot
-from servoid.policy.diffusion.features import raw_layout
+from servoid.policy.features import raw_layout
 from servoid.sim.kinematics import joint_places
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.runtime.run import RunSettings, run

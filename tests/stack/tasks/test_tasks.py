@@ -21,8 +21,8 @@ from servoid.hw.robot.description import load_robot
 from servoid.policy.text.captions import caption
 from servoid.stack.navigation.go_to_point import SpeedProfile
 from servoid.stack.tasks import find, load_settings, load_task, names
-from servoid.stack.tasks import metrics as measures
-from servoid.stack.tasks.guidance import Weights, integrate_twist, twist_cost
+from servoid.stack.tasks.terms import metrics as measures
+from servoid.stack.tasks.terms.guidance import Weights, integrate_twist, twist_cost
 
 DT = 0.02
 NOTHING = Percept(source="task", age=0.0)

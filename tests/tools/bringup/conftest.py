@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-import servoid.sim.rig.backend
+import servoid.sim.rig.process.backend
 import servoid.sim.rig.process.control
 from servoid.hw.robot.description import load_robot
 from servoid.sim.rig.process.control import RigProcess
@@ -45,7 +45,7 @@ def rig(one_rig: RigProcess, monkeypatch: pytest.MonkeyPatch) -> RigProcess:
     one_rig.control.call("accepted")
     Lent.rig = one_rig
     monkeypatch.setattr(servoid.sim.rig.process.control, "RigProcess", Lent)
-    monkeypatch.setattr(servoid.sim.rig.backend, "RigProcess", Lent)
+    monkeypatch.setattr(servoid.sim.rig.process.backend, "RigProcess", Lent)
     return one_rig
 
 

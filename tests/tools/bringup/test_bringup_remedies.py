@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import pytest
 from test_bringup_scan import VIRTUAL, bus_of, write
 
+from servoid.hw.config import CONFIGS
 from servoid.hw.dynamixel.protocol.tables import table
 from servoid.sim.rig.process.control import RigProcess
 
@@ -97,3 +99,15 @@ def test_an_id_that_others_have_or_obey_is_not_written_to(rig: RigProcess, bring
     code, answer, _ = bringup("setup", "r_knee", "--from", "33", *VIRTUAL, "--yes")
     assert code == 3
     assert "ID 13 at 2000000 bit/s is r_knee (ID 13) already" in answer["error"] or "obeys ID 33" in answer["error"]
+
+
+def test_check_sees_a_servo_of_nobody_on_the_robots_bus(rig: RigProcess, bringup: Any, tmp_path: Path) -> None:
+    """All registers of the joints may be right, and what is written to one moves the stranger too."""
+    text = (CONFIGS / "robots" / "op3.yaml").read_text().replace("op3.xml", str(CONFIGS / "robots" / "op3.xml"))
+    lines = [line for line in text.splitlines() if "name: head_" not in line]  # a robot without a head, on this rig
+    (tmp_path / "headless.yaml").write_text("\n".join(lines))
+    write(rig, 20, secondary_id=14)
+    code, found, _ = bringup("check", *VIRTUAL, "--robot", str(tmp_path / "headless.yaml"))
+    assert (code, found["differences"], found["ready"]) == (1, [], False)
+    assert len(found["strangers"]) == 2
+    assert any("ID 20, 2000000 bit/s: obeys ID 14 too (its secondary ID)" in text for text in found["strangers"])

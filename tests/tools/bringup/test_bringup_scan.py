@@ -15,8 +15,8 @@ from servoid.hw.dynamixel.servos.bus_scan import power_on
 from servoid.hw.dynamixel.transport.bus import Bus
 from servoid.hw.dynamixel.transport.port import SerialPort
 from servoid.hw.robot.description import load_robot
-from servoid.sim.rig.factory_state import FactoryState
 from servoid.sim.rig.process.control import LockedClock, RigProcess
+from servoid.sim.rig.servo.factory_state import FactoryState
 
 ROBOT = load_robot()
 XM430 = table("xm430-w350")

@@ -17,7 +17,7 @@ import pytest
 from servoid.hw.config import ConfigError
 from servoid.stack.log.flightlog import read_log
 from servoid.tools.cli import main
-from servoid.tools.common.video import VideoError
+from servoid.tools.common.pictures.video import VideoError
 
 RUN = ["run", "walk", "--policy", "gait", "--seconds", "2", "--set", "vx=0.1"]
 
@@ -74,9 +74,14 @@ def test_live_line_summary_and_log_for_a_person(capsys):
     assert main(RUN) == 0
     out = capsys.readouterr().out
     assert "asked +0.10 +0.00 m/s" in out
-    assert "goal met after 2.0 s" in out
+    assert "goal met after 2.02 s (times count from the start of the task)" in out
     (log,) = [line.split()[-1] for line in out.splitlines() if "log:" in line]
     assert read_log(log).complete
+
+
+def test_what_the_robot_cannot_do_is_said_before_it_tries(capsys):
+    main(["run", "walk", "--policy", "gait", "--seconds", "0.2", "--set", "vx=9"])
+    assert capsys.readouterr().out.startswith("vx=9 is more than op3 can: 0.5 m/s at most that way")
 
 
 def test_a_fall_is_exit_code_1(capsys):
@@ -96,8 +101,8 @@ def test_a_fall_is_exit_code_1(capsys):
         ([*RUN, "--video", "run.avi"], "ends in .mp4"),
         ([*RUN, "--record", "/proc/log.mcap"], "choose another place"),
         ([*RUN, "--seconds", "-3"], "not a positive number"),
-        (["run", "cross", "--set", "robots=1"], "robots: 1 cannot cross: give 2 to 4"),
-        (["run", "cross", "--set", "robots=5"], "robots: 5 cannot cross: give 2 to 4"),
+        (["run", "cross", "--set", "robots=1"], "robots: must be 2 to 4, not 1"),
+        (["run", "cross", "--set", "robots=5"], "robots: must be 2 to 4, not 5"),
         (["run", "cross", "--set", "circle=0.3"], "circle: 0.3 m is too small a radius for 3 robots"),
         (["run", "cross", "--backend", "virtual"], "backend 'virtual' has one robot, and the task asks for 3"),
         (["run", "cross", "--backend", "dynamixel", "--port", "x", "--start"], "give --backend sim"),
@@ -221,7 +226,7 @@ def test_a_disk_that_fills_up_ends_the_run_safe(tmp_path):
     ],
 )
 def test_without_a_way_to_draw_the_run_still_succeeds(error, tmp_path, monkeypatch, capsys):
-    from servoid.tools.common import video
+    from servoid.tools.common.pictures import video
 
     def broken(*_):
         raise error
@@ -235,7 +240,7 @@ def test_without_a_way_to_draw_the_run_still_succeeds(error, tmp_path, monkeypat
 
 
 def test_a_picture_that_cannot_be_written_leaves_the_result_alone(tmp_path, monkeypatch, capsys):
-    from servoid.tools.common import video
+    from servoid.tools.common.pictures import video
 
     monkeypatch.setattr(video, "make_video", lambda *_: None)
     (tmp_path / "a.png").mkdir()

@@ -15,8 +15,11 @@ import serial
 from waiting import until
 
 from servoid.hw.dynamixel.protocol import codec
+from servoid.sim.rig.process.control import RigProcess
 from servoid.stack.log.flightlog import read_log
 from servoid.tools.cli import main
+from servoid.tools.commands.run import tell_lateness
+from servoid.tools.common.output import reporting
 
 RUN = ["run", "walk", "--policy", "gait", "--backend", "virtual"]
 
@@ -112,6 +115,23 @@ def test_joints_of_a_limp_virtual_robot_are_moved_by_a_command(capsys: pytest.Ca
         assert main(["virtual", *words]) == 2
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=120)
+
+
+def test_a_run_says_that_it_was_the_rig_that_was_late(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """On a busy machine the driver would blame cable and latency timer. Here the rig is held up for a moment."""
+    with RigProcess(clock="real") as rig, reporting(False) as report:
+        (tmp_path / "rig.control").symlink_to(rig.control_path)
+        tell_lateness(report, str(tmp_path / "rig"))  # what was late while it started is told by now
+        os.kill(rig.process.pid, signal.SIGSTOP)
+        time.sleep(0.1)
+        os.kill(rig.process.pid, signal.SIGCONT)
+        capsys.readouterr()
+        tell_lateness(report, str(tmp_path / "rig"))
+        tell_lateness(report, "/dev/ttyUSB0")
+        report.result({})
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("the virtual rig was late")
+    assert "say nothing about cable, adapter or latency timer" in line
 
 
 def test_a_locked_rig_that_nobody_could_advance_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from servoid.hw.robot.description import load_robot
-from servoid.sim.rig.faults import EXPECTED
+from servoid.sim.rig.wire.faults import EXPECTED
 from servoid.stack.safety.guard import LOWER_SECONDS, REST_SECONDS
 from servoid.tools.cli import main
 from servoid.tools.common.worker_pool import Lost

@@ -18,8 +18,8 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.robot.description import Robot, load_robot
-from servoid.policy.diffusion.dataset import read_recording
-from servoid.policy.diffusion.features import raw_layout
+from servoid.policy.features import raw_layout
+from servoid.policy.recording import read_recording
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.gait import GaitPolicy
 from servoid.tools import cli

@@ -17,13 +17,14 @@ from servoid.hw.contracts.control import Instruction
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.checkpoint import read_header
-from servoid.policy.diffusion.dataset import Windows, read_recording
-from servoid.policy.diffusion.features import raw_mirror, raw_row
+from servoid.policy.diffusion.dataset import Windows
 from servoid.policy.diffusion.model.action_space import load_action_space
 from servoid.policy.diffusion.model.checkpoint import load
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.settings import load_settings
+from servoid.policy.features import raw_mirror, raw_row
 from servoid.policy.latent.actions import load_latents, same_latents
+from servoid.policy.recording import read_recording
 from servoid.stack.control.diffusion import diffusion_policy
 from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.latent_roundtrip import recoded_survival

@@ -12,8 +12,10 @@ from test_train_diffusion import CONFIG, QUICK, ROBOT, Measured, trainer
 
 from servoid.hw.config import ConfigError
 from servoid.policy.checkpoint import read_header
-from servoid.policy.diffusion.dataset import Windows, read_recording
+from servoid.policy.diffusion.dataset import Windows
 from servoid.policy.latent.dataset import Demonstrations
+from servoid.policy.recording import read_recording
+from servoid.tools.learn.progress import ProgressLine
 from servoid.tools.learn.settings import LatentTraining
 from servoid.tools.learn.trainers import latent
 from servoid.tools.learn.trainers.diffusion import DiffusionTrainer
@@ -91,3 +93,25 @@ def test_a_checkpoint_says_what_it_was_begun_with_also_after_going_on(windows: W
     assert "begun_with" not in header(run())["results"]
     with pytest.raises(ConfigError, match="trained on new walks, not on other walks"):
         run("other walks").resume()
+
+
+def test_the_time_that_is_left_is_that_of_this_calls_pace(capsys: pytest.CaptureFixture[str]) -> None:
+    """A run that goes on must not divide what was done before by the seconds of this call, nor the reverse."""
+    with ProgressLine(0.5) as line:
+        line.trained(0.6, 60.0, "step 6")
+        line.trained(0.7, 60.0, "step 7")
+        line.note("measuring in closed loop ...")
+    shown = capsys.readouterr().err
+    assert "4 min left, step 6" in shown
+    assert "3 min left, step 7" in shown
+    assert "measuring in closed loop ..." in shown
+
+
+def test_a_training_ends_with_the_next_command(
+    windows: Windows, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainer(windows, tmp_path, Measured(1.0), replace(QUICK, steps=2, evaluate_every=0.0)).run()
+    shown = capsys.readouterr().err
+    assert "measuring on held-out data ..." in shown  # where it would stand at 100 %
+    command = f"servoid rollout walk --policy {tmp_path / 'best.safetensors'} --episodes 50"
+    assert shown.splitlines()[-1] == f"next: {command}"

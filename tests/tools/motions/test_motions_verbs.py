@@ -40,7 +40,7 @@ def nod(tmp_path: Path, motions: Motions) -> Path:
     told = ("--caption", "look to the left", "--licence", "Apache-2.0", "--out", folder)
     code, answer, err = motions("import", path, "--page", 7, "--name", "look-left", *told)
     assert code == 0, err
-    assert answer["seconds"] == pytest.approx(170 * 0.008 + 0.5, abs=0.03)
+    assert answer["clips"][0]["seconds"] == pytest.approx(170 * 0.008 + 0.5, abs=0.03)
     return folder
 
 
@@ -51,7 +51,7 @@ def test_a_page_becomes_a_clip_that_stands_and_says_where_it_comes_from(nod: Pat
     clip = Library(ROBOT, nod)["look-left"]
     assert clip.joints[:, 0].max() == pytest.approx(500 * 2 * np.pi / 4096, abs=0.01)
     assert clip.root_position[:, 2].min() > 0.9 * ROBOT.standing_height
-    code, played, _ = motions("play", "look-left", "--library", nod, "--worlds", 4)
+    code, played, _ = motions("play", "look-left", "--library", nod)
     assert (code, played["stands_share"]) == (0, 1.0)
     assert played["joint_error_rad"] < 0.1
     code, checked, _ = motions("check", "--library", nod)
@@ -90,7 +90,7 @@ def test_a_run_becomes_a_clip(tmp_path: Path, motions: Motions, monkeypatch: pyt
     code, answer, err = motions("import", log, "--name", "walk", *told)
     assert code == 0, err
     clip = Library(ROBOT, tmp_path / "clips")["walk"]
-    assert answer["ticks"] == clip.ticks == pytest.approx(100, abs=2)
+    assert answer["clips"][0]["ticks"] == clip.ticks == pytest.approx(100, abs=2)
     assert clip.root_position[-1, 0] > 0.1
 
 
@@ -103,7 +103,10 @@ def test_a_run_becomes_a_clip(tmp_path: Path, motions: Motions, monkeypatch: pyt
         (("import", "{}/motion.bin", "--name", "look-left", "--page", 7), "look-left.safetensors: exists already"),
         (("play", "look-lfet", "--library", "{}/clips"), "did you mean 'look-left'?"),
         (("play", "look-left", "--library", "{}/clips", "--rate", 0), "--rate 0: must be between 0.1 and 10"),
-        (("play", "look-left", "--library", "{}/clips", "--worlds", 0), "--worlds 0: must be at least 1"),
+        (
+            ("play", "look-left", "--library", "{}/clips", "--worlds", 5),
+            "--worlds 5: must be at least 1, and goes with --randomise",
+        ),
         (("list", "--library", "{}/none"), "none: no such folder of clips"),
         (("play", "{}/motion.bin.safetensors"), "no such checkpoint"),
     ],
@@ -116,8 +119,39 @@ def test_mistakes_are_named(nod: Path, tmp_path: Path, motions: Motions, words: 
 
 
 def test_a_page_beyond_the_joint_ranges_is_refused_with_the_joints(tmp_path: Path, motions: Motions) -> None:
-    path = file(tmp_path, {7: page((HOME | {14: 2048 + 1600}, 80, 0))})
+    path = file(tmp_path, {7: page((HOME | {14: 2048 + 1800}, 80, 0))})
     told = ("--caption", "x", "--licence", "MIT", "--out", tmp_path / "clips")
     code, answer, _ = motions("import", path, "--page", 7, "--name", "x", *told)
     assert code == 2
-    assert "page 7 goes beyond the joint ranges of op3: l_knee by 0.26 rad" in answer["error"]
+    assert "page 7 goes beyond the joint ranges of op3: l_knee by 0.25 rad" in answer["error"]
+
+
+def test_a_recipe_makes_all_of_its_clips_one_after_the_other(tmp_path: Path, motions: Motions) -> None:
+    bent = HOME | {14: HOME[14] + 100, 13: HOME[13] - 100}
+    path = file(tmp_path, {7: page((bent, 80, 0)), 8: page(({19: HOME[19] + 300}, 40, 0))})
+    recipe = tmp_path / "two.yaml"
+    text = "licence: MIT\nclips:\n  - {page: 7, name: bend, captions: [bend]}\n"
+    recipe.write_text(text + "  - {page: 8, name: look, captions: [look], after: bend}\n")
+    code, answer, err = motions("import", path, "--recipe", recipe, "--out", tmp_path / "clips")
+    assert code == 0, err
+    assert [clip["name"] for clip in answer["clips"]] == ["bend", "look"]
+    library = Library(ROBOT, tmp_path / "clips")
+    np.testing.assert_allclose(library["look"].joints[0], library["bend"].joints[-1], atol=1e-6)
+    recipe.write_text(text + "  - {page: 8, name: look, captions: [look], after: bent}\n")
+    code, answer, _ = motions("import", path, "--recipe", recipe, "--out", tmp_path / "clips", "--replace")
+    assert (code, "after: 'bent' is no clip before it" in answer["error"]) == (2, True)
+    recipe.write_text(text + "  - {pgae: 8, name: look, captions: [look]}\n")
+    code, answer, _ = motions("import", path, "--recipe", recipe, "--out", tmp_path / "clips", "--replace")
+    assert (code, "two.yaml:4: clips[1].pgae: unknown key" in answer["error"]) == (2, True)
+
+
+def test_the_shipped_clips_fit_the_robot_and_stand_open_loop(motions: Motions) -> None:
+    """They are what `servoid motions import --recipe op3-action-file` makes of the manufacturer's file."""
+    from servoid.tools.motions.recipe import load_recipe
+
+    recipe = load_recipe("op3-action-file")
+    shipped = {clip["name"]: clip for clip in motions("list")[1]["clips"]}
+    assert shipped.keys() == {clip.name for clip in recipe.clips}
+    assert {clip["licence"] for clip in shipped.values()} == {recipe.licence}
+    for name in ("bow", "get-up-front", "get-up-back"):
+        assert motions("play", name)[1]["stands_share"] == 1.0, name

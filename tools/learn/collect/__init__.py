@@ -141,7 +141,7 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
 
 def _features(robot: Robot) -> dict[str, Feature]:
     """The dataset's columns and the names of their numbers."""
-    from servoid.policy.diffusion.features import recorded_names
+    from servoid.policy.features import recorded_names
     from servoid.tools.learn.collect.lerobot import Feature
 
     notes = {

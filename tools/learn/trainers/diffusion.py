@@ -16,8 +16,8 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
-from servoid.policy.diffusion.features import token_layout
-from servoid.policy.diffusion.model.config import DenoiserConfig, DenoiserShape, Objective
+from servoid.policy.diffusion.model.config import DenoiserConfig, DenoiserShape, TrainingObjective
+from servoid.policy.features import token_layout
 from servoid.policy.text.encoder import load_encoder
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.settings import DiffusionTraining
@@ -52,8 +52,9 @@ def main(args: argparse.Namespace) -> int:
     import torch
 
     from servoid.hw.robot.description import load_robot
-    from servoid.policy.diffusion.dataset import Windows, read_recording
+    from servoid.policy.diffusion.dataset import Windows
     from servoid.policy.latent.actions import load_latents
+    from servoid.policy.recording import read_recording
 
     # What cannot be trained or measured is refused before the data is read.
     settings = read_settings(args, DiffusionTraining())
@@ -215,7 +216,7 @@ class DiffusionTrainer(Trainer):
         states, actions, text = self.windows.held_out(count)
         # The same measure whatever else is trained for, so that runs can be compared.
         same = self.settings
-        measure = Objective(same.inference_delay, same.near_actions, same.far_actions, monotone=0.0)
+        measure = TrainingObjective(same.inference_delay, same.near_actions, same.far_actions, monotone=0.0)
         with torch.inference_mode():
             given = states, actions, text, self.signal, torch.Generator().manual_seed(0)
             return losses(network, *given, measure)[1].item()
@@ -255,7 +256,7 @@ class DiffusionTrainer(Trainer):
 
     def restore(self, path: Path, saved: Mapping[str, Any]) -> None:
         """See `Trainer.restore`."""
-        from servoid.policy.diffusion.features import Normaliser
+        from servoid.policy.features import Normaliser
 
         latents = _arrays(saved["latents"])
         ours = self.windows.latents.to_tensors() if self.windows.latents else {}

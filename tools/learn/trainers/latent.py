@@ -40,8 +40,8 @@ def main(args: argparse.Namespace) -> int:
     import torch
 
     from servoid.hw.robot.description import load_robot
-    from servoid.policy.diffusion.dataset import read_recording
     from servoid.policy.latent.dataset import Demonstrations
+    from servoid.policy.recording import read_recording
 
     settings = read_settings(args, LatentTraining())
     torch.set_num_threads(args.threads)

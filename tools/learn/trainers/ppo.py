@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -266,4 +268,5 @@ def _algorithm(env: Environment, s: Ppo) -> Any:
             "use_clipped_value_loss": False,  # its clip is absolute: with returns of tens the critic never gets there
         },
     }
-    return PPO.construct_algorithm(tensors(env), Shape, config, "cpu")
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks' layers
+        return PPO.construct_algorithm(tensors(env), Shape, config, "cpu")

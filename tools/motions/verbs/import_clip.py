@@ -1,108 +1,99 @@
-"""Import a motion from a file: an action file of ROBOTIS (.bin), or a flight log of this project (.mcap).
+"""Import motions from a file: an action file of ROBOTIS (.bin), or a flight log of this project (.mcap).
 
 Of an action file, the chain of pages that begins with --page is played as the firmware plays it, in physics, where the
-way of the base comes from. Of a flight log, the goals that were sent are taken, and the way that the robot believed to
-have gone.
+way of the base comes from; or all clips of a --recipe, a YAML file that lists pages, names and captions. Of a flight
+log, the goals that were sent are taken, and the way that the robot believed to have gone.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import Robot, load_robot
-from servoid.policy.motion.clip import About, Clip
+from servoid.policy.motion.clip import POSES, Clip
 from servoid.tools.common.exit_codes import DONE
 from servoid.tools.common.output import add_json_argument, reporting
-from servoid.tools.motions.action_file import chain, joint_goals, read_pages
-from servoid.tools.motions.verbs.options import add_about_arguments, add_out_arguments, out_library
-
-AFTER_SECONDS = 0.5  # that the last goal is held, so that what it leads to is seen
+from servoid.tools.motions.action_file import read_pages
+from servoid.tools.motions.recipe import PageClip, Recipe, load_recipe, make_clips
+from servoid.tools.motions.verbs.options import add_out_arguments, out_library
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, help="action file (.bin) or flight log (.mcap)")
-    parser.add_argument("--name", required=True, help="of the clip")
-    parser.add_argument("--page", type=int, metavar="N", help="first page of an action file")
-    add_about_arguments(parser)
+    parser.add_argument("--recipe", metavar="NAME|FILE", help="what to make of an action file, such as op3-action-file")
+    one = parser.add_argument_group("one clip, instead of a recipe")
+    one.add_argument("--name", help="of the clip")
+    one.add_argument("--page", type=int, metavar="N", help="first page of an action file")
+    one.add_argument("--caption", action="append", default=[], metavar="TEXT", help="what it shows; repeatable")
+    one.add_argument("--licence", metavar="TEXT", help="who may use it, such as Apache-2.0")
+    for end in ("begins", "ends"):
+        one.add_argument(f"--{end}", choices=POSES, default="upright", help=f"how it {end} (default: upright)")
+    one.add_argument("--loop", action="store_true", help="its last frame leads on to its first")
     add_out_arguments(parser)
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     add_json_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
+    """Raises ConfigError."""
     with reporting(args.json) as report:
         robot = load_robot(args.robot)
-        library = out_library(args, robot)
-        make = {".bin": _from_action_file, ".mcap": _from_log}.get(args.file.suffix)
-        if make is None:
+        if args.file.suffix not in (".bin", ".mcap"):
             raise ConfigError(f"{args.file}: not an action file (.bin) or a flight log (.mcap)")
-        clip = make(args, robot)
-        path = library.add(clip, replace=args.replace)
-        report.line(f"{path}: {clip.ticks * robot.dt:.1f} s, {clip.about.begins} to {clip.about.ends}")
-        report.line(
-            f"next: servoid motions play {clip.name} --library {args.out}, to see whether it stays up open loop"
-        )
-        report.result({"path": path, "name": clip.name, "seconds": clip.ticks * robot.dt, "ticks": clip.ticks})
+        recipe = _recipe(args)
+        library = out_library(args, robot)
+        clips: Iterable[Clip]
+        if args.file.suffix == ".bin":
+            clips = make_clips(args.file, recipe, robot)
+        else:
+            clips = [_from_log(args.file, recipe.clips[0], recipe.licence, robot)]
+        made = []
+        for clip in clips:
+            path = library.add(clip, replace=args.replace)
+            seconds = clip.ticks * robot.dt
+            report.line(f"{path}: {seconds:.1f} s, {clip.about.begins} to {clip.about.ends}")
+            made.append({"path": path, "name": clip.name, "seconds": seconds, "ticks": clip.ticks})
+        last = made[-1]["name"]
+        report.line(f"next: servoid motions play {last} --library {args.out}, to see whether it stays up open loop")
+        report.result({"clips": made})
     return DONE
 
 
-def _about(args: argparse.Namespace, source: str) -> About:
-    try:
-        return About(tuple(args.caption), source, args.licence, args.begins, args.ends, args.loop)
-    except ValueError as error:
-        raise ConfigError(f"--caption, --licence: {error}") from None
-
-
-def _from_action_file(args: argparse.Namespace, robot: Robot) -> Clip:
-    """Raises ConfigError, also where a goal is beyond a joint's range: another motion would be played."""
-    from servoid.tools.motions.physics import play
-
-    if args.page is None:
+def _recipe(args: argparse.Namespace) -> Recipe:
+    """What to make, by the recipe or by the options of one clip."""
+    if args.recipe is not None:
+        if args.name is not None or args.page is not None:
+            raise ConfigError("--recipe says all of its clips: leave out --name and --page")
+        if args.file.suffix != ".bin":
+            raise ConfigError(f"--recipe {args.recipe}: is for action files; of a flight log give --name")
+        return load_recipe(args.recipe)
+    for option in ("name", "caption", "licence"):
+        if not vars(args)[option]:
+            raise ConfigError(f"--{option}: missing; a clip needs --name, --caption and --licence, or give a --recipe")
+    if args.page is None and args.file.suffix == ".bin":
         named = ", ".join(f"{page.number} {page.name}".strip() for page in read_pages(args.file).values())
         raise ConfigError(f"{args.file}: say which page with --page; it has {named}")
-    pages = chain(read_pages(args.file), args.page, args.file)
-    goals = joint_goals(pages, robot, robot.home)
-    if args.begins != "upright":  # nobody lies in the home pose: the first goal is where it begins
-        goals = joint_goals(pages, robot, _first_goals(goals))
-    beyond = np.maximum(robot.lower - goals, goals - robot.upper).max(0)
-    if (beyond > 0.01).any():
-        far = [f"{robot.names[i]} by {beyond[i]:.2f}" for i in np.flatnonzero(beyond > 0.01)]
-        raise ConfigError(
-            f"{args.file}: page {args.page} goes beyond the joint ranges of {robot.name}: {', '.join(far)} rad"
-        )
-    held = np.concatenate([goals, np.repeat(goals[-1:], round(AFTER_SECONDS * robot.rate), 0)])
-    source = f"{args.file.name}, pages {', '.join(str(page.number) for page in pages)}"
-    return play(held, robot, begins=args.begins).as_clip(args.name, _about(args, source))
+    page = PageClip(args.page or 0, args.name, tuple(args.caption), args.begins, args.ends, args.loop)
+    return Recipe(args.licence, (page,))
 
 
-def _first_goals(goals: np.ndarray) -> np.ndarray:
-    """The pose that a motion first comes to rest in, or its last one where it never does."""
-    still = np.abs(np.diff(goals, axis=0)).max(1) < 1e-6
-    moving = np.flatnonzero(~still)
-    rest = np.flatnonzero(still[moving[0] :]) if len(moving) else np.array([], int)
-    return goals[moving[0] + rest[0]] if len(rest) else goals[-1]
-
-
-def _from_log(args: argparse.Namespace, robot: Robot) -> Clip:
+def _from_log(file: Path, wanted: PageClip, licence: str, robot: Robot) -> Clip:
     from servoid.stack.log.flightlog import read_log
 
-    log = read_log(args.file)
+    log = read_log(file)
     ticks = log.ticks("/instruction")
     if len(ticks) < 2:
-        raise ConfigError(f"{args.file}: its task never began: there is no motion in it")
+        raise ConfigError(f"{file}: its task never began: there is no motion in it")
     states, commands = (np.isin(log.ticks(channel), ticks) for channel in ("/state", "/command"))
-    clip = Clip(
-        args.name,
-        log.column("/command", "position")[commands],
-        log.column("/state", "displacement")[states].astype(float),
-        log.column("/state", "orientation")[states].astype(float),
-        log.column("/state", "contact")[states].astype(float),
-        _about(args, f"flight log {args.file.name}"),
+    goals = log.column("/command", "position")[commands]
+    if goals.shape[1] != len(robot.joints):
+        raise ConfigError(f"{file}: has {goals.shape[1]} joints, and {robot.name} {len(robot.joints)}")
+    place, turn, contact = (
+        log.column("/state", field)[states].astype(float) for field in ("displacement", "orientation", "contact")
     )
-    if clip.joints.shape[1] != len(robot.joints):
-        raise ConfigError(f"{args.file}: has {clip.joints.shape[1]} joints, and {robot.name} {len(robot.joints)}")
-    return clip.placed()
+    return Clip(wanted.name, goals, place, turn, contact, wanted.about(f"flight log {file.name}", licence)).placed()

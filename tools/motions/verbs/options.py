@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from servoid.hw.robot.description import Robot, load_robot
-from servoid.policy.motion.clip import POSES, SUFFIX, Clip, load
+from servoid.policy.motion.clip import SUFFIX, Clip, load
 from servoid.policy.motion.library import SHIPPED, Library
 from servoid.tools.common.output import add_json_argument
 
@@ -22,14 +22,6 @@ def add_library_arguments(parser: argparse.ArgumentParser) -> None:
 def add_out_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write the clip into")
     parser.add_argument("--replace", action="store_true", help="overwrite a clip of that name")
-
-
-def add_about_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--caption", action="append", required=True, metavar="TEXT", help="what it shows; repeatable")
-    parser.add_argument("--licence", required=True, metavar="TEXT", help="who may use it, such as Apache-2.0")
-    for end in ("begins", "ends"):
-        parser.add_argument(f"--{end}", choices=POSES, default="upright", help=f"how it {end} (default: upright)")
-    parser.add_argument("--loop", action="store_true", help="its last frame leads on to its first")
 
 
 def open_library(args: argparse.Namespace) -> Library:

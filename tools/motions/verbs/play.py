@@ -1,4 +1,7 @@
-"""Play a clip open loop in physics: the goals alone, without a controller, on many robots drawn at random."""
+"""Play a clip open loop in physics: the goals alone, without a controller.
+
+The nominal robot does the same every time, so it plays once; --randomise draws --worlds robots.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,8 @@ HOLD_SECONDS = 1.0  # of the last goal: a robot that is about to fall has fallen
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("clip", help="name in the library, or a file")
-    parser.add_argument("--worlds", type=int, default=20, metavar="N", help="robots (default: 20)")
     parser.add_argument("--randomise", action="store_true", help="draw each robot's mass, friction, delays ...")
+    parser.add_argument("--worlds", type=int, metavar="N", help="robots that are drawn (default: 40)")
     parser.add_argument("--rate", type=float, default=1.0, help="times as fast (default: 1)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
     add_library_arguments(parser)
@@ -28,8 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         check_seed(args.seed)
-        if args.worlds < 1:
-            raise ConfigError(f"--worlds {args.worlds}: must be at least 1")
+        if args.worlds is not None and (args.worlds < 1 or not args.randomise):
+            raise ConfigError(f"--worlds {args.worlds}: must be at least 1, and goes with --randomise")
+        worlds = (args.worlds or 40) if args.randomise else 1
         if not 0.1 <= args.rate <= 10.0:
             raise ConfigError(f"--rate {args.rate:g}: must be between 0.1 and 10")
         from servoid.tools.motions.physics import play
@@ -38,19 +42,19 @@ def main(args: argparse.Namespace) -> int:
         goals = clip.at_rate(args.rate).joints
         held = np.concatenate([goals, np.repeat(goals[-1:], round(HOLD_SECONDS * robot.rate), 0)])
         played = play(
-            held, robot, begins=clip.about.begins, worlds=args.worlds, randomise=float(args.randomise), seed=args.seed
+            held, robot, begins=clip.about.begins, worlds=worlds, randomise=float(args.randomise), seed=args.seed
         )
         upright = clip.about.ends == "upright"
         stood = int(played.stands.sum())
         error = float(np.sqrt(np.mean((played.joints - played.goals) ** 2)))
         result = {
             "clip": clip.name,
-            "worlds": args.worlds,
+            "worlds": worlds,
             "randomised": args.randomise,
             "rate": args.rate,
             "seconds": len(goals) * robot.dt,
-            "stands_share": stood / args.worlds if upright else None,
-            "stands_ci95": wilson(stood, args.worlds) if upright else None,
+            "stands_share": stood / worlds if upright else None,
+            "stands_ci95": wilson(stood, worlds) if upright and worlds > 1 else None,
             "joint_error_rad": error,
             "torque_p99_nm": float(np.percentile(np.abs(played.effort), 99)),
             "height_at_end_m": float(played.place[:, -1, 2].mean()),

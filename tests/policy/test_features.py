@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import load_robot
-from servoid.policy.diffusion.features import (
+from servoid.policy.features import (
     Normaliser,
     Trajectory,
     raw_layout,

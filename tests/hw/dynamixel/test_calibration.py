@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from servoid.hw.config import ConfigError
-from servoid.hw.dynamixel.protocol.tables import table
-from servoid.hw.dynamixel.protocol.units import Units
-from servoid.hw.robot.calibration import (
+from servoid.hw.dynamixel.calibration import (
     Calibration,
     JointCalibration,
     apply,
@@ -21,6 +19,8 @@ from servoid.hw.robot.calibration import (
     load_calibration,
     save_calibration,
 )
+from servoid.hw.dynamixel.protocol.tables import table
+from servoid.hw.dynamixel.protocol.units import Units
 from servoid.hw.robot.description import load_robot
 from servoid.stack.runtime.run import RunSettings, run
 

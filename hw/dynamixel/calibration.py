@@ -7,6 +7,7 @@ the robot's file by them.
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 from dataclasses import asdict, dataclass, replace
@@ -20,6 +21,7 @@ from servoid.hw.config import ConfigError, load_marked, nearest
 from servoid.hw.dynamixel.protocol.tables import table
 from servoid.hw.dynamixel.protocol.units import Units
 from servoid.hw.robot.description import Robot
+from servoid.hw.user_folders import user_folder
 
 
 @dataclass(frozen=True)
@@ -49,10 +51,14 @@ class Calibration:
 
 
 def calibration_path(robot: Robot) -> Path:
-    """Where the calibration of a robot of this name is kept: in $XDG_CONFIG_HOME, or ~/.config, under servoid/."""
-    given = os.environ.get("XDG_CONFIG_HOME", "")
-    base = Path(given) if os.path.isabs(given) else Path.home() / ".config"  # a relative one is to be ignored
-    return base / "servoid" / "calibration" / f"{quote(robot.name, safe='')}.yaml"
+    """Where the calibration of a robot of this name is kept: in $XDG_CONFIG_HOME, or ~/.config, under servoid/.
+
+    Raises ConfigError for a user who has neither.
+    """
+    folder = user_folder("XDG_CONFIG_HOME", ".config")
+    if folder is None:
+        raise ConfigError("you have no home folder: set XDG_CONFIG_HOME to a folder that keeps your calibrations")
+    return folder / "calibration" / f"{quote(robot.name, safe='')}.yaml"
 
 
 def load_calibration(path: Path) -> Calibration:
@@ -70,15 +76,48 @@ def save_calibration(calibration: Calibration, path: Path) -> Path | None:
         earlier = None
         if path.exists():
             earlier = _free(path.with_name(f"{path.stem}-until-{datetime.now():%Y%m%d-%H%M%S}.yaml"))
-            os.link(path, earlier)  # so that there is a calibration at every instant
-        partial = path.with_name(path.name + ".partial")
-        partial.write_text(yaml.safe_dump(asdict(calibration), sort_keys=False, default_flow_style=None))
-        os.replace(partial, path)
+            _write(earlier, path.read_bytes())  # a copy, so that there is a calibration at every instant
+        _write(path, as_text(calibration).encode())
     except OSError as error:
-        raise ConfigError(
-            f"{path}: cannot be written: {error.strerror}: set XDG_CONFIG_HOME to a folder of yours"
-        ) from error
+        raise _cannot_write(path, error) from error
     return earlier
+
+
+def check_writable(path: Path) -> None:
+    """Do what `save_calibration` does, with a file beside `path` that is deleted again: twenty joints shall not be
+    measured for nothing. Raises ConfigError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
+        if path.exists():
+            path.read_bytes()
+        trial = path.with_name(f"{path.name}.trial")
+        _write(trial, b"")
+        trial.unlink()
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+
+
+def as_text(calibration: Calibration) -> str:
+    """The calibration as its file has it."""
+    return str(yaml.safe_dump(asdict(calibration), sort_keys=False, default_flow_style=None))
+
+
+def _write(path: Path, data: bytes) -> None:
+    """A file, whole or not at all, and on the disk."""
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+
+
+def _cannot_write(path: Path, error: OSError) -> ConfigError:
+    return ConfigError(
+        f"{path}: cannot be written: {error.strerror}: set XDG_CONFIG_HOME to a folder of yours, or give --out FILE"
+    )
 
 
 def apply(robot: Robot, calibration: Calibration, source: str = "the calibration") -> Robot:
@@ -117,8 +156,15 @@ def calibrated(robot: Robot) -> tuple[Robot, str]:
 
     Without a calibration it is that of its file. Raises ConfigError for a calibration that cannot be used.
     """
-    path = calibration_path(robot)
-    if not path.exists():
+    try:
+        path = calibration_path(robot)
+    except ConfigError as error:
+        return robot, f"not calibrated: zero and direction are those of the robot's file ({error})"
+    try:
+        there = path.exists()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}: is there a calibration or not?") from error
+    if not there:
         return robot, f"not calibrated: zero and direction are those of the robot's file (there is no {path})"
     calibration = load_calibration(path)
     return apply(robot, calibration, str(path)), f"calibrated on {calibration.date[:10]}: {path}"

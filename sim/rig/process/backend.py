@@ -7,7 +7,6 @@ while the controller thinks, so that a run comes out the same every time.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -20,6 +19,7 @@ from servoid.hw.dynamixel.motors import DynamixelMotors
 from servoid.hw.dynamixel.sensors import DynamixelSensors
 from servoid.hw.robot.description import Robot
 from servoid.sim.rig.process.control import Control, LockedClock, RigProcess, RigTruth
+from servoid.sim.rig.servo.board import on_the_board
 from servoid.sim.scene import Stage
 
 
@@ -58,7 +58,7 @@ class VirtualBackend:
         if self._rig is not None:
             raise BackendError("the virtual rig is connected already")
         try:
-            rig = self._rig = RigProcess(self._robot, seed=self._seed, randomise=self._randomise)
+            rig = self._rig = RigProcess(on_the_board(self._robot), seed=self._seed, randomise=self._randomise)
             if self.stage is not None:
                 rig.control.furnish(self.stage.scene, self._seed, randomise=self._randomise)
             self._rig_truth = rig.truth(None if self.stage is None else self.stage.scene)
@@ -97,11 +97,6 @@ class VirtualBackend:
             raise BackendError("the virtual rig is not connected: it has no truth")
         self._clock.deliver()
         return self._rig_truth.fetch()
-
-
-def on_the_board(robot: Robot) -> Robot:
-    """The robot with its IMU on the bus, mounted as it is: a virtual rig has no other."""
-    return replace(robot, imu=replace(robot.imu, kind="opencr", port=None))
 
 
 class VirtualClock:
