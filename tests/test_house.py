@@ -158,6 +158,52 @@ def test_a_question_is_seen(code: str) -> None:
     assert len(list(asked(code))) == 1
 
 
+CLOCKS = {f"{name}{unit}" for name in ("time", "monotonic", "perf_counter", "process_time") for unit in ("", "_ns")}
+
+
+def timed(code: str) -> list[int]:
+    """Lines of comparisons with the time of a clock that is read there, or that an operand was calculated from. One
+    that is passed to a function, as a deadline is, counts for nothing."""
+
+    def reads(node: ast.AST, names: set[str]) -> bool:
+        if isinstance(node, ast.Call):
+            function = ast.unparse(node.func)
+            if function.removeprefix("time.") in CLOCKS:
+                return True
+            if function not in ("abs", "round", "float", "int", "min", "max"):
+                return False
+        of_one = isinstance(node, ast.Name) and node.id in names
+        return of_one or any(reads(child, names) for child in ast.iter_child_nodes(node))
+
+    found = set()
+    for scope in (node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.FunctionDef)):
+        names: set[str] = set()
+        for node in ast.walk(scope):
+            if isinstance(node, ast.Assign) and reads(node.value, names):
+                names |= {part.id for target in node.targets for part in ast.walk(target) if isinstance(part, ast.Name)}
+        found |= {node.lineno for node in ast.walk(scope) if isinstance(node, ast.Compare) and reads(node, names)}
+    return sorted(found)
+
+
+def test_no_test_asserts_on_a_clock() -> None:
+    """It would fail where two other programs are busy. How long a thing takes is for `servoid bench`; whatever waits
+    for something that may never come is ended by pytest's own timeout."""
+    found = {name(path): lines for path in sources("tests") if (lines := timed(path.read_text()))}
+    assert found == {}
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "assert time.monotonic() - began < 1.0",
+        "began = time.perf_counter(); work(); took = time.perf_counter() - began; assert took < 1.0",
+        "end = monotonic() + 5\n    while now() < end: pass",
+    ],
+)
+def test_an_assertion_on_a_clock_is_seen(body: str) -> None:
+    assert timed(f"def test():\n    {body}") != []
+
+
 def rooms(package: str) -> dict[str, set[str]]:
     """The folders of a package, and those of the same package that each imports from."""
     found: dict[str, set[str]] = {}

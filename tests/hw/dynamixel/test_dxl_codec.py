@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import time
 
 import pytest
 from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
@@ -183,7 +182,6 @@ def test_random_and_mutated_streams_do_not_hang() -> None:
     rng = random.Random(1)
     good = [codec.status(i, 0, bytes(10)) for i in range(1, 21)]
     parser = PacketParser()
-    began = time.process_time()
     for _ in range(3000):
         kind = rng.randrange(3)
         if kind == 0:
@@ -199,7 +197,6 @@ def test_random_and_mutated_streams_do_not_hang() -> None:
             stream = bytes(mutable[: rng.randrange(len(mutable))])
         parser.feed(stream)
         assert parser.pending <= codec.MAX_LENGTH + 420
-    assert time.process_time() - began < 30
     parser.reset()
     assert len(parser.feed(b"".join(good))) == 20
 
