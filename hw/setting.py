@@ -8,20 +8,25 @@ from __future__ import annotations
 import typing
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any
+from typing import Any, Literal
 
 Range = tuple[float, float]  # low, high
+Way = Literal["forward", "backward", "left", "turning"]
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a field of a frozen dataclass is for. `above` is an open end of its range, `least` and `most` are closed."""
+    """What a field of a frozen dataclass is for. `above` is an open end of its range, `least` and `most` are closed.
+
+    `asks` says which way the robot is asked to go so fast: the robot's file says how fast it can at most.
+    """
 
     text: str
     unit: str = ""
     above: float | None = None
     least: float | None = None
     most: float | None = None
+    asks: Way | None = None
 
     @property
     def range(self) -> str:
@@ -63,6 +68,16 @@ def check(settings: Any) -> None:
         for number in _numbers(value):
             if problem := setting.problem(number):
                 raise ValueError(f"{name}: {problem}")
+
+
+def asks(settings: Any, prefix: str = "") -> Iterator[tuple[str, str, Way, tuple[float, ...]]]:
+    """Name, unit, way and speeds of each setting that asks for speeds, those of the dataclasses in it too."""
+    for name, setting, _ in _described(type(settings)):
+        if setting.asks is not None:
+            yield prefix + name, setting.unit, setting.asks, tuple(_numbers(getattr(settings, name)))
+    for f in fields(settings):
+        if is_dataclass(part := getattr(settings, f.name)):
+            yield from asks(part, f"{prefix}{f.name}.")
 
 
 def explain(settings: Any, prefix: str = "") -> Iterator[Explained]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Any, ClassVar
@@ -10,10 +11,10 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Behaviour, Episode, Objective, Trace
+from servoid.hw.contracts.task import Behaviour, Criterion, Episode, Objective, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot, load_robot
-from servoid.hw.setting import Setting, check
+from servoid.hw.setting import Setting, asks, check
 from servoid.stack.tasks.terms.guidance import Weights, total_cost
 
 
@@ -31,6 +32,24 @@ class Settings:
     def completed(typed: dict[str, str]) -> dict[str, str]:
         """Settings as typed on a command line, with those that follow from them."""
         return typed
+
+
+def beyond(settings: Any, robot: Robot) -> list[str]:
+    """A sentence about each speed that a task's settings ask for and the robot cannot reach."""
+    top = robot.walking
+    limits = {  # that way, and the opposite one
+        "forward": (top.forward, top.backward),
+        "backward": (top.backward, top.forward),
+        "left": (top.sideways, top.sideways),
+        "turning": (top.turning, top.turning),
+    }
+    told = []
+    for name, unit, way, speeds in asks(settings):
+        for speed in dict.fromkeys(speeds):
+            limit = limits[way][speed < 0.0]
+            if abs(speed) > limit + 1e-9:
+                told.append(f"{name}={speed:g} is more than {robot.name} can: {limit:g} {unit} at most that way")
+    return told
 
 
 class BaseTask:
@@ -70,8 +89,16 @@ class BaseTask:
         weights: Weights = self.settings.cost
         return None if self.guided_by_velocity_alone and not weights.twist else partial(total_cost, weights=weights)
 
+    def criteria(self, trace: Trace, episode: Any) -> Sequence[Criterion]:
+        """All that a success needs: what a run is told when it fails."""
+        return ()
+
     def success(self, trace: Trace, episode: Any) -> bool:
-        raise NotImplementedError(f"task {self.name} does not say what success is")
+        """Whether every criterion is met."""
+        criteria = self.criteria(trace, episode)
+        if not criteria:
+            raise NotImplementedError(f"task {self.name} does not say what success is")
+        return all(criterion.met for criterion in criteria)
 
     def metrics(self, trace: Trace, episode: Any) -> dict[str, float]:
         return {}

@@ -12,7 +12,7 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Keyframes, State
-from servoid.hw.contracts.task import Episode, Trace
+from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.geometry import to_heading, turned
 from servoid.hw.robot.description import Robot
@@ -87,9 +87,10 @@ class Inbetween(BaseTask):
     def behaviour(self, episode: KeyframeEpisode) -> BaseBehaviour:
         return _Pass(episode, self.dt)
 
-    def success(self, trace: Trace, episode: KeyframeEpisode) -> bool:
+    def criteria(self, trace: Trace, episode: KeyframeEpisode) -> list[Criterion]:
         """Not fallen until the last keyframe. How near it came is among the metrics, as in the paper."""
-        return not trace.fallen and len(trace.yaw) > episode.ticks[-1]
+        least = int(episode.ticks[-1]) + 1
+        return [Criterion.never("fell", trace.fallen), Criterion("lasted", len(trace.yaw), "ticks", least=least)]
 
     def metrics(self, trace: Trace, episode: KeyframeEpisode) -> dict[str, float]:
         """Mean error at the keyframes that it lived to see: of the base (`mrpe_m`), and of the joints' places relative

@@ -11,8 +11,9 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.stack.log.flightlog import FlightLog, read_log
-from servoid.tools.common import exit_codes, flightpath
+from servoid.tools.common import exit_codes
 from servoid.tools.common.output import add_json_argument, reporting
+from servoid.tools.common.pictures import flightpath
 from servoid.tools.evaluate.plots import GOAL, OBSTACLE, PLAN, ROBOT
 
 if TYPE_CHECKING:

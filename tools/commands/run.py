@@ -17,7 +17,7 @@ from typing import Any
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, add_json_argument, reporting
-from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, settings
+from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, positive, settings
 from servoid.tools.common.prompt import confirm
 
 EXIT_CODES = {
@@ -27,14 +27,6 @@ EXIT_CODES = {
     "timed_out": exit_codes.FAILED,
     "stopped": exit_codes.STOPPED,
     "interrupted": exit_codes.INTERRUPTED,
-}
-WORDS = {
-    "succeeded": "goal met",
-    "failed": "goal not met",
-    "fell": "the robot fell",
-    "timed_out": "time ran out",
-    "stopped": "stopped by the guard",
-    "interrupted": "interrupted",
 }
 
 
@@ -67,10 +59,12 @@ def main(args: argparse.Namespace) -> int:
         check_seed(args.seed)
         if args.video is not None:
             _prepare_video(args.video)
+        from servoid.hw.robot.description import load_robot
         from servoid.stack.runtime.backends import backend_kind
         from servoid.stack.runtime.run import RunSettings, run
-        from servoid.stack.tasks import find
+        from servoid.stack.tasks import beyond, find, load_settings
         from servoid.tools.common.live import LiveLine
+        from servoid.tools.common.summary import summary
 
         watched = (sys.stdout.isatty() and not args.json) or find(args.task).cls.steered
         plan = RunSettings(
@@ -88,6 +82,8 @@ def main(args: argparse.Namespace) -> int:
             realtime=(watched and not args.fast) if backend_kind(args.backend).simulated else None,
             port=args.port,
         )
+        for text in beyond(load_settings(args.task, settings(args)), load_robot(args.robot)):
+            report.line(text)
         live = LiveLine(sys.stderr if args.json else sys.stdout)
         try:
             result = run(plan, on_tick=live, confirm=partial(confirm, remedy="give --start to let the robot move"))
@@ -95,7 +91,8 @@ def main(args: argparse.Namespace) -> int:
             live.close()
             tell_lateness(report, args.port)
         files: dict[str, Any] = {"log": result.log}
-        _summarise(report, result)
+        for text in summary(result, report.columns):
+            report.line(text)
         if args.video is not None and result.log is not None:
             files |= _film(report, result.log, args.video)
         for name, path in files.items():
@@ -120,17 +117,6 @@ def tell_lateness(report: Report, port: str | None) -> None:
             text = str(error)
         if text is not None:
             report.line(text)
-
-
-def positive(text: str) -> float:
-    """An argument that is a positive number."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
-    return value
 
 
 def _default_log(task: str) -> Path:
@@ -159,7 +145,7 @@ def _prepare_video(path: Path) -> None:
 def _film(report: Report, log: Path, path: Path) -> dict[str, Path]:
     """Video and plot of a run; where they cannot be made, the reason. The run itself has succeeded or not before."""
     from servoid.stack.log.flightlog import read_log
-    from servoid.tools.common.video import VideoError, make_video
+    from servoid.tools.common.pictures.video import VideoError, make_video
 
     made: dict[str, Path] = {}
     failures = (VideoError, ConfigError, OSError, ValueError)  # a full disk, say, or no encoder
@@ -178,16 +164,3 @@ def _film(report: Report, log: Path, path: Path) -> dict[str, Path]:
     except failures as error:
         report.line(f"no plot: {error}")
     return made
-
-
-def _summarise(report: Report, result: Any) -> None:
-    for event in result.events:
-        if event.kind not in ("phase", "task"):
-            report.line(f"{event.time:6.2f} s  {event.text}")
-    report.line(f"{WORDS[result.outcome]} after {result.seconds:.1f} s")
-    for name, value in result.metrics.items():
-        report.line(f"{name:>24}: {value:.3f}")
-    report.line(
-        f"{result.ticks} ticks, {result.missed} missed, late p50 {result.late_p50_ms:.2f} ms,"
-        f" p99 {result.late_p99_ms:.2f} ms"
-    )

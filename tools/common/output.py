@@ -35,6 +35,11 @@ class Report:
         """A line for a person."""
         say(text, sys.stderr if self.as_json else self._stdout)
 
+    @property
+    def columns(self) -> int | None:
+        """Width of the terminal that lines go to, as it is now; None where they go elsewhere."""
+        return columns(sys.stderr if self.as_json else self._stdout)
+
     def table(self, head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
         """A table for a person, columns aligned."""
         text = [[str(cell) for cell in row] for row in (head, *rows)]
@@ -62,16 +67,49 @@ def say(text: str, stream: TextIO) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # Python writes once more at exit
 
 
+def columns(stream: TextIO) -> int | None:
+    """Width of the terminal behind a stream, as it is now; None where there is none, or it does not say."""
+    if not stream.isatty():
+        return None
+    try:
+        return os.get_terminal_size(stream.fileno()).columns or None
+    except OSError:  # a terminal in memory
+        return None
+
+
 class Screen:
     """A stream that nobody waits for, for the line that is rewritten while a control loop runs.
 
     What it does not take at once is left out: a terminal that Ctrl-S stopped, or an ssh connection that hangs. When a
-    write fails, because the reader is gone, nothing is written any more.
+    write fails, because the reader is gone, nothing is written any more. `rewrites`: whether a line can be written
+    over, which it cannot in a file, a pipe or a terminal that is dumb.
     """
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: TextIO, term: str | None = None) -> None:
+        """`term` is the kind of terminal, that of the environment unless given."""
+        dumb = (os.environ.get("TERM") if term is None else term) in ("dumb", "unknown")
         self.tty = stream.isatty()
+        self.rewrites = self.tty and not dumb
         self._stream: TextIO | None = stream
+        self._shown = 0  # columns of the line that can be written over
+
+    def rewrite(self, text: str) -> None:
+        """Write over the line that stands there; what does not fit the terminal as it is now is cut off."""
+        room = self.columns
+        text = text[:room]
+        if self.write("\r" + text.ljust(min(self._shown, room))):
+            self._shown = len(text)
+
+    @property
+    def columns(self) -> int:
+        """What a line that is rewritten may take: a full one would go on in the next."""
+        return max((columns(self._stream) if self._stream is not None else None) or 80, 2) - 1
+
+    def end(self) -> None:
+        """Leave the line that was rewritten standing."""
+        if self._shown:
+            self.write("\n")
+        self._shown = 0
 
     def write(self, text: str) -> bool:
         """Write a line at most, to be seen at once; whether it was."""

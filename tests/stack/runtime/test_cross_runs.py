@@ -18,7 +18,7 @@ from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Phase
 from servoid.tools.cli import main
 from servoid.tools.commands import replay
-from servoid.tools.common import flightpath
+from servoid.tools.common.pictures import flightpath
 from servoid.tools.evaluate.judge import judge
 
 NEAR = {"robots": "2", "circle": "0.4", "spread": "0"}  # head-on, so that a run is short

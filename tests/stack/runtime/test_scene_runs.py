@@ -16,8 +16,8 @@ from servoid.sim.backend import SimBackend
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.runtime.run import RunSettings, prepare, run
 from servoid.tools.commands import replay
-from servoid.tools.common import flightpath
 from servoid.tools.common.ground_truth import GroundTruth
+from servoid.tools.common.pictures import flightpath
 from servoid.tools.evaluate.judge import judge, simulation
 
 

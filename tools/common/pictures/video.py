@@ -9,7 +9,7 @@ import numpy as np
 
 from servoid.hw.robot.description import load_robot
 from servoid.stack.log.flightlog import FlightLog
-from servoid.tools.common import flightpath
+from servoid.tools.common.pictures import flightpath
 
 FPS = 25
 
