@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,16 @@ def resolve(name: str | Path) -> Path:
     near = get_close_matches(path.stem, shipped, n=1, cutoff=0.0)
     hint = f"; did you mean '{near[0]}'?" if near else "; none is shipped: train one, or give the path of a file"
     raise CheckpointError(f"{path}: no such checkpoint{hint}")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What the header of a trained network says of how it came about."""
+
+    data: str  # what it was trained on
+    licence: str  # of the data
+    results: Mapping[str, Any]  # what was measured
+    training: Mapping[str, Any]  # settings
 
 
 def header(

@@ -23,7 +23,7 @@ from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.multi_robot import Crowd
 from servoid.sim.randomise import Body, draw, longest
 from servoid.sim.scene import robot_bodies
-from servoid.sim.truth import Truth
+from servoid.sim.truth import SimulatedTruth
 
 NOISE_ROWS = 64  # ticks of sensor noise drawn at a time
 VELOCITY_NOISE = 0.02  # rad/s, standard deviation, before quantisation
@@ -99,7 +99,7 @@ class Worlds:
         self._fresh = {key: value[:, -self.substeps :].copy() for key, value in self._record.items()}
         self.ticks = np.zeros(n, int)  # since each world's reset
         self.tick = 0
-        self.truth = Truth(
+        self.truth = SimulatedTruth(
             self.model, robot, self._state_qpos, self._state_qvel, self._sensors, self._fresh["sensordata"]
         )
 

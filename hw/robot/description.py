@@ -168,7 +168,7 @@ Button = Literal["mode", "start", "user"]
 
 
 @dataclass(frozen=True)
-class Bus:
+class BusSettings:
     """The servo bus. Any of the board's `stop_buttons` is an emergency stop. With `board` none the servos are on an
     adapter such as a U2D2 and have a supply of their own."""
 
@@ -188,7 +188,7 @@ class Robot:
     imu_site: str
     rate: int
     standing_height: float
-    bus: Bus
+    bus: BusSettings
     limits: Limits
     imu: Imu
     feet: dict[str, Foot]

@@ -17,6 +17,7 @@ from servoid.policy.diffusion.schedule import (
     PYRAMID,
     TRAPEZOID,
     DenoisingMatrix,
+    Rolling,
     autoregressive,
     ddim_levels,
     full_sequence,
@@ -78,19 +79,6 @@ class Pyramid:
             raise ValueError(f"spread must not be negative, not {self.spread}")
         if self.shape not in SHAPES:
             raise ValueError(f"no shape is called '{self.shape}': {nearest(self.shape, SHAPES)}")
-
-
-@dataclass(frozen=True)
-class Rolling:
-    """See `servoid.policy.diffusion.schedule.rolling`. Levels are those of a network with 20, as in Diffuse-CLoC."""
-
-    state_level: int = 14
-    action_level: int = 4
-    ramp: int | None = None  # frames over which the level rises to pure noise; None: the whole window
-
-    def __post_init__(self) -> None:
-        if min(self.state_level, self.action_level, self.ramp or 1) < 1:
-            raise ValueError("state_level, action_level and ramp must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -202,9 +190,7 @@ class DiffusionSettings:
         elif self.schedule == "pyramid":
             matrix = pyramid(levels, self.steps, *frames, self.pyramid.spread, self.pyramid.shape, lead)
         elif self.schedule == "rolling" and fresh is not None:
-            roll = self.rolling
-            start = roll.state_level, roll.action_level
-            matrix = rolling(levels, self.steps, *frames, *start, fresh, roll.ramp or horizon, lead)
+            matrix = rolling(levels, self.steps, *frames, self.rolling, fresh, lead)
         else:
             matrix = full_sequence(levels, self.steps, len(state_frames), len(action_frames), lead)
         states, actions = self.used(network)

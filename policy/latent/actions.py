@@ -103,19 +103,9 @@ def same_latents(a: LatentActions | None, b: LatentActions | None) -> bool:
     return ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in ours)
 
 
-def save_latents(
-    path: Path,
-    latents: LatentActions,
-    robot: Robot,
-    *,
-    data: str,
-    licence: str,
-    results: Mapping[str, Any],
-    training: Mapping[str, Any],
-) -> None:
+def save_latents(path: Path, latents: LatentActions, robot: Robot, origin: checkpoint.Origin) -> None:
     """Write a checkpoint of the kind `latent`. Raises CheckpointError."""
-    about: dict[str, Any] = {"data": data, "licence": licence, "results": results, "training": dict(training)}
-    head = checkpoint.header(KIND, robot, **about, **latents.describe(len(robot.joints)))
+    head = checkpoint.header(KIND, robot, **vars(origin), **latents.describe(len(robot.joints)))
     checkpoint.write(path, latents.to_tensors(), head)
 
 

@@ -32,7 +32,7 @@ class AvoidanceSettings:
         check(self)
 
 
-class Motion:
+class MeanVelocity:
     """How fast others go, from where they were at each tick before."""
 
     def __init__(self, window: float, dt: float) -> None:

@@ -159,7 +159,9 @@ class Run:
         self.behaviour = self._behaviour()
         self._open.callback(self.behaviour.close)
         self._open.enter_context(self._interrupt)
-        self.policy = self._policy or make_policy(settings.policy, robot, task, self.realtime)
+        self.policy = self._policy or make_policy(
+            settings.policy, robot, task, self.realtime, planner=self._script.planner
+        )
         self._open.callback(self.policy.close)
         self._interrupt.check()
         if self._script.plans is not None:
@@ -185,7 +187,13 @@ class Run:
         clock = self.body.clock
         if behaviours := self.behaviour.teammates:
             clock = self._teammates = Teammates(
-                self.settings, self.robot, self.assignment, behaviours, self.body, self.guard, self._interrupt
+                self.settings,
+                self.assignment,
+                behaviours,
+                self.body,
+                self._controlled,
+                self._interrupt,
+                self._script,
             )
             self._open.callback(self._teammates.close)
             listeners.append(self._teammates)

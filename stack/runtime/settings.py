@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.stack.safety.event import Event
+
+if TYPE_CHECKING:
+    from servoid.policy.diffusion.settings import DiffusionSettings
 
 MAX_GAIN = 2.0  # times the firmware's configured gain; above, a servo of this class rings
 
@@ -46,3 +50,4 @@ class Script:
     plans: Mapping[int, int] | None = None  # ticks of plan requests, and when their plans were adopted
     velocities: Array | None = None  # (ticks, 3) that a person steered by,
     ended: bool = False  # and whether the person ended the run
+    planner: DiffusionSettings | None = None  # what it planned with: the policy's file may have moved or changed

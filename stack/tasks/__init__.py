@@ -30,7 +30,7 @@ GROUP = "servoid.tasks"  # of entry points
 
 
 @dataclass(frozen=True)
-class Known:
+class TaskEntry:
     """A task that can be run: its class, by what name, and where it came from."""
 
     name: str
@@ -42,12 +42,12 @@ class Known:
 _CLASSES: tuple[type[BaseTask], ...] = (
     Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Cross, Inbetween, Survive, Text, Steer,
 )  # fmt: skip
-_OWN: dict[str, Known] = {
-    **{cls.name: Known(cls.name, cls, cls.description) for cls in _CLASSES},
+_OWN: dict[str, TaskEntry] = {
+    **{cls.name: TaskEntry(cls.name, cls, cls.description) for cls in _CLASSES},
     # The same classes with other files of settings.
-    "goal-near": Known("goal-near", Goal, "walk to a near point"),
-    "goal-far": Known("goal-far", Goal, "walk to a far point"),
-    "perturb": Known("perturb", Walk, "walk ahead while being pushed once a second"),
+    "goal-near": TaskEntry("goal-near", Goal, "walk to a near point"),
+    "goal-far": TaskEntry("goal-far", Goal, "walk to a far point"),
+    "perturb": TaskEntry("perturb", Walk, "walk ahead while being pushed once a second"),
 }
 
 
@@ -56,7 +56,7 @@ def names() -> tuple[str, ...]:
     return (*_OWN, *(name for name in installed(GROUP) if name not in _OWN))
 
 
-def find(name: str) -> Known:
+def find(name: str) -> TaskEntry:
     """The task of that name, or of a file: `FILE.py:Class`. Servoid's own hide others of their names.
 
     Raises ConfigError with the nearest name, or with what is wrong with a class of a user's own.
@@ -69,7 +69,7 @@ def find(name: str) -> Known:
     cls: type[BaseTask] = plugin.cls
     if not (cls.name and cls.description):
         raise plugin.error(f'{cls.__name__}: say what it is: name = "..." and description = "..." in the class')
-    return Known(cls.name, cls, cls.description, plugin)
+    return TaskEntry(cls.name, cls, cls.description, plugin)
 
 
 def source(name: str) -> dict[str, Any] | None:
@@ -108,14 +108,6 @@ def load_task(name: str, settings: dict[str, str] | None = None, dt: float = 0.0
 
 
 __all__ = [
-    "BaseBehaviour",
-    "BaseTask",
-    "Known",
-    "Settings",
-    "beyond",
-    "find",
-    "load_settings",
-    "load_task",
-    "names",
-    "source",
-]
+    "BaseBehaviour", "BaseTask", "Settings", "TaskEntry",
+    "beyond", "find", "load_settings", "load_task", "names", "source",
+]  # fmt: skip

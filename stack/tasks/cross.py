@@ -14,7 +14,7 @@ from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading, turned
 from servoid.hw.setting import Setting
 from servoid.policy.references.gait import load_gait
-from servoid.stack.navigation.collision_avoidance import AvoidanceSettings, Motion, bearing_past
+from servoid.stack.navigation.collision_avoidance import AvoidanceSettings, MeanVelocity, bearing_past
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 from servoid.stack.tasks.terms import metrics as measures
@@ -126,7 +126,7 @@ class _CrossOver(BaseBehaviour):
         self.arrived = self.ended = False
         self._settings = settings
         self._bearing = 0.0  # rad in the odometry frame, of the way that was chosen
-        self._motion = Motion(settings.passing.window, dt)
+        self._motion = MeanVelocity(settings.passing.window, dt)
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
         """The goal, the others as obstacles that move, and a velocity past them; standing, once arrived."""

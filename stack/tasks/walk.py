@@ -47,7 +47,7 @@ class WalkSettings(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Commands(Episode):
+class WalkEpisode(Episode):
     commands: Array  # (changes, 3) m/s forward, m/s to the left, rad/s
 
 
@@ -56,7 +56,7 @@ class Walk(BaseTask):
     description = "walk with a commanded velocity that changes every few seconds"
     settings_type = WalkSettings
 
-    def scenario(self, rng: np.random.Generator) -> Commands:
+    def scenario(self, rng: np.random.Generator) -> WalkEpisode:
         """Draw all commands and pushes. The first push comes one interval after the start."""
         s = self.settings
         ranges = np.array([s.vx, s.vy, s.yaw_rate])
@@ -67,9 +67,9 @@ class Walk(BaseTask):
         pushes = size[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
         ticks = self.ticks(s.push_every)
         due = {(number + 1) * ticks: push for number, push in enumerate(pushes)}
-        return Commands(commands=commands, pushes=due if s.push[1] > 0.0 else {})
+        return WalkEpisode(commands=commands, pushes=due if s.push[1] > 0.0 else {})
 
-    def behaviour(self, episode: Commands) -> BaseBehaviour:
+    def behaviour(self, episode: WalkEpisode) -> BaseBehaviour:
         return FollowCommands(episode, self.ticks(self.settings.every))
 
     def criteria(self, trace: Trace, episode: Episode) -> list[Criterion]:
@@ -94,7 +94,7 @@ class Walk(BaseTask):
 class FollowCommands(BaseBehaviour):
     """Asks for each command of the episode for `ticks` ticks, and for the last one from then on."""
 
-    def __init__(self, episode: Commands, ticks: int) -> None:
+    def __init__(self, episode: WalkEpisode, ticks: int) -> None:
         super().__init__(episode)
         self._ticks = ticks
 
@@ -122,7 +122,7 @@ class Survive(Walk):
     settings_type = SurviveSettings
     guided_by_velocity_alone = True
 
-    def behaviour(self, episode: Commands) -> BaseBehaviour:
+    def behaviour(self, episode: WalkEpisode) -> BaseBehaviour:
         return _ToldAtFirst(episode, self.ticks(self.settings.every), self.settings.told, self)
 
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
@@ -130,7 +130,7 @@ class Survive(Walk):
 
 
 class _ToldAtFirst(FollowCommands):
-    def __init__(self, episode: Commands, ticks: int, told: float, task: BaseTask) -> None:
+    def __init__(self, episode: WalkEpisode, ticks: int, told: float, task: BaseTask) -> None:
         """`told`: s for which a sentence says how to walk."""
         super().__init__(episode, ticks)
         self._told, self._dt, self._top = told, task.dt, task.top

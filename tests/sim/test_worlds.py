@@ -28,7 +28,7 @@ from servoid.sim.randomise import (
     ZERO,
     draw,
 )
-from servoid.sim.truth import Truth
+from servoid.sim.truth import SimulatedTruth
 from servoid.sim.worlds import Worlds
 
 ROBOT = load_robot()
@@ -263,11 +263,11 @@ def test_gain_and_supply_scale_stiffness_together(monkeypatch: pytest.MonkeyPatc
     assert torque(1.0, stiffness=18.8) == pytest.approx(2 * torque(1.0), rel=1e-3)
 
 
-def synthetic_truth(height: float, tilt: float) -> Truth:
+def synthetic_truth(height: float, tilt: float) -> SimulatedTruth:
     model = build(ROBOT)
     qpos, qvel = np.zeros((1, model.nq)), np.zeros((1, model.nv))
     qpos[0, 2], qpos[0, 3:7] = height, [np.cos(tilt / 2), np.sin(tilt / 2), 0, 0]
-    return Truth(model, ROBOT, qpos, qvel, np.zeros((1, model.nsensordata)))  # in the air: no contacts
+    return SimulatedTruth(model, ROBOT, qpos, qvel, np.zeros((1, model.nsensordata)))  # in the air: no contacts
 
 
 def test_fallen_by_height_and_by_tilt() -> None:

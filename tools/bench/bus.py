@@ -73,7 +73,7 @@ def measure(report: Report, bauds: tuple[int, ...], cycles: int) -> list[dict[st
             for mode in ("sync", "fast"):
                 limit = wire_ms(mode, baud)
                 rows += [runs[name, mode].row(name, mode, baud, limit) for name in CLIENTS]
-                rows.append(_row("wire", mode, baud, limit, limit, 0.0, 0, limit))
+                rows.append(_row("wire", mode, baud, limit, limit, 0.0, 0, 1.0))
             report.line(f"{baud} bit/s: {len(runs)} x {cycles} cycles")
     return rows
 
@@ -115,12 +115,13 @@ class ClientTimes:
         import numpy as np
 
         median, p99 = (float(value) * 1e-6 for value in np.percentile(self.wall, (50, 99)))
-        return _row(client, mode, baud, median, p99, float(np.mean(self.cpu)) * 1e-3, self.failed, limit_ms)
+        cpu = float(np.mean(self.cpu)) * 1e-3
+        return _row(client, mode, baud, median, p99, cpu, self.failed, median / limit_ms)
 
 
 def wire_ms(mode: str, baud: int) -> float:
     """Time that the bytes of a cycle take on a wire, without any pause between them."""
-    from servoid.hw.dynamixel.transport.bus import BITS
+    from servoid.hw.dynamixel.protocol.codec import FRAME_BITS
     from servoid.hw.dynamixel.transport.group_read import GroupRead
     from servoid.tools.bench.bus_clients import BOARD, BOARD_BYTES, GOAL_BYTES, PRESENT, PRESENT_BYTES
 
@@ -128,7 +129,7 @@ def wire_ms(mode: str, baud: int) -> float:
     board = GroupRead([(BOARD_ID, BOARD, BOARD_BYTES)]).request_all()
     goals = 14 + SERVOS * (1 + GOAL_BYTES)
     count = goals + sum(len(request.packet) + request.answer for request in (present, board))
-    return 1e3 * BITS * count / baud
+    return 1e3 * FRAME_BITS * count / baud
 
 
 @contextmanager
@@ -149,10 +150,7 @@ def responder() -> Iterator[str]:
         process.stdout.close()
 
 
-def _row(
-    client: str, mode: str, baud: int, median: float, p99: float, cpu: float, failed: int, limit: float
-) -> dict[str, Any]:
-    values = (client, mode, baud, median, p99, cpu, failed, median / limit)
+def _row(*values: Any) -> dict[str, Any]:
     return dict(zip(COLUMNS, values, strict=True))
 
 

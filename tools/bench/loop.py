@@ -7,9 +7,9 @@ import argparse
 from servoid.hw.robot.description import load_robot
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, run
-from servoid.tools.commands.run import positive
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import add_json_argument, reporting
+from servoid.tools.common.parser import positive
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

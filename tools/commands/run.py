@@ -16,7 +16,7 @@ from typing import Any
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Progress, Report, add_json_argument, reporting
-from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, settings
+from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, positive, settings
 from servoid.tools.common.pictures.drawing import prepare
 from servoid.tools.common.prompt import confirm
 
@@ -118,17 +118,6 @@ def tell_lateness(report: Report, port: str | None) -> None:
             text = str(error)
         if text is not None:
             report.line(text)
-
-
-def positive(text: str) -> float:
-    """An argument that is a positive number."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
-    return value
 
 
 def _default_log(task: str) -> Path:

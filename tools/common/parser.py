@@ -40,10 +40,21 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     return f"; did you mean '{close[0]}'?" if close else ""
 
 
+def positive(text: str) -> float:
+    """An argument that is a positive number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
+    return value
+
+
 def check_seed(seed: int) -> None:
     """Raise ConfigError for a `--seed` that no generator takes."""
     if seed < 0:
-        raise ConfigError(f"--seed {seed}: give a number from 0 on")
+        raise ConfigError(f"--seed {seed}: must not be negative")
 
 
 def add_set_argument(parser: argparse.ArgumentParser) -> None:

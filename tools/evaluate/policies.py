@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from servoid.hw.config import ConfigError
-from servoid.tools.evaluate.cache import key
-from servoid.tools.evaluate.code_hash import code
+from servoid.hw.config import ConfigError, available
+from servoid.tools.evaluate.cache import depends_on, key
 from servoid.tools.evaluate.spec import Experiment, OwnNetwork
 
 if TYPE_CHECKING:
@@ -174,7 +173,7 @@ def _diffusion_settings(policy: str) -> DiffusionSettings | None:
         if read_header(Path(policy))["kind"] != "diffusion":
             return None
         settings = replace(load_settings(), checkpoint=policy)
-    elif policy == "diffusion" or policy.endswith((".yaml", ".yml")):
+    elif policy.endswith((".yaml", ".yml")) or policy in set(available("policies")) - {"gait"}:
         settings = load_settings(policy)
     else:
         return None
@@ -184,23 +183,16 @@ def _diffusion_settings(policy: str) -> DiffusionSettings | None:
 def dependencies(
     experiment: Experiment, policies: Policies, robot: str, seed: int, seconds: float | None, clips: str | None
 ) -> Mapping[str, Any]:
-    """What the episodes of an experiment depend on: the same dependencies, the same episodes. Raises ConfigError."""
-    from servoid.hw.robot.description import load_robot
-    from servoid.stack.log.provenance import described, fingerprint, versions
-    from servoid.stack.tasks import load_settings, source
+    """What the episodes of an experiment depend on. Raises ConfigError."""
+    from servoid.stack.runtime.run import RunSettings
 
-    own = source(experiment.task)
-    return {
-        **({} if own is None else {"source": own}),
-        "task": experiment.task,
-        "settings": described(load_settings(experiment.task, dict(experiment.set))),
-        "seconds": seconds,
-        "policy": policies.fingerprint(experiment),
-        "robot": fingerprint(load_robot(robot)),
-        "backend": experiment.backend,
-        "randomise": experiment.randomise,
-        "seed": seed,
-        "clips": clips,
-        "code": code(),
-        "versions": versions(),
-    }
+    settings = RunSettings(
+        task=experiment.task,
+        backend=experiment.backend,
+        robot=robot,
+        randomise=experiment.randomise,
+        seconds=seconds,
+        seed=seed,
+        set=dict(experiment.set),
+    )
+    return depends_on(settings, policies.fingerprint(experiment)) | {"clips": clips}

@@ -75,6 +75,7 @@ def evaluate(
     say: Callable[[str], None] = print,
     work: Work = do_episode,
     pool: Pool = each,
+    now: Callable[[], float] = time.monotonic,
 ) -> dict[str, Measured]:
     """Do the episodes that `rows` lack, and return what was measured by the rows' names.
 
@@ -84,7 +85,7 @@ def evaluate(
     """
     from servoid.policy.checkpoint import git_commit
 
-    begun = time.monotonic()
+    begun = now()
     read = read_anew(options.robot)
     policies = Policies(options.policy, options.out)
     measured, prepared = _prepare_all(rows, policies, options, say)
@@ -186,7 +187,7 @@ def _prepare(experiment: Experiment, policies: Policies, options: Options, say: 
         policy=_made_of(policies, experiment, settings.policy),
         limit=shortest,
         episodes=options.episodes or experiment.episodes,
-        cache=EpisodeCache(options.out / "episodes", kept, options.fresh),
+        cache=EpisodeCache(options.out / "episodes" / f"{key(kept)}.jsonl", kept, options.fresh),
     )
 
 

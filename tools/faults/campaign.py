@@ -14,9 +14,9 @@ import time
 from typing import Any
 
 from servoid.hw.config import ConfigError, nearest
-from servoid.tools.commands.run import positive
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, add_json_argument, reporting
+from servoid.tools.common.parser import positive
 
 QUICK = (
     "drop",

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from servoid.hw.config import ConfigError
-from servoid.tools.commands.run import positive
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, add_json_argument, reporting
-from servoid.tools.common.parser import check_seed
+from servoid.tools.common.parser import check_seed, positive
 
 TELL_SECONDS = 60.0
 VELOCITY = {"vx": "0.1", "vy": "0", "yaw_rate": "0.3"}  # round in a circle, not away

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
 from servoid.hw.config import nearest
-from servoid.policy.diffusion.model.config import DenoiserShape, Objective
+from servoid.policy.diffusion.model.config import DenoiserShape, TrainingObjective
 from servoid.policy.latent.actions import LatentConfig
 from servoid.policy.tracker.rewards import TERMS
 
@@ -19,7 +19,7 @@ Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainingRun:
     """How long, and how often to look."""
 
     # Fields that may change when a run goes on.
@@ -43,7 +43,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class StepRun(Run):
+class StepRun(TrainingRun):
     """A run that may be measured in steps of the optimiser."""
 
     steps: Annotated[int, "steps to train for instead of minutes, the same on any machine; 0: by minutes"] = 0
@@ -62,7 +62,7 @@ class StepRun(Run):
 class DataRun(StepRun):
     """A training on a recorded dataset, judged in closed loop."""
 
-    FREE: ClassVar[frozenset[str]] = Run.FREE | {"survival_seconds", "survival_worlds", "licence"}
+    FREE: ClassVar[frozenset[str]] = TrainingRun.FREE | {"survival_seconds", "survival_worlds", "licence"}
 
     survival_seconds: Annotated[float, "seconds that the network walks in each evaluation"] = 10.0
     survival_worlds: Annotated[int, "worlds it walks in; 0: keep the best by its loss on held-out data instead"] = 32
@@ -113,7 +113,7 @@ class DiffusionNetwork(DenoiserShape):
 
 
 @dataclass(frozen=True)
-class DiffusionTraining(DecayedOptimiser, Objective, DiffusionNetwork, DataRun):
+class DiffusionTraining(DecayedOptimiser, TrainingObjective, DiffusionNetwork, DataRun):
     """`servoid train diffusion`."""
 
     warmup_steps: Annotated[int, "steps over which the learning rate rises"] = 200
@@ -121,7 +121,7 @@ class DiffusionTraining(DecayedOptimiser, Objective, DiffusionNetwork, DataRun):
     precision: Annotated[Literal["bf16", "fp32"], "arithmetic of the network"] = "bf16"
 
     def __post_init__(self) -> None:
-        for part in (DataRun, DenoiserShape, Objective, Optimiser):
+        for part in (DataRun, DenoiserShape, TrainingObjective, Optimiser):
             part.__post_init__(self)
         if self.history < 2:
             raise ValueError(f"history must be at least 2, not {self.history}: what ran last is an action of the past")
@@ -155,10 +155,10 @@ class LatentTraining(Optimiser, LatentConfig, DataRun):
 
 
 @dataclass(frozen=True)
-class SampleRun(Run):
+class SampleRun(TrainingRun):
     """A run that is measured in ticks of experience."""
 
-    FREE: ClassVar[frozenset[str]] = Run.FREE | {"worlds"}
+    FREE: ClassVar[frozenset[str]] = TrainingRun.FREE | {"worlds"}
 
     minutes: float = 90.0
     evaluate_every: float = 2.0
@@ -297,10 +297,10 @@ class OdometryTraining(DecayedOptimiser, Layers, OdometryWalks, StepRun):
 
 
 TITLES: Mapping[type, str] = {  # of the help, in its order
-    Run: "run", StepRun: "run", DataRun: "run", SampleRun: "run",
+    TrainingRun: "run", StepRun: "run", DataRun: "run", SampleRun: "run",
     OdometryWalks: "walks",
     DenoiserShape: "network", DiffusionNetwork: "network", LatentConfig: "network", Layers: "network",
-    Objective: "objective", LatentTraining: "objective", OdometryTraining: "objective", Ppo: "objective (PPO)",
+    TrainingObjective: "objective", LatentTraining: "objective", OdometryTraining: "objective", Ppo: "objective (PPO)",
     Optimiser: "optimiser", DecayedOptimiser: "optimiser", DiffusionTraining: "optimiser",
     TrackingSettings: "episodes and rewards", ExpertTraining: "episodes and rewards",
 }  # fmt: skip

@@ -25,7 +25,7 @@ _SPEED = 32  # plays a page as its times say
 
 
 @dataclass(frozen=True)
-class Step:
+class PageStep:
     goals: Mapping[int, int]  # servo ID -> encoder ticks
     time: int  # units
     pause: int  # units, after it
@@ -40,7 +40,7 @@ class Page:
     repeat: int
     acceleration: int  # units that speeding up and slowing down take
     next: int  # page, or 0
-    steps: tuple[Step, ...]
+    steps: tuple[PageStep, ...]
 
 
 def read_pages(path: Path) -> dict[int, Page]:
@@ -80,7 +80,7 @@ def _page(path: Path, number: int, raw: bytes) -> Page:
         step = raw[64 + i * STEP_BYTES : 64 + (i + 1) * STEP_BYTES]
         words = np.frombuffer(step[:62], "<u2")
         goals = {id: int(word) for id, word in enumerate(words) if not word & (_NO_GOAL | _NO_TORQUE)}
-        steps.append(Step(goals, time=(step[63] * speed) // _SPEED, pause=(step[62] * _SPEED) // speed))
+        steps.append(PageStep(goals, time=(step[63] * speed) // _SPEED, pause=(step[62] * _SPEED) // speed))
     name = raw[:14].split(b"\0")[0].decode("ascii", "replace").strip()
     return Page(number, name, max(raw[15], 1), raw[24], raw[25], tuple(steps))
 

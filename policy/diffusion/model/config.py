@@ -54,7 +54,7 @@ class DenoiserShape:
 
 
 @dataclass(frozen=True)
-class Objective:
+class TrainingObjective:
     """What a denoiser is trained for, beside the plain squared error."""
 
     inference_delay: Annotated[int, "longest delay of a plan to train for, in ticks, whose actions are given"] = 2

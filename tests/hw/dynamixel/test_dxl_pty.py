@@ -29,7 +29,7 @@ def port() -> Iterator[str]:
         yield json.loads(server.stdout.readline())["port"]
     finally:
         server.terminate()
-        server.wait(10)
+        server.wait(120)
         server.stdout.close()
 
 

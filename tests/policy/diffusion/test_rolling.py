@@ -13,7 +13,7 @@ from servoid.policy.diffusion.guidance import Diverged
 from servoid.policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise, seeded
 from servoid.policy.diffusion.runtime import Runtime
 from servoid.policy.diffusion.sampler import Known, Sampler
-from servoid.policy.diffusion.schedule import cosine_signal, rolling
+from servoid.policy.diffusion.schedule import Rolling, cosine_signal, rolling
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 from servoid.policy.features import Emphasis, Normaliser, raw_layout
 
@@ -87,7 +87,7 @@ def test_what_goes_on_from_a_low_level_stays_near_the_plan_that_runs() -> None:
     sampler = Sampler(lambda s, a, ks, ka: (s * keep[ks][:, None], a * keep[ka][:, None]), signal)
 
     def found(state_level: int, action_level: int) -> tuple[float, float]:
-        matrix = rolling(20, 4, frames, frames, state_level, action_level, fresh=1)
+        matrix = rolling(20, 4, frames, frames, Rolling(state_level, action_level, ramp=1), fresh=1)
         plan = torch.full((200, 8, 1), 2.0)
         start = renoise((plan, plan), noise, matrix, signal)
         states, actions = sampler.sample(matrix, known, seeds, start=start)

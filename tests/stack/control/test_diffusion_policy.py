@@ -17,6 +17,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Plan, PlanRequest, State
 from servoid.hw.robot.description import load_robot
+from servoid.policy.checkpoint import Origin
 from servoid.policy.diffusion.model import checkpoint
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.denoiser import Denoiser
@@ -312,7 +313,8 @@ def untrained(tmp_path: Path, **training: Any) -> DiffusionSettings:
     states = Normaliser(torch.zeros(54), torch.ones(54))
     actions = Normaliser(torch.tensor(ROBOT.home, dtype=torch.float32), torch.full((20,), 0.1))
     facts: dict[str, Any] = {"data": "none", "licence": "none", "results": {}, "training": training}
-    checkpoint.save(path, Denoiser(config).state_dict(), config, states, actions, ROBOT, **facts)
+    trained = checkpoint.Trained(Denoiser(config).state_dict(), config, states, actions)
+    checkpoint.save(path, trained, ROBOT, Origin(**facts))
     return DiffusionSettings(checkpoint=str(path), steps=5, execution_horizon=4, delay=2)
 
 

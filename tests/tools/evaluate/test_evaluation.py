@@ -16,8 +16,8 @@ from servoid.hw.seeds import episode_seed
 from servoid.policy.checkpoint import resolve
 from servoid.stack.runtime.run import RunSettings
 from servoid.tools.cli import main
-from servoid.tools.commands import rollout
 from servoid.tools.evaluate import code_hash
+from servoid.tools.evaluate import judge as judging
 from servoid.tools.evaluate.cache import EpisodeCache
 from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult, do_episode
 from servoid.tools.evaluate.metrics import METRICS
@@ -256,16 +256,16 @@ def test_after_ctrl_c_the_figures_are_of_what_was_done(
 def test_the_command_prints_and_writes_what_was_done_until_ctrl_c(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    judged = rollout.judge
+    judged = judging.judge
     seen = []
 
-    def judge(settings: RunSettings) -> rollout.Judged:
+    def judge(settings: RunSettings) -> judging.Judged:
         if seen:
             raise KeyboardInterrupt
         seen.append(settings)
         return judged(settings)
 
-    monkeypatch.setattr(rollout, "judge", judge)
+    monkeypatch.setattr(judging, "judge", judge)
     words = [
         "evaluate",
         "papers",
@@ -289,7 +289,7 @@ def test_the_command_prints_and_writes_what_was_done_until_ctrl_c(
 def test_a_cache_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="--out"):
-        EpisodeCache(tmp_path / "file", {"a": 1})
+        EpisodeCache(tmp_path / "file" / "a.jsonl", {"a": 1})
 
 
 @pytest.mark.slow

@@ -16,7 +16,8 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
-from servoid.policy.diffusion.model.config import DenoiserConfig, DenoiserShape, Objective
+from servoid.policy.checkpoint import Origin
+from servoid.policy.diffusion.model.config import DenoiserConfig, DenoiserShape, TrainingObjective
 from servoid.policy.features import token_layout
 from servoid.policy.text.encoder import load_encoder
 from servoid.tools.learn.flags import plain, read_settings
@@ -216,28 +217,18 @@ class DiffusionTrainer(Trainer):
         states, actions, text = self.windows.held_out(count)
         # The same measure whatever else is trained for, so that runs can be compared.
         same = self.settings
-        measure = Objective(same.inference_delay, same.near_actions, same.far_actions, monotone=0.0)
+        measure = TrainingObjective(same.inference_delay, same.near_actions, same.far_actions, monotone=0.0)
         with torch.inference_mode():
             given = states, actions, text, self.signal, torch.Generator().manual_seed(0)
             return losses(network, *given, measure)[1].item()
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
         """See `Trainer.ship`."""
-        from servoid.policy.diffusion.model import checkpoint
+        from servoid.policy.diffusion.model.checkpoint import Trained, save
 
-        checkpoint.save(
-            path,
-            self.average.weights,
-            self.config,
-            self.windows.states,
-            self.windows.actions,
-            self.robot,
-            data=self.source,
-            licence=self.settings.licence,
-            results=results,
-            training=plain(self.settings),
-            latents=self.windows.latents,
-        )
+        windows = self.windows
+        trained = Trained(self.average.weights, self.config, windows.states, windows.actions, windows.latents)
+        save(path, trained, self.robot, Origin(self.source, self.settings.licence, results, plain(self.settings)))
 
     def state(self) -> dict[str, Any]:
         """See `Trainer.state`."""

@@ -158,10 +158,11 @@ class LatentTrainer(Trainer):
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
         """See `Trainer.ship`."""
+        from servoid.policy.checkpoint import Origin
         from servoid.policy.latent.actions import save_latents
 
-        about: dict[str, Any] = {"data": self.source, "licence": self.settings.licence, "results": results}
-        save_latents(path, self.network.to_numpy(), self.robot, **about, training=plain(self.settings))
+        origin = Origin(self.source, self.settings.licence, results, plain(self.settings))
+        save_latents(path, self.network.to_numpy(), self.robot, origin)
 
     def state(self) -> dict[str, Any]:
         """See `Trainer.state`."""

@@ -19,7 +19,7 @@ from servoid.hw.config import ConfigError
 from servoid.tools.common.folder_lock import locked
 from servoid.tools.learn.flags import add_setting_flags, plain
 from servoid.tools.learn.progress import ProgressLine
-from servoid.tools.learn.settings import Run
+from servoid.tools.learn.settings import TrainingRun
 
 if TYPE_CHECKING:
     from servoid.policy.recording import Recording
@@ -34,7 +34,7 @@ _CHUNK = 10.0  # seconds of training between two rows of the log, at most
 
 def add_run_arguments(
     parser: argparse.ArgumentParser,
-    base: Run,
+    base: TrainingRun,
     out: Path | None = None,
     what: str = "folder of the run: checkpoints, log, learning curve",
     *,
@@ -75,7 +75,7 @@ class Trainer(ABC):
     columns: Sequence[str]  # of the log, beside the minutes: what `learn`, `shown`, `held_out` and `judge` give
     panels: Sequence[Sequence[str]]  # columns that are drawn, by picture
 
-    def __init__(self, out: Path, settings: Run, source: str, judge: Judge | None = None) -> None:
+    def __init__(self, out: Path, settings: TrainingRun, source: str, judge: Judge | None = None) -> None:
         """`source` says what is learned from: a run goes on with the same. `judge` runs a checkpoint in closed loop."""
         self.out, self.settings, self.source, self.judge = out, settings, source, judge
         self.every = settings.evaluate_every / settings.minutes or math.inf  # share of the budget between evaluations
