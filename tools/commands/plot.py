@@ -24,11 +24,15 @@ COLOURS = ("#3459b8", "#d1495b", "#2e8b57", "#8a5fbf")  # of several logs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", type=Path, nargs="+", help="flight log of a run; several are drawn over each other")
-    parser.add_argument("--joints", metavar="NAME,NAME", help="draw targets and positions of these joints")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="PNG to write (default: beside the first log)")
+    parser.add_argument("log", type=Path, nargs="+", metavar="LOG", help="flight log (.mcap); several over each other")
+    parser.add_argument("--joints", metavar="NAME,NAME", help="draw targets and positions of these joints instead")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help="picture to write, PNG (default: beside the first log)"
+    )
     parser.add_argument("--video", type=Path, metavar="FILE", help="film a log instead: MP4")
-    parser.add_argument("--video-size", default="1280x720", metavar="WxH", help="size of its pictures (1280x720)")
+    parser.add_argument(
+        "--video-size", default="1280x720", metavar="WxH", help="size of the film (default: %(default)s)"
+    )
     add_json_argument(parser)
 
 

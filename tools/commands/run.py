@@ -50,7 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", action="store_true", help="move a real robot without asking")
     parser.add_argument("--record", type=Path, metavar="FILE", help="flight log (default: runs/DATE-TASK.mcap)")
     parser.add_argument("--video", type=Path, metavar="FILE", help="film the run afterwards: MP4, and its path as PNG")
-    parser.add_argument("--video-size", default="1280x720", metavar="WxH", help="size of its pictures (1280x720)")
+    parser.add_argument(
+        "--video-size", default="1280x720", metavar="WxH", help="size of the film (default: %(default)s)"
+    )
     parser.add_argument("--fast", action="store_true", help="do not keep a simulation to real time on a terminal")
     add_json_argument(parser)
 
