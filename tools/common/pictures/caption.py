@@ -34,7 +34,7 @@ def heading(log: FlightLog) -> str:
     return f"{settings['task']} with {policy} on {settings['robot']}, seed {settings['seed']}"
 
 
-class Captions:
+class FilmCaptions:
     """Lines for each state of a log, by its row."""
 
     def __init__(self, log: FlightLog) -> None:

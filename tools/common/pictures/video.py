@@ -12,7 +12,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
 from servoid.stack.log.flightlog import FlightLog
 from servoid.tools.common.pictures import flightpath
-from servoid.tools.common.pictures.caption import Captions
+from servoid.tools.common.pictures.caption import FilmCaptions
 from servoid.tools.common.pictures.drawing import SIZE
 
 if TYPE_CHECKING:  # MuJoCo chooses how to draw when it is imported: not before it is known
@@ -45,7 +45,7 @@ def make_video(
 
     if not log.messages["/state"]:
         raise VideoError("the log holds no state")
-    rows, captions = _rows(log), Captions(log)
+    rows, captions = _rows(log), FilmCaptions(log)
     frames, (width, height) = _frames(log, rows), size
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from servoid.stack.log.flightlog import FlightLog, read_log
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.tools.common.pictures import flightpath, panels
-from servoid.tools.common.pictures.caption import Captions
+from servoid.tools.common.pictures.caption import FilmCaptions
 from servoid.tools.common.pictures.panels import Shown
 
 PUSHED = {"vx": "0.1", "push": "0.4", "push_every": "0.5"}
@@ -70,7 +70,7 @@ def test_keyframes_are_poses_of_the_clip(folder: Path, pushed: FlightLog) -> Non
 
 
 def test_captions_say_run_time_what_is_asked_and_what_happens(pushed: FlightLog) -> None:
-    captions, first = Captions(pushed), int(flightpath.task_ticks(pushed)[0])
+    captions, first = FilmCaptions(pushed), int(flightpath.task_ticks(pushed)[0])
     row = int(np.flatnonzero(pushed.ticks("/state") == first + 20)[0])
     assert captions.lines(row) == ["walk with gait on op3, seed 0", "0.40 s   asked +0.10 +0.00 m/s +0.00 rad/s"]
     assert captions.lines(row + 6)[2] == "pushed by 0.40 m/s"
@@ -80,7 +80,7 @@ def test_captions_say_run_time_what_is_asked_and_what_happens(pushed: FlightLog)
 
 def test_a_caption_fits_a_narrow_picture(pushed: FlightLog) -> None:
     picture = np.full((120, 160, 3), 90, dtype=np.uint8)
-    written = Captions(pushed).write(picture, 0)
+    written = FilmCaptions(pushed).write(picture, 0)
     assert (written[:12, :120] > 200).any()
     assert (written[:, -2:] <= 90).all()  # it is cut before the edge
     assert (written[40:] == 90).all()
