@@ -135,23 +135,23 @@ class DiffusionSettings:
             most = getattr(network, name)
             if ours is not None and not 1 <= ours <= most:
                 raise ConfigError(
-                    f"diffusion policy: {name} {ours} is asked for, and this checkpoint has 1 to {most} ticks; "
+                    f"diffusion policy: {name} is {ours}, but this checkpoint takes 1 to {most} ticks; "
                     f"lower it, or train a model with --{name} {ours}"
                 )
         training, needed = training or {}, self.execution_horizon + self.delay
         if needed > (horizon := min(self.horizon or network.horizon, network.action_horizon)):
             raise ConfigError(
                 f"diffusion policy: a plan must last execution_horizon + delay = {needed} ticks, "
-                f"and this one has actions for {horizon}; lower execution_horizon or delay"
+                f"but this one has actions for {horizon}; lower execution_horizon or delay"
             )
         if needed > (near := _near_alone(training, needed)):
             raise ConfigError(
-                f"diffusion policy: a plan must last execution_horizon + delay = {needed} ticks, and this checkpoint "
-                f"learned the actions of the next {near} only; lower execution_horizon or delay"
+                f"diffusion policy: a plan must last execution_horizon + delay = {needed} ticks, but this checkpoint "
+                f"learned only the actions of the next {near}; lower execution_horizon or delay"
             )
         if self.delay > (longest := _longest_delay(training, self.delay)):
             raise ConfigError(
-                f"diffusion policy: delay {self.delay} is asked for, and this checkpoint was trained for at most "
+                f"diffusion policy: delay is {self.delay}, but this checkpoint was trained for at most "
                 f"{longest} ticks: lower it, or train with --inference-delay {self.delay}"
             )
         if self.stabilization_level > network.levels:

@@ -30,8 +30,8 @@ _PARTS = ("encoder", "prior", "decoder")
 class LatentConfig:
     """Shape of the three networks. Stored in the checkpoint."""
 
-    size: Annotated[int, "numbers of a latent; PULSE has 32 for a human's 69 joints"] = 16
-    width: Annotated[int, "units of a hidden layer"] = 256
+    size: Annotated[int, "numbers in a latent; PULSE has 32 for a human's 69 joints"] = 16
+    width: Annotated[int, "units of each hidden layer"] = 256
     layers: Annotated[int, "hidden layers"] = 2
 
     def __post_init__(self) -> None:
@@ -91,7 +91,9 @@ class LatentActions:
             raise CheckpointError(f"{path}: its latent actions do not fit its own header: {error}") from error
         needed = [(n + n_joints, *hidden, 2 * z), (n, *hidden, 2 * z), (n + z, *hidden, n_joints)]
         if found != needed:
-            raise CheckpointError(f"{path}: its latent actions do not fit its own header: {found}, {needed} are needed")
+            raise CheckpointError(
+                f"{path}: its latent actions do not fit its own header: {found}, but {needed} are needed"
+            )
         return made
 
 

@@ -1,4 +1,4 @@
-"""`servoid bench policy`: how long the diffusion policy takes for a plan, on one thread, by engine and runtime."""
+"""Time the plans of the diffusion policy on one thread, by engine and runtime."""
 
 from __future__ import annotations
 
@@ -44,22 +44,31 @@ COLUMNS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid bench policy`."""
-    parser.add_argument("--checkpoint", help=f"name or file; '{RANDOM}': weights made up (default: the shipped one)")
-    parser.add_argument("--robot", default="op3", help="robot name or file (default op3)")
-    parser.add_argument("--plans", type=int, default=100, help="plans to time for each row (default 100)")
-    parser.add_argument("--width", type=int, default=192, help="width of made-up weights (default 192)")
-    parser.add_argument("--layers", type=int, default=2, help="layers of made-up weights (default 2)")
+    parser.add_argument(
+        "--checkpoint", metavar="NAME|FILE", help=f"checkpoint; '{RANDOM}': random weights (default: the shipped one)"
+    )
+    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
+    parser.add_argument("--plans", type=int, default=100, metavar="N", help="plans to time for each row (default: 100)")
+    parser.add_argument(
+        "--width", type=int, default=192, metavar="N", help="width of a network with random weights (default: 192)"
+    )
+    parser.add_argument(
+        "--layers", type=int, default=2, metavar="N", help="layers of a network with random weights (default: 2)"
+    )
     parser.add_argument(
         "--shape",
         default=PAPER_SHAPE,
         metavar="PAST,STATES,ACTIONS",
-        help="window of a second network, as wide and deep as the checkpoint's, its weights made up: states up to the "
+        help="window of a second network, as wide and deep as the checkpoint's, with random weights: states up to the "
         f"present, states to come, actions to come; '{NONE}': no second network (default {PAPER_SHAPE})",
     )
     parser.add_argument(
-        "--engine", action="append", metavar="NAME", help="only this engine; may be repeated (default: all installed)"
+        "--engine",
+        action="append",
+        metavar="NAME",
+        help="only this engine; may be repeated (default: all that are installed)",
     )
-    parser.add_argument("--runtime", choices=RUNTIMES, help="only this one (default: both)")
+    parser.add_argument("--runtime", choices=RUNTIMES, help="only this runtime (default: both)")
     add_json_argument(parser)
 
 

@@ -223,6 +223,6 @@ def test_guidance_that_drives_a_plan_out_of_all_bounds_gives_no_plan() -> None:
 
 def test_a_checkpoint_that_never_learned_far_actions_does_not_execute_them() -> None:
     made = replace(model(), header={"training": {"far_actions": 0.0, "near_actions": 4}})
-    with pytest.raises(ConfigError, match="learned the actions of the next 4 only"):
+    with pytest.raises(ConfigError, match="learned only the actions of the next 4"):
         Runtime(made, DiffusionSettings(steps=4, execution_horizon=4, delay=2), ROBOT)
     Runtime(made, DiffusionSettings(steps=4, execution_horizon=3, delay=1), ROBOT)

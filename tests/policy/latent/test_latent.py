@@ -161,7 +161,7 @@ def test_what_does_not_fit_is_refused_with_the_reason(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="truncated"):
         load_latents(path, ROBOT)
     shipped = Path(__file__).resolve().parents[3] / "policy" / "checkpoints" / "expert.safetensors"
-    with pytest.raises(CheckpointError, match="holds a tracker network, and a latent network is needed"):
+    with pytest.raises(CheckpointError, match="holds a tracker network, but a latent network is needed"):
         load_latents(shipped, ROBOT)
     with pytest.raises(ValueError, match="size must be at least 1"):
         LatentConfig(size=0)

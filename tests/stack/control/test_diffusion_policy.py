@@ -369,7 +369,7 @@ def test_a_checkpoint_for_another_rate_is_refused_before_anything_starts(
         diffusion_policy(replace(ROBOT, rate=100), settings, process=process)
     with pytest.raises(ConfigError, match="lower execution_horizon or delay"):
         diffusion_policy(ROBOT, replace(settings, execution_horizon=15, delay=2), process=process)
-    with pytest.raises(ConfigError, match="horizon 32 is asked for"):
+    with pytest.raises(ConfigError, match="horizon is 32"):
         diffusion_policy(ROBOT, replace(settings, horizon=32), process=process)
 
 
@@ -379,7 +379,7 @@ def test_settings_that_the_training_does_not_fit_are_refused_before_anything_sta
 ) -> None:
     with pytest.raises(ConfigError, match="trained for at most 1 ticks"):
         diffusion_policy(ROBOT, untrained(tmp_path, committed=1), process=process)
-    with pytest.raises(ConfigError, match="learned the actions of the next 5 only"):
+    with pytest.raises(ConfigError, match="learned only the actions of the next 5"):
         diffusion_policy(ROBOT, untrained(tmp_path, far_actions=0.0, near_actions=5), process=process)
 
 

@@ -149,6 +149,6 @@ def test_latents_that_do_not_fit_are_refused(settings: DiffusionSettings) -> Non
     with pytest.raises(CheckpointError, match="latent actions' state layout"):
         diffusion_policy(ROBOT, settings)
     write(path, tensors, {k: v for k, v in head.items() if k != "latent"})
-    with pytest.raises(CheckpointError, match="plans 3 numbers a tick, and op3 has 20 joints"):
+    with pytest.raises(CheckpointError, match="plans 3 numbers a tick, but op3 has 20 joints"):
         diffusion_policy(ROBOT, settings)
     assert read_header(path)["kind"] == "diffusion"
