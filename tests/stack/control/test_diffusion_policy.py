@@ -190,8 +190,7 @@ class FakePipe:
     def recv(self) -> object:
         return self._answers.pop(0)[1]
 
-    def close(self) -> None:
-        pass
+    def close(self) -> None: ...
 
 
 @pytest.mark.parametrize(("replan", "delay", "slow"), [(4, 2, 2.6), (4, 4, 5.2), (2, 2, 2.5), (2, 1, 5.5), (1, 1, 1.3)])
@@ -326,6 +325,7 @@ def trace(policy: DiffusionPolicy, seed: int, wait: bool) -> Array:
     return np.stack(out)
 
 
+@pytest.mark.slow
 def test_in_line_and_beside_the_loop_a_seed_gives_the_same_actions(settings: DiffusionSettings) -> None:
     inline = diffusion_policy(ROBOT, settings, slow_down)
     process = diffusion_policy(ROBOT, settings, slow_down, process=True)
@@ -343,6 +343,7 @@ def beyond(trajectory: Any, instruction: Instruction) -> Any:
     return trajectory.velocity.square().sum((-1, -2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("process", [False, True])
 def test_a_guidance_weight_that_diverges_holds_the_robot_and_says_why(
     settings: DiffusionSettings, process: bool
@@ -386,6 +387,7 @@ def test_plans_that_take_no_time_are_for_simulation_only(settings: DiffusionSett
         diffusion_policy(ROBOT, replace(settings, delay=0), process=True)
 
 
+@pytest.mark.slow
 def test_rolling_gives_the_same_actions_in_line_and_beside_the_loop(settings: DiffusionSettings) -> None:
     rolling = replace(settings, schedule="rolling", steps=2, execution_horizon=1, delay=1)
     inline, process = diffusion_policy(ROBOT, rolling), diffusion_policy(ROBOT, rolling, process=True)

@@ -41,6 +41,7 @@ def ends_off(log):
     assert log.messages["/command"][-1]["mode"] == "OFF"
 
 
+@pytest.mark.slow
 def test_json_is_one_object_on_standard_output(capfd):
     assert main([*RUN, "--seed", "2", "--json"]) == 0
     out, err = capfd.readouterr()
@@ -70,6 +71,7 @@ def test_who_steers_is_given_real_time_whoever_reads_the_output(words, realtime,
     assert asked == [realtime]
 
 
+@pytest.mark.slow
 def test_live_line_summary_and_log_for_a_person(capsys):
     assert main(RUN) == 0
     out = capsys.readouterr().out
@@ -117,6 +119,7 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, message, capsys):
     assert len(error.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_replay_is_identical_and_says_where_a_changed_log_differs(capsys):
     main([*RUN, "--record", "a.mcap", "--set", "push=0.1", "--randomise", "--seed", "4"])
     capsys.readouterr()
@@ -136,6 +139,7 @@ def test_replay_is_identical_and_says_where_a_changed_log_differs(capsys):
     assert (difference.tick, difference.channel, difference.field) == (150, "/command", "position")
 
 
+@pytest.mark.slow
 def test_what_only_a_program_can_repeat_is_refused(capsys):
     assert main([*RUN, "--record", "a.mcap"]) == 0
 
@@ -152,6 +156,7 @@ def test_what_only_a_program_can_repeat_is_refused(capsys):
             replay.replay(log)
 
 
+@pytest.mark.slow
 def test_a_truncated_log_replays_as_far_as_it_goes(tmp_path, capsys):
     assert main([*RUN, "--record", "a.mcap"]) == 0
     data = (tmp_path / "a.mcap").read_bytes()
@@ -162,6 +167,7 @@ def test_a_truncated_log_replays_as_far_as_it_goes(tmp_path, capsys):
     assert (tmp_path / "b.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("seed", range(2))
 def test_a_signal_at_any_moment_ends_lowered_and_off_and_replays(seed, number, tmp_path, capsys):
@@ -183,6 +189,7 @@ def test_a_signal_at_any_moment_ends_lowered_and_off_and_replays(seed, number, t
     assert main(["replay", "a.mcap"]) == 0, capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_two_signals_end_at_once(tmp_path):
     process = start("run", "walk", "--policy", "gait", "--seconds", "600", "--record", "a.mcap")
     while not (tmp_path / "a.mcap").exists():
@@ -196,6 +203,7 @@ def test_two_signals_end_at_once(tmp_path):
     ends_off(read_log("a.mcap"))
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_ends_the_run_safe(tmp_path):
     def small_files():
         resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000))
@@ -257,8 +265,11 @@ def test_a_film_that_cannot_be_written_is_refused_before_anything_moves(tmp_path
     assert not list(tmp_path.glob("runs/*"))
 
 
+@pytest.mark.slow
 def test_gl_that_does_not_work_is_explained(tmp_path):
-    process = start(*RUN, "--video", "a.mp4", env=os.environ | {"MUJOCO_GL": "glfw", "DISPLAY": ":99"})
+    process = start(
+        *RUN, "--seconds", "0.2", "--video", "a.mp4", env=os.environ | {"MUJOCO_GL": "glfw", "DISPLAY": ":99"}
+    )
     out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
     assert "MUJOCO_GL=egl" in out
@@ -272,14 +283,15 @@ def draws() -> bool:
     return any(subprocess.run(drawn, env=kind, capture_output=True).returncode == 0 for kind in kinds)
 
 
+@pytest.mark.slow
 def test_a_goal_run_is_filmed_and_plotted(tmp_path):
     av = pytest.importorskip("av")
-    process = start("run", "goal", "--policy", "gait", "--seconds", "2", "--video", "a.mp4")
+    process = start("run", "goal", "--policy", "gait", "--seconds", "1", "--video", "a.mp4")
     out, err = process.communicate(timeout=120)
-    assert process.returncode == 1, err  # two seconds do not reach it
-    if not draws():
+    assert process.returncode == 1, err  # a second does not reach it
+    if "no video" in out:
+        assert not draws()
         pytest.skip("MuJoCo itself cannot draw on this machine")
-    assert "no video" not in out
     with av.open(str(tmp_path / "a.mp4")) as container:
         pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert len(pictures) >= 50
