@@ -30,6 +30,9 @@ HEAVY = {
 }
 LONGEST = 400  # lines of a file
 ROOMIEST = 12  # modules of a folder beside its folders
+MOST_ARGUMENTS = 7
+# Where there are more, since a class would only say them once again.
+MANY = {("stack/estimation/odometry.py", "push")}  # an array for each group of columns of a network's input
 # Where an object is asked what it has, since it is not ours: by file, what it is asked for.
 ASKED = {
     ("hw/clock.py", "prctl"),  # the C library's: Linux alone has it
@@ -257,6 +260,30 @@ def test_a_class_name_stands_for_one_thing() -> None:
         for found in classes(path.read_text()):
             where.setdefault(found, []).append(name(path))
     assert {found: paths for found, paths in where.items() if len(paths) > 1} == {}
+
+
+def crowds(code: str) -> Iterator[tuple[str, int]]:
+    """Name and number of the arguments of every function that takes more than `MOST_ARGUMENTS`."""
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.FunctionDef):
+            taken = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+            count = len(taken) - (taken[:1] in (["self"], ["cls"]))
+            if count > MOST_ARGUMENTS:
+                yield node.name, count
+
+
+def test_what_takes_many_arguments_takes_a_dataclass() -> None:
+    found = {
+        (name(path), function)
+        for package in BELOW
+        for path in sources(package)
+        for function, _ in crowds(path.read_text())
+    }
+    assert found == MANY
+
+
+def test_a_crowd_of_arguments_is_seen() -> None:
+    assert list(crowds("class A:\n    def f(self, a, b, c, d, e, f, *, g, h): ...")) == [("f", 8)]
 
 
 def test_configs_hold_data_alone() -> None:

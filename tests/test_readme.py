@@ -47,7 +47,7 @@ def commands(text: str) -> Iterator[list[str]]:
 
 def check(words: list[str], verbs: dict[str, Verb] = VERBS) -> None:
     """Parse a command line as `servoid` would, and look up the names in it. A verb by itself is a mention of it."""
-    if not words or words[0] in ("--help", "--version", "VERB"):
+    if not words or words[0] in ("--help", "--version", "COMMAND"):
         return
     assert words[0] in verbs, f"no verb {words[0]}"
     verb, rest = verbs[words[0]], words[1:]

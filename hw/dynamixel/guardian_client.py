@@ -66,7 +66,7 @@ class Lifeline:
             if self._starts >= STARTS:
                 raise BackendError(
                     f"the guardian process ended {STARTS} times, the last with code {self._process.returncode}: "
-                    "who or what ends it?"
+                    "find out what ends it"
                 )
             process = self._start()  # first: where it cannot be started, torque off must still be possible
             self._forget()

@@ -30,8 +30,8 @@ _PARTS = ("encoder", "prior", "decoder")
 class LatentConfig:
     """Shape of the three networks. Stored in the checkpoint."""
 
-    size: Annotated[int, "numbers of a latent; PULSE has 32 for a human's 69 joints"] = 16
-    width: Annotated[int, "units of a hidden layer"] = 256
+    size: Annotated[int, "numbers in a latent; PULSE has 32 for a human's 69 joints"] = 16
+    width: Annotated[int, "units of each hidden layer"] = 256
     layers: Annotated[int, "hidden layers"] = 2
 
     def __post_init__(self) -> None:
@@ -91,7 +91,9 @@ class LatentActions:
             raise CheckpointError(f"{path}: its latent actions do not fit its own header: {error}") from error
         needed = [(n + n_joints, *hidden, 2 * z), (n, *hidden, 2 * z), (n + z, *hidden, n_joints)]
         if found != needed:
-            raise CheckpointError(f"{path}: its latent actions do not fit its own header: {found}, {needed} are needed")
+            raise CheckpointError(
+                f"{path}: its latent actions do not fit its own header: {found}, but {needed} are needed"
+            )
         return made
 
 
@@ -103,19 +105,9 @@ def same_latents(a: LatentActions | None, b: LatentActions | None) -> bool:
     return ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in ours)
 
 
-def save_latents(
-    path: Path,
-    latents: LatentActions,
-    robot: Robot,
-    *,
-    data: str,
-    licence: str,
-    results: Mapping[str, Any],
-    training: Mapping[str, Any],
-) -> None:
+def save_latents(path: Path, latents: LatentActions, robot: Robot, origin: checkpoint.Origin) -> None:
     """Write a checkpoint of the kind `latent`. Raises CheckpointError."""
-    about: dict[str, Any] = {"data": data, "licence": licence, "results": results, "training": dict(training)}
-    head = checkpoint.header(KIND, robot, **about, **latents.describe(len(robot.joints)))
+    head = checkpoint.header(KIND, robot, **vars(origin), **latents.describe(len(robot.joints)))
     checkpoint.write(path, latents.to_tensors(), head)
 
 

@@ -164,7 +164,7 @@ def diffusion_policy(
     planner: Planner
     if process and not settings.delay:
         raise ConfigError(
-            "diffusion policy: delay 0 wants plans that take no time: in real time set delay to 1 or more"
+            "diffusion policy: delay 0 needs plans that take no time: in real time set delay to 1 or more"
         )
     if process:
         planner = ProcessPlanner(partial(_build, robot, settings, cost))

@@ -151,7 +151,7 @@ def _maker(name: str) -> Maker:
 
         kind = str(read_header(Path(name))["kind"])
         if kind not in _KINDS:
-            raise ConfigError(f"{name}: a checkpoint of kind '{kind}' is no policy; there are {', '.join(_KINDS)}")
+            raise ConfigError(f"{name}: a checkpoint of kind '{kind}' is not a policy; known: {', '.join(_KINDS)}")
         return _KINDS[kind]
     if _plugin(name) is not None:
         return _own

@@ -154,7 +154,7 @@ def _make(path: Path) -> BinaryIO:
         return path.open("xb")
     except FileExistsError:
         raise ConfigError(
-            f"{path}: exists already, and a log is never overwritten: give another name, or delete it"
+            f"{path}: already exists, and a log is never overwritten: choose another name, or delete it"
         ) from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror}): choose another place") from None

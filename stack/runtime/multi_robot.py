@@ -11,7 +11,6 @@ import numpy as np
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.body import Clock
 from servoid.hw.contracts.task import Assignment, Behaviour
-from servoid.hw.robot.description import Robot
 from servoid.hw.seeds import teammate_seed
 from servoid.stack.control.policies import make_policy
 from servoid.stack.estimation.estimator import Estimator
@@ -47,17 +46,17 @@ class Teammates:
     def __init__(
         self,
         settings: RunSettings,
-        robot: Robot,
         assignment: Assignment,
         behaviours: Sequence[Behaviour],
         body: Backend,
-        first: Guard,
+        first: ControlledRobot,
         interrupt: Interrupt,
         script: Script,
     ) -> None:
-        """`body` is the first robot's, whose world has a body for each of `behaviours`, and `first` its guard."""
+        """`body` is the first robot's, whose world has a body for each of `behaviours`."""
         assert body.simulation is not None
-        self._first, self._interrupt, self._robot = first, interrupt, robot
+        robot = self._robot = first.robot
+        self._first, self._interrupt = first.guard, interrupt
         self._clock: Clock = body.clock
         self._heard: list[Event] = []  # why the first robot ended: the others end with it
         self._open = ExitStack()

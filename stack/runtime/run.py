@@ -188,11 +188,10 @@ class Run:
         if behaviours := self.behaviour.teammates:
             clock = self._teammates = Teammates(
                 self.settings,
-                self.robot,
                 self.assignment,
                 behaviours,
                 self.body,
-                self.guard,
+                self._controlled,
                 self._interrupt,
                 self._script,
             )

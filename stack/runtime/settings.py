@@ -39,7 +39,9 @@ class RunSettings:
         if not 0.0 < self.gain <= MAX_GAIN:
             raise ConfigError(f"gain: {self.gain:g} is outside 0 to {MAX_GAIN:g}: it scales the servos' position gain")
         if "gain" in self.set:
-            raise ConfigError(f"--set gain={self.set['gain']}: gain is no setting of a task: give --gain G (gain=G)")
+            raise ConfigError(
+                f"--set gain={self.set['gain']}: gain is not a setting of the task: use --gain G (gain=G)"
+            )
 
 
 @dataclass(frozen=True)

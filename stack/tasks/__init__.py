@@ -68,7 +68,9 @@ def find(name: str) -> TaskEntry:
         raise ConfigError(f"unknown task '{name}': {nearest(name, names())}")
     cls: type[BaseTask] = plugin.cls
     if not (cls.name and cls.description):
-        raise plugin.error(f'{cls.__name__}: say what it is: name = "..." and description = "..." in the class')
+        raise plugin.error(
+            f'{cls.__name__}: name or description missing: write name = "..." and description = "..." in the class'
+        )
     return TaskEntry(cls.name, cls, cls.description, plugin)
 
 

@@ -69,7 +69,7 @@ class Inbetween(BaseTask):
         """Draw clips and where in them, and string them together. Raises ConfigError without clips."""
         if not self._clips:
             raise ConfigError(
-                "inbetween: no clips: record some, as with `servoid run walk --policy expert --record FILE`, and give"
+                "inbetween: no clips: record some, as with `servoid run walk --policy expert --record FILE`, and name"
                 " them with --set clips=FILE:FILE"
             )
         motions, frames, place, yaw = list(self._clips.values()), [], np.zeros(2), 0.0

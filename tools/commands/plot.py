@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", type=Path, help="flight log of a run")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="PNG to write (default: beside the log)")
+    parser.add_argument("log", type=Path, metavar="LOG", help="flight log (.mcap)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="picture to write, PNG (default: beside the log)")
     add_json_argument(parser)
 
 

@@ -54,7 +54,7 @@ def positive(text: str) -> float:
 def check_seed(seed: int) -> None:
     """Raise ConfigError for a `--seed` that no generator takes."""
     if seed < 0:
-        raise ConfigError(f"--seed {seed}: must not be negative")
+        raise ConfigError(f"--seed must not be negative, not {seed}")
 
 
 def add_set_argument(parser: argparse.ArgumentParser) -> None:
@@ -64,14 +64,18 @@ def add_set_argument(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="change a setting of the task (servoid tasks)",
+        help="change a setting of the task (see servoid tasks TASK)",
     )
 
 
 def add_gain_argument(parser: argparse.ArgumentParser) -> None:
     """`--gain G`, for `RunSettings.gain`."""
     parser.add_argument(
-        "--gain", type=float, default=1.0, metavar="G", help="scale the servos' position gain; below 1 is softer"
+        "--gain",
+        type=float,
+        default=1.0,
+        metavar="G",
+        help="factor on the servos' position gain; below 1 is softer (default: 1)",
     )
 
 

@@ -63,4 +63,6 @@ def record_clips(folder: Path, robot: str, number: int, say: Callable[[str], Non
         clips.append(path.resolve())
         if len(clips) == number:
             return clips
-    raise ConfigError(f"{place}: the expert fell in most of its walks: only {len(clips)} of {number} clips are there")
+    raise ConfigError(
+        f"{place}: the expert fell in most of its walks: only {len(clips)} of {number} clips were recorded"
+    )

@@ -107,10 +107,12 @@ class Policies:
         share, last = _share(path), path.with_name(_LAST)
         if share is None:
             raise ConfigError(
-                f"{last} does not say that the training was finished: train anew: {self._command(network, path)}"
+                f"{last}: does not record that the training finished; train it again: {self._command(network, path)}"
             )
         if share < 1.0:
-            raise ConfigError(f"{last}: {share:.1%} of its training are done: go on: {self._command(network, path)}")
+            raise ConfigError(
+                f"{last}: only {share:.1%} of its training is done; continue it: {self._command(network, path)}"
+            )
 
     def fingerprint(self, experiment: Experiment) -> dict[str, Any]:
         """Everything about the policy of an experiment that its episodes depend on: checkpoints by their hash."""
@@ -161,7 +163,9 @@ def _check_training(path: Path, network: OwnNetwork) -> None:
     for name, value in given.items():
         if name in asked and name not in whatever and asked[name] != value:
             option = "--" + name.replace("_", "-")
-            raise ConfigError(f"{path}: trained with {option} {value}, and this row is of {asked[name]}: train it anew")
+            raise ConfigError(
+                f"{path}: trained with {option} {value}, but this row needs {asked[name]}: train it again"
+            )
 
 
 def _diffusion_settings(policy: str) -> DiffusionSettings | None:

@@ -112,7 +112,7 @@ def evaluate(
             ):
                 raise ConfigError(
                     f"the policy of {', '.join(one.rows)}, the robot, the code or a file in configs/ changed while"
-                    " episodes ran: what was done is kept; give the same command again when the files stay as they are"
+                    " episodes ran: finished ones are kept; run the same command again once the files no longer change"
                 )
             one.cache.add(result.job.episode, {**result.record, "commit": commit})
             bar.done(result.job.experiment, result.wall_seconds)

@@ -51,7 +51,7 @@ def read_pages(path: Path) -> dict[int, Page]:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     if len(content) != PAGES * PAGE_BYTES:
         whole = PAGES * PAGE_BYTES
-        raise ConfigError(f"{path}: has {len(content)} bytes, and an action file {whole}: it is cut off, or none")
+        raise ConfigError(f"{path}: has {len(content)} bytes instead of {whole}: cut off, or not an action file")
     pages = {}
     for number in range(PAGES):
         raw = content[number * PAGE_BYTES : (number + 1) * PAGE_BYTES]
@@ -68,10 +68,10 @@ def read_pages(path: Path) -> dict[int, Page]:
 def _page(path: Path, number: int, raw: bytes) -> Page:
     count, schedule, speed = raw[20], raw[16], raw[22]
     if count > STEPS:
-        raise ConfigError(f"{path}: page {number}: {count} steps, where {STEPS} fit")
+        raise ConfigError(f"{path}: page {number}: has {count} steps, but only {STEPS} fit")
     if schedule != _TIME_SCHEDULE:
         raise ConfigError(
-            f"{path}: page {number}: its steps are timed by speed, which is not read yet: save it by time"
+            f"{path}: page {number}: its steps are timed by speed, which is not supported yet: save it timed by time"
         )
     if speed == 0:
         raise ConfigError(f"{path}: page {number}: its play speed is 0")
@@ -94,7 +94,7 @@ def chain(pages: Mapping[int, Page], first: int, path: Path) -> list[Page]:
             asked = f"page {number}" + (f", which page {followed[-1].number} goes on with," if followed else "")
             raise ConfigError(f"{path}: {asked} is empty; pages with a motion: {', '.join(map(str, pages))}")
         if any(page.number == number for page in followed):
-            raise ConfigError(f"{path}: the pages from {first} on loop at page {number}: such a motion has no end")
+            raise ConfigError(f"{path}: the pages from {first} on loop at page {number}, so the motion never ends")
         followed.append(pages[number])
         number = pages[number].next
     return followed

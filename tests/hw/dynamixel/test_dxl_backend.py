@@ -127,7 +127,7 @@ def test_who_asks_for_a_robot_exactly_as_its_file_gets_no_other(robot: Robot) ->
     """What `servoid run` asks for: a servo that answers 0.5 ms late, or gets hotter than it should, is no small thing
     with torque on."""
     robot.joint("l_el").put("temperature_limit", 75)
-    with pytest.raises(BackendError, match="1 registers are not as op3 needs them, the first of l_el"):
+    with pytest.raises(BackendError, match="1 registers differ from what op3 needs, the first on l_el"):
         robot.backend(exact=True).connect()
     assert robot.line.gone
 

@@ -11,7 +11,7 @@ from servoid.policy.diffusion.model.config import DenoiserConfig, TrainingObject
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.objective import losses
 from servoid.policy.diffusion.sampler import Known, Sampler
-from servoid.policy.diffusion.schedule import autoregressive, cosine_signal, full_sequence, rolling
+from servoid.policy.diffusion.schedule import Rolling, autoregressive, cosine_signal, full_sequence, rolling
 
 LEVELS = 100
 SIGNAL = torch.as_tensor(cosine_signal(LEVELS), dtype=torch.float32)
@@ -140,7 +140,7 @@ def test_sampling_can_go_on_from_a_noisy_start() -> None:
         return s, a
 
     start = torch.full((1, 2, 1), 5.0), torch.full((1, 2, 1), 6.0)
-    matrix = rolling(20, 2, np.arange(2), np.arange(2), 14, 4)
+    matrix = rolling(20, 2, np.arange(2), np.arange(2), Rolling(14, 4, ramp=1))
     Sampler(predict, cosine_signal(20)).sample(matrix, unknown(1, tokens=2), generators(1), start=start)
     assert seen[0][0].eq(5.0).all()
     assert seen[0][1:] == ([14, 20], [4, 20])

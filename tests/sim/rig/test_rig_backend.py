@@ -35,7 +35,7 @@ def test_it_stands_is_pushed_and_ends_with_torque_off_and_without_a_process() ->
         _ = body.truth.position
     sensors, motors = body.connect()
     rig = body.rig
-    with pytest.raises(BackendError, match="connected already"):
+    with pytest.raises(BackendError, match="already connected"):
         body.connect()
     start = body.clock.now_ns()
     assert start % TICK == 0, "ticks fall on steps of physics"

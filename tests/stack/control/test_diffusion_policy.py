@@ -17,6 +17,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Plan, PlanRequest, State
 from servoid.hw.robot.description import load_robot
+from servoid.policy.checkpoint import Origin
 from servoid.policy.diffusion.model import checkpoint
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.denoiser import Denoiser
@@ -311,7 +312,8 @@ def untrained(tmp_path: Path, **training: Any) -> DiffusionSettings:
     states = Normaliser(torch.zeros(54), torch.ones(54))
     actions = Normaliser(torch.tensor(ROBOT.home, dtype=torch.float32), torch.full((20,), 0.1))
     facts: dict[str, Any] = {"data": "none", "licence": "none", "results": {}, "training": training}
-    checkpoint.save(path, Denoiser(config).state_dict(), config, states, actions, ROBOT, **facts)
+    trained = checkpoint.Trained(Denoiser(config).state_dict(), config, states, actions)
+    checkpoint.save(path, trained, ROBOT, Origin(**facts))
     return DiffusionSettings(checkpoint=str(path), steps=5, execution_horizon=4, delay=2)
 
 
@@ -368,7 +370,7 @@ def test_a_checkpoint_for_another_rate_is_refused_before_anything_starts(
         diffusion_policy(replace(ROBOT, rate=100), settings, process=process)
     with pytest.raises(ConfigError, match="lower execution_horizon or delay"):
         diffusion_policy(ROBOT, replace(settings, execution_horizon=15, delay=2), process=process)
-    with pytest.raises(ConfigError, match="horizon 32 is asked for"):
+    with pytest.raises(ConfigError, match="horizon is 32"):
         diffusion_policy(ROBOT, replace(settings, horizon=32), process=process)
 
 
@@ -378,7 +380,7 @@ def test_settings_that_the_training_does_not_fit_are_refused_before_anything_sta
 ) -> None:
     with pytest.raises(ConfigError, match="trained for at most 1 ticks"):
         diffusion_policy(ROBOT, untrained(tmp_path, committed=1), process=process)
-    with pytest.raises(ConfigError, match="learned the actions of the next 5 only"):
+    with pytest.raises(ConfigError, match="learned only the actions of the next 5"):
         diffusion_policy(ROBOT, untrained(tmp_path, far_actions=0.0, near_actions=5), process=process)
 
 

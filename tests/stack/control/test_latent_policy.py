@@ -13,7 +13,7 @@ from test_diffusion_policy import INSTRUCTION, ROBOT, Spy, state
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Plan, PlanRequest
-from servoid.policy.checkpoint import CheckpointError, read, read_header, write
+from servoid.policy.checkpoint import CheckpointError, Origin, read, read_header, write
 from servoid.policy.diffusion.model import checkpoint
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.denoiser import Denoiser
@@ -105,7 +105,8 @@ def settings(tmp_path: Path) -> DiffusionSettings:
     actions = Normaliser(torch.zeros(SIZE), torch.ones(SIZE))
     facts: dict[str, Any] = {"data": "none", "licence": "none", "results": {}, "training": {}}
     weights = Denoiser(config).state_dict()
-    checkpoint.save(path, weights, config, states, actions, ROBOT, **facts, latents=latents())
+    trained = checkpoint.Trained(weights, config, states, actions, latents())
+    checkpoint.save(path, trained, ROBOT, Origin(**facts))
     return DiffusionSettings(checkpoint=str(path), steps=5, execution_horizon=4, delay=2)
 
 
@@ -149,6 +150,6 @@ def test_latents_that_do_not_fit_are_refused(settings: DiffusionSettings) -> Non
     with pytest.raises(CheckpointError, match="latent actions' state layout"):
         diffusion_policy(ROBOT, settings)
     write(path, tensors, {k: v for k, v in head.items() if k != "latent"})
-    with pytest.raises(CheckpointError, match="plans 3 numbers a tick, and op3 has 20 joints"):
+    with pytest.raises(CheckpointError, match="plans 3 numbers a tick, but op3 has 20 joints"):
         diffusion_policy(ROBOT, settings)
     assert read_header(path)["kind"] == "diffusion"

@@ -130,7 +130,7 @@ def test_a_missing_log_is_refused(tmp_path):
 
 def test_a_log_is_never_overwritten(tmp_path):
     (tmp_path / "a.mcap").write_text("precious")
-    with pytest.raises(ConfigError, match="exists already"):
+    with pytest.raises(ConfigError, match="already exists"):
         Recorder.create(tmp_path / "a.mcap", HEADER)
     assert (tmp_path / "a.mcap").read_text() == "precious"
 

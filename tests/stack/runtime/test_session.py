@@ -241,7 +241,7 @@ def never_connected():
 
 def test_a_log_that_cannot_be_made_is_refused_before_the_robot_is_asked(tmp_path):
     (tmp_path / "run.mcap").write_text("precious")
-    for path, why in ((tmp_path / "run.mcap", "exists already"), (tmp_path / "run.mcap" / "b" / "a", "cannot be")):
+    for path, why in ((tmp_path / "run.mcap", "already exists"), (tmp_path / "run.mcap" / "b" / "a", "cannot be")):
         with pytest.raises(ConfigError, match=why):
             stand(never_connected(), settings={"record": path, "start": True})
     assert (tmp_path / "run.mcap").read_text() == "precious"
@@ -275,7 +275,7 @@ def test_a_gain_that_servos_cannot_have_is_refused(gain):
 
 
 def test_the_gain_is_no_setting_of_the_task():
-    with pytest.raises(ConfigError, match=r"--set gain=0.6: gain is no setting of a task: give --gain G"):
+    with pytest.raises(ConfigError, match=r"--set gain=0.6: gain is not a setting of the task: use --gain G"):
         RunSettings("stand", set={"gain": "0.6"})
 
 

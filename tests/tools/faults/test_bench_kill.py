@@ -107,4 +107,4 @@ def test_an_interrupted_run_is_judged_after_its_guardian(tmp_path: Path, monkeyp
 def test_what_cannot_be_counted_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "kill", "--kills", "-1"]) == 2
     assert main(["bench", "interrupt", "--times", "0"]) == 2
-    assert "give numbers from 1 on" in capsys.readouterr().err
+    assert "both must be at least 1" in capsys.readouterr().err

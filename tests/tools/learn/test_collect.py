@@ -319,7 +319,7 @@ def test_a_dataset_is_replaced_only_when_told(tmp_path: Path, capsys: pytest.Cap
     assert "--force" in json.loads(capsys.readouterr().out)["error"]
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "1.jpg").touch()
-    with pytest.raises(ConfigError, match="something else"):
+    with pytest.raises(ConfigError, match="something other"):
         writer(tmp_path / "photos", force=True)
 
 
@@ -378,7 +378,7 @@ def test_files_are_split_by_size_and_found_again(tmp_path: Path, monkeypatch: py
     [
         ("--frames 0", "--frames"),
         ("--worlds 0", "--worlds"),
-        ("--randomise 25", "share between 0 and 1"),
+        ("--randomise 25", "must be between 0 and 1"),
         ("--noise 1.3 0.5", "the lower one first"),
         ("--seconds 2", "at least 3 s"),
         ("--policy exprt", "no such checkpoint"),

@@ -89,7 +89,7 @@ def test_minutes_that_are_typed_count_where_steps_are_the_default() -> None:
         ("minutes: 60\nwidth: wide\n", r"mine.yaml:2: width: expected a whole number"),
         ("minutes: 60\nmonotone: 0.8\n", r"mine.yaml:2: monotone must be a share of 0 to 0\.5, not 0\.8"),
         ("history: 1\n", r"mine.yaml:1: history must be at least 2"),
-        ("mask: casual\n", r"mine.yaml:1: mask: no attention mask is called 'casual'"),
+        ("mask: casual\n", r"mine.yaml:1: mask: unknown attention mask 'casual'"),
         ("precision: fp64\n", r"mine.yaml:1: precision: expected one of bf16, fp32"),
     ],
 )

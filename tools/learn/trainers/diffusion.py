@@ -1,4 +1,7 @@
-"""Train the diffusion planner-controller on a recorded dataset."""
+"""Train the diffusion model, which plans and controls, on a recorded dataset.
+
+Ctrl-C saves, and the same command continues.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
+from servoid.policy.checkpoint import Origin
 from servoid.policy.diffusion.model.config import DenoiserConfig, DenoiserShape, TrainingObjective
 from servoid.policy.features import token_layout
 from servoid.policy.text.encoder import load_encoder
@@ -35,13 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid train diffusion`."""
     run = add_run_arguments(parser, DiffusionTraining(), data=True)
     run.add_argument(
-        "--init", type=Path, metavar="CHECKPOINT", help="begin with this diffusion model; its normalisation is kept"
+        "--init", type=Path, metavar="CHECKPOINT", help="start from this diffusion model, with its normalisation"
     )
     run.add_argument(
         "--latent",
         type=Path,
         metavar="CHECKPOINT",
-        help="plan latents of this file (`servoid train latent`), not joint targets",
+        help="plan in the latents of this file (`servoid train latent`) instead of joint targets",
     )
 
 
@@ -144,9 +148,9 @@ class DiffusionTrainer(Trainer):
 
         model = load(path, self.robot)
         if model.config != self.config:
-            raise ConfigError(f"{path}: another network than the options ask for: {model.config}")
+            raise ConfigError(f"{path}: not the network that the options ask for: {model.config}")
         if not same_latents(model.latents, self.windows.latents):
-            raise ConfigError(f"{path}: its actions are not those that --latent gives: use the same latents, or none")
+            raise ConfigError(f"{path}: its actions are not those of --latent: use the same latents, or none")
         self.network.load_state_dict(model.denoiser.state_dict())
         self.average.weights = {name: p.detach().clone() for name, p in self.network.named_parameters()}
         self.windows.states, self.windows.actions = model.states, model.actions
@@ -223,21 +227,11 @@ class DiffusionTrainer(Trainer):
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
         """See `Trainer.ship`."""
-        from servoid.policy.diffusion.model import checkpoint
+        from servoid.policy.diffusion.model.checkpoint import Trained, save
 
-        checkpoint.save(
-            path,
-            self.average.weights,
-            self.config,
-            self.windows.states,
-            self.windows.actions,
-            self.robot,
-            data=self.source,
-            licence=self.settings.licence,
-            results=results,
-            training=plain(self.settings),
-            latents=self.windows.latents,
-        )
+        windows = self.windows
+        trained = Trained(self.average.weights, self.config, windows.states, windows.actions, windows.latents)
+        save(path, trained, self.robot, Origin(self.source, self.settings.licence, results, plain(self.settings)))
 
     def state(self) -> dict[str, Any]:
         """See `Trainer.state`."""

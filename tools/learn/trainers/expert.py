@@ -1,6 +1,6 @@
 """Train the expert, the tracker of references, with PPO on residuals of the gait.
 
-Ctrl-C saves; the same command goes on. The newest network is expert.safetensors.
+Ctrl-C saves, and the same command continues. The newest network is expert.safetensors.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument(
         "--init",
         metavar="CHECKPOINT",
-        help="begin with this tracker (expert: the shipped one), halfway in the schedules",
+        help="start from this tracker (expert: the shipped one), halfway through the schedules",
     )
 
 

@@ -1,9 +1,9 @@
-"""Learn latent actions, a conditional VAE with a learned prior, on a recorded dataset.
+"""Train latent actions, a conditional VAE with a learned prior, on a recorded dataset.
 
-It measures what the posterior's mean loses of held-out joint targets (`reconstruction_rad`, root mean square), what is
-left when the latent is taken from the prior instead (`prior_rad`), how far posterior and prior are apart (`kl_nats`),
-and how the expert walks when each of its targets is encoded and decoded (`survival`, `velocity_error`), beside the
-expert itself. The latents through which it walks best are kept.
+It measures the error of held-out joint targets that the posterior's mean reconstructs (`reconstruction_rad`, root mean
+square) and that the prior's mean gives (`prior_rad`), how far posterior and prior are apart (`kl_nats`), and how the
+expert walks when each of its targets is encoded and decoded (`survival`, `velocity_error`), beside the expert itself.
+The latents through which it walks best are kept.
 """
 
 from __future__ import annotations
@@ -158,10 +158,11 @@ class LatentTrainer(Trainer):
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
         """See `Trainer.ship`."""
+        from servoid.policy.checkpoint import Origin
         from servoid.policy.latent.actions import save_latents
 
-        about: dict[str, Any] = {"data": self.source, "licence": self.settings.licence, "results": results}
-        save_latents(path, self.network.to_numpy(), self.robot, **about, training=plain(self.settings))
+        origin = Origin(self.source, self.settings.licence, results, plain(self.settings))
+        save_latents(path, self.network.to_numpy(), self.robot, origin)
 
     def state(self) -> dict[str, Any]:
         """See `Trainer.state`."""

@@ -1,6 +1,6 @@
-"""Learn the correction of leg odometry from walks in randomised worlds, and measure the drift that is left.
+"""Train the correction of leg odometry on walks in randomised worlds, and measure the drift that is left.
 
-With --measure nothing is trained: it says how far an odometry is off.
+With --measure it trains nothing and measures an existing checkpoint.
 """
 
 from __future__ import annotations
@@ -38,16 +38,14 @@ _MEASURING = ("policy", "seed", "walks", "walk_seconds")  # settings that --meas
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid train odometry`."""
     out = Path("runs/odometry.safetensors")
-    run = add_run_arguments(
-        parser, OdometryTraining(), out, "checkpoint to write; its run is kept in the folder beside it"
-    )
+    run = add_run_arguments(parser, OdometryTraining(), out, "checkpoint to write; the folder beside it holds its run")
     run.add_argument(
         "--measure",
         nargs="?",
         const=SHIPPED,
         metavar="CHECKPOINT",
-        help="train nothing: how far is this odometry off (default: the shipped one); "
-        "--policy, --walks, --walk-seconds and --seed choose the walks",
+        help="train nothing, and measure this odometry (default: the shipped one) on the walks that "
+        "--policy, --walks, --walk-seconds and --seed choose",
     )
 
 
