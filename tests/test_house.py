@@ -264,7 +264,7 @@ def test_a_class_name_stands_for_one_thing() -> None:
 
 def crowds(code: str) -> Iterator[tuple[str, int]]:
     """Name and number of the arguments of every function that takes more than `MOST_ARGUMENTS`."""
-    for node in ast.walk(ast.parse(code)):
+    for node in ast.walk(parse(code)):
         if isinstance(node, ast.FunctionDef):
             taken = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
             count = len(taken) - (taken[:1] in (["self"], ["cls"]))

@@ -41,14 +41,12 @@ class DynamixelBackend:
         exact: bool = False,
         name: str = "dynamixel",
         opener: Callable[[str, int], Port] = SerialPort,
-        imu_opener: Callable[..., SerialImu] = SerialImu,
     ) -> None:
         self.name = name
         self.clock: Clock = clock or WallClock()
         self.simulation: Simulation | None = None  # it moves metal
         self.differences: tuple[Difference, ...] = ()
         self._robot, self._given, self._fix, self._exact, self._open = robot, port, fix, exact, opener
-        self._open_imu = imu_opener
         self._port: Port | None = None
         self._bus: Bus | None = None
         self._motors: DynamixelMotors | None = None
@@ -76,7 +74,7 @@ class DynamixelBackend:
 
     def _connect(self, bus: Bus) -> tuple[DynamixelSensors, DynamixelMotors]:
         if self._robot.imu.kind not in ("opencr", "none"):
-            self._imu = self._open_imu(self._robot.imu, self._robot.rate, clock=self.clock)
+            self._imu = SerialImu(self._robot.imu, self._robot.rate, clock=self.clock)
         bus.return_delay = LONGEST_RETURN_DELAY  # until the servos' own is known
         find_board(bus, self._robot)
         found = find_servos(bus, self._robot)

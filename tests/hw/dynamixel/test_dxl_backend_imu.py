@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from scripted_op3 import ROBOT, Robot, run
 
 from servoid.hw.contracts.body import BackendError
+from servoid.hw.dynamixel import backend as module
 from servoid.hw.dynamixel.backend import DynamixelBackend
 from servoid.hw.faults import IMU_FROZEN, STOP_BUTTON
 from servoid.hw.imu.reading import Reading
@@ -38,18 +39,15 @@ class FakeImu:
 
 
 @pytest.fixture
-def robot() -> Robot:
+def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
+    monkeypatch.setattr(module, "SerialImu", FakeImu)
     FakeImu.opened, FakeImu.closed = [], 0
     return Robot()
 
 
-def backend(robot: Robot, imu: Any = FakeImu) -> DynamixelBackend:
-    return DynamixelBackend(OWN, port=robot.line, clock=robot.line, imu_opener=imu)
-
-
 def test_the_named_imu_is_read_with_its_age(robot: Robot) -> None:
-    body = backend(robot)
-    sensors, motors = body.connect()
+    backend = DynamixelBackend(OWN, port=robot.line, clock=robot.line)
+    sensors, motors = backend.connect()
     assert FakeImu.opened == [("/dev/imu", 50)]
     robot.board.put("acceleration_z", 0)  # the board's own does not matter
     robot.line.before_answer = None
@@ -67,17 +65,18 @@ def test_the_named_imu_is_read_with_its_age(robot: Robot) -> None:
     assert (o.fault == IMU_FROZEN | STOP_BUTTON).all()
     assert np.isnan(o.specific_force).all()
     assert o.imu_age > 0.2
-    body.close()
+    backend.close()
     assert FakeImu.closed == 1
     assert not any(servo.get("torque_enable") for servo in robot.servos)
 
 
-def test_an_imu_that_does_not_open_leaves_servos_and_port_alone(robot: Robot) -> None:
-    def absent(*_: object, **__: object) -> Any:
+def test_an_imu_that_does_not_open_leaves_servos_and_port_alone(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(*_: object, **__: object) -> None:
         raise BackendError("/dev/imu: no such port")
 
+    monkeypatch.setattr(module, "SerialImu", absent)
     with pytest.raises(BackendError, match="/dev/imu"):
-        backend(robot, absent).connect()
+        DynamixelBackend(OWN, port=robot.line, clock=robot.line).connect()
     assert robot.line.sent == [], "not even their power was switched on"
     assert robot.line.gone, "the bus is given back"
 
@@ -85,5 +84,5 @@ def test_an_imu_that_does_not_open_leaves_servos_and_port_alone(robot: Robot) ->
 def test_servos_that_fail_give_the_imu_back(robot: Robot) -> None:
     robot.joint("l_knee").answers = False
     with pytest.raises(BackendError, match="l_knee"):
-        backend(robot).connect()
+        DynamixelBackend(OWN, port=robot.line, clock=robot.line).connect()
     assert FakeImu.closed == 1

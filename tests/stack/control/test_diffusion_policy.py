@@ -327,7 +327,6 @@ def trace(policy: DiffusionPolicy, seed: int, wait: bool) -> Array:
     return np.stack(out)
 
 
-@pytest.mark.slow
 def test_in_line_and_beside_the_loop_a_seed_gives_the_same_actions(settings: DiffusionSettings) -> None:
     inline = diffusion_policy(ROBOT, settings, slow_down)
     process = diffusion_policy(ROBOT, settings, slow_down, process=True)
@@ -345,8 +344,7 @@ def beyond(trajectory: Any, instruction: Instruction) -> Any:
     return trajectory.velocity.square().sum((-1, -2))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("process", [False, True])
+@pytest.mark.parametrize("process", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_guidance_weight_that_diverges_holds_the_robot_and_says_why(
     settings: DiffusionSettings, process: bool
 ) -> None:
