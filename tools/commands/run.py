@@ -85,7 +85,7 @@ def main(args: argparse.Namespace) -> int:
             realtime=(watched and not args.fast) if backend_kind(args.backend).simulated else None,
             port=args.port,
         )
-        for text in beyond(load_settings(args.task, settings(args)), load_robot(args.robot)):
+        for text in beyond(load_settings(args.task, settings(args), robot := load_robot(args.robot)), robot):
             report.line(text)
         live = LiveLine(sys.stderr if args.json else sys.stdout)
         try:

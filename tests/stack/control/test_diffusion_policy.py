@@ -215,7 +215,7 @@ def test_planning_goes_on_after_a_slow_plan(
 def test_what_is_asked_is_corrected_and_has_the_name_of_its_correction() -> None:
     """A name of its own for what was asked would pull against the correction: the planner names what it is asked."""
     spy = Spy()
-    policy = DiffusionPolicy(spy, Pace(4, 4, 2), trim=Trim(ROBOT.dt, rate=5.0))
+    policy = DiffusionPolicy(spy, Pace(4, 4, 2), trim=Trim(ROBOT, rate=5.0))
     turning = replace(state(0), angular_velocity=np.array([0.0, 0.0, 0.4]))
     for tick in range(200):
         act(policy, replace(turning, time_ns=tick * 20_000_000), np.full(20, 0.5), INSTRUCTION)
