@@ -1,11 +1,11 @@
 # make demo: install, then walk to a goal.   make test: install what tests need, then run all of them.
-# make quick: the tests that take less than some seconds each.
+# make quick: the tests that take less than about a second each.
 # make clean: remove the environment and caches; what was recorded and trained under runs/ stays.   PYTHON=... chooses the interpreter (3.11 or newer).
 
 PYTHON ?= $(shell for p in python3.11 python3; do $$p -c '' 2>/dev/null && echo $$p && break; done)
 VENV ?= .venv
 BIN := $(VENV)/bin
-PARALLEL := --numprocesses 2 --dist loadgroup
+PARALLEL := --numprocesses 2 --dist worksteal
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 .PHONY: demo test quick clean

@@ -108,6 +108,7 @@ def trained(recording: Recording, size: int, steps: int = 250) -> float:
     return float(np.sqrt(np.square(made.decode(raw, made.encode(raw, target)) - target).mean()))
 
 
+@pytest.mark.slow
 def test_a_few_latents_are_enough_because_the_decoder_knows_the_state() -> None:
     """Four numbers cannot hold twenty joints, unless the state tells the rest."""
     recording = state_dependent(3000, seed=0)

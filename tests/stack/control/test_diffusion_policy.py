@@ -191,8 +191,7 @@ class FakePipe:
     def recv(self) -> object:
         return self._answers.pop(0)[1]
 
-    def close(self) -> None:
-        pass
+    def close(self) -> None: ...
 
 
 @pytest.mark.parametrize(("replan", "delay", "slow"), [(4, 2, 2.6), (4, 4, 5.2), (2, 2, 2.5), (2, 1, 5.5), (1, 1, 1.3)])
@@ -345,7 +344,7 @@ def beyond(trajectory: Any, instruction: Instruction) -> Any:
     return trajectory.velocity.square().sum((-1, -2))
 
 
-@pytest.mark.parametrize("process", [False, True])
+@pytest.mark.parametrize("process", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_guidance_weight_that_diverges_holds_the_robot_and_says_why(
     settings: DiffusionSettings, process: bool
 ) -> None:
@@ -388,6 +387,7 @@ def test_plans_that_take_no_time_are_for_simulation_only(settings: DiffusionSett
         diffusion_policy(ROBOT, replace(settings, delay=0), process=True)
 
 
+@pytest.mark.slow
 def test_rolling_gives_the_same_actions_in_line_and_beside_the_loop(settings: DiffusionSettings) -> None:
     rolling = replace(settings, schedule="rolling", steps=2, execution_horizon=1, delay=1)
     inline, process = diffusion_policy(ROBOT, rolling), diffusion_policy(ROBOT, rolling, process=True)

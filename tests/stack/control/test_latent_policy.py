@@ -120,6 +120,7 @@ def trace(of: DiffusionPolicy) -> Array:
     return np.stack(out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("schedule", ["full_sequence", "rolling"])
 def test_a_checkpoint_with_latents_runs_by_itself(settings: DiffusionSettings, schedule: str) -> None:
     """In line and beside the loop, with nothing but its own file."""

@@ -50,6 +50,7 @@ def walk(body: Any, seconds: float) -> tuple[Array, Array]:
     return np.array(joints), np.array(path)
 
 
+@pytest.mark.slow
 def test_a_walk_is_that_of_the_simulation_and_repeats_bit_for_bit() -> None:
     """10 s straight ahead. In tight turns soles slip, and there a little noise parts two simulations as well."""
     joints, path = walk(SimBackend(ROBOT), 10.0)

@@ -178,6 +178,7 @@ def test_json_is_standard_json() -> None:
     assert json.loads(to_json(values)) == {"nan": None, "array": [1.0, None], "count": 3, "flag": True}
 
 
+@pytest.mark.slow
 def test_tasks_lists_every_setting() -> None:
     result = servoid("tasks", "--json", check=True)
     assert result.stdout.count("\n") == 1

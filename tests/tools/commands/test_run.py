@@ -48,6 +48,7 @@ def ends_off(log):
     assert log.messages["/command"][-1]["mode"] == "OFF"
 
 
+@pytest.mark.slow
 def test_json_is_one_object_on_standard_output(capfd):
     assert main([*RUN, "--seed", "2", "--json"]) == 0
     out, err = capfd.readouterr()
@@ -77,6 +78,7 @@ def test_who_steers_is_given_real_time_whoever_reads_the_output(words, realtime,
     assert asked == [realtime]
 
 
+@pytest.mark.slow
 def test_live_line_summary_and_log_for_a_person(capsys):
     assert main(RUN) == 0
     out = capsys.readouterr().out
@@ -126,6 +128,7 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, message, capsys):
     assert len(error.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_replay_is_identical_and_says_where_a_changed_log_differs(capsys):
     main([*RUN, "--record", "a.mcap", "--set", "push=0.1", "--randomise", "--seed", "4"])
     capsys.readouterr()
@@ -145,6 +148,7 @@ def test_replay_is_identical_and_says_where_a_changed_log_differs(capsys):
     assert (difference.tick, difference.channel, difference.field) == (150, "/command", "position")
 
 
+@pytest.mark.slow
 def test_what_only_a_program_can_repeat_is_refused(capsys):
     assert main([*RUN, "--record", "a.mcap"]) == 0
 
@@ -161,6 +165,7 @@ def test_what_only_a_program_can_repeat_is_refused(capsys):
             replay.replay(log)
 
 
+@pytest.mark.slow
 def test_a_truncated_log_replays_as_far_as_it_goes(tmp_path, capsys):
     assert main([*RUN, "--record", "a.mcap"]) == 0
     data = (tmp_path / "a.mcap").read_bytes()
@@ -171,6 +176,7 @@ def test_a_truncated_log_replays_as_far_as_it_goes(tmp_path, capsys):
     assert (tmp_path / "b.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("seed", range(2))
 def test_a_signal_at_any_moment_ends_lowered_and_off_and_replays(seed, number, tmp_path, capsys):
@@ -192,6 +198,7 @@ def test_a_signal_at_any_moment_ends_lowered_and_off_and_replays(seed, number, t
     assert main(["replay", "a.mcap"]) == 0, capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_two_signals_end_at_once(tmp_path):
     process = start("run", "walk", "--policy", "gait", "--seconds", "600", "--record", "a.mcap")
     while not (tmp_path / "a.mcap").exists():
@@ -205,6 +212,7 @@ def test_two_signals_end_at_once(tmp_path):
     ends_off(read_log("a.mcap"))
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_ends_the_run_safe(tmp_path):
     def small_files():
         resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000))
@@ -268,6 +276,7 @@ def test_a_film_that_cannot_be_written_is_refused_before_anything_moves(tmp_path
     assert not list(tmp_path.glob("runs/*"))
 
 
+@pytest.mark.slow
 def test_gl_that_does_not_work_is_explained_before_anything_moves(tmp_path):
     process = start(*RUN, "--video", "a.mp4", env=os.environ | {"MUJOCO_GL": "glfw", "DISPLAY": ":99"})
     out, err = process.communicate(timeout=120)
@@ -277,6 +286,7 @@ def test_gl_that_does_not_work_is_explained_before_anything_moves(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("drawn")
 def test_a_goal_run_is_filmed_and_plotted(tmp_path):
     av = pytest.importorskip("av")

@@ -35,6 +35,7 @@ def start(*arguments: str) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.slow
 def test_the_verb_serves_a_port_until_ctrl_c(tmp_path: Path) -> None:
     """Any program can talk to it: the board answers a ping on the link, and both are gone afterwards."""
     process = start("virtual", "--link", "rig", "--json")
@@ -178,6 +179,7 @@ def test_a_port_for_the_virtual_rig_is_refused(capsys: pytest.CaptureFixture[str
     assert "drop --port" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_in_mid_walk_ends_with_torque_off_acknowledged(number: signal.Signals, tmp_path: Path) -> None:
     """A servo that had not said that torque is off would be exit code 3."""

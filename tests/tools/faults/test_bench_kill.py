@@ -87,6 +87,7 @@ def test_ctrl_c_ends_with_torque_off_that_all_servos_acknowledged(capfd: pytest.
     assert values["acknowledged"] >= 1, "only the run that is interrupted twice may be too late to say so"
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_judged_after_its_guardian(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Or what the guardian had to do would not be seen. The last words are how it ended, without the figures."""
     program, ready = tmp_path / "run", tmp_path / "ready"
