@@ -256,7 +256,7 @@ def test_the_reference_pose_must_be_within_every_range() -> None:
     from servoid.tools.bringup.calibrate import _reference
 
     bent = replace(ROBOT, joints=(replace(ROBOT.joints[0], range=(0.2, 1.0)), *ROBOT.joints[1:]))
-    with pytest.raises(ConfigError, match="head_pan cannot be at 0: give --pose home"):
+    with pytest.raises(ConfigError, match="head_pan cannot be at 0: use --pose home"):
         _reference("zero", bent)
 
 
