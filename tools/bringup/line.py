@@ -35,7 +35,7 @@ def add_line_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--port",
         metavar="PATH|virtual",
-        help="serial port of the robot (see servoid bringup find-port), or a temporary virtual rig",
+        help="serial port of the robot, or 'virtual' for a temporary rig",
     )
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     add_json_argument(parser)

@@ -344,12 +344,12 @@ def test_torque_that_is_proven_off_after_all_is_no_longer_doubted(
     sensors, motors = backend.connect()
     run(robot, sensors, motors, 2)
     robot.joint("l_knee").answers = False
-    with pytest.raises(BackendError, match=r"l_knee .*did not say") as raised:
+    with pytest.raises(BackendError, match=r"l_knee .*did not report") as raised:
         motors.write(Command(ROBOT.home, np.ones(20), Mode.OFF))
     robot.joint("l_knee").answers = heard_by == "closing"
     monkeypatch.setattr(backend, "_lifeline", Guardian())
     backend.close()
-    assert "did not say" not in str(raised.value)
+    assert "did not report" not in str(raised.value)
     assert "l_knee (ID 14) were late to say that torque is off: it is off now, ack" in str(raised.value)
 
 

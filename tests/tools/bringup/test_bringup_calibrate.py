@@ -146,7 +146,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anybody_measures(
     monkeypatch.setenv("XDG_CONFIG_HOME", str(configuration / "file"))
     code, answer, _ = bringup("calibrate", "--port", "/dev/ttyUSB0")
     assert code == 2
-    assert "set XDG_CONFIG_HOME to a folder of yours" in answer["error"]
+    assert "set XDG_CONFIG_HOME to your own folder" in answer["error"]
 
 
 # What a person does --------------------------------------------------------------------------------------------------

@@ -109,7 +109,7 @@ def test_ports_that_cannot_be_opened(rig: RigProcess, bringup: Any, tmp_path: Pa
     assert (code, "no such port" in answer["error"]) == (3, True)
     code, answer, _ = bringup("check")
     assert code == 2
-    assert "--port virtual to practise" in answer["error"]
+    assert "practise with --port virtual" in answer["error"]
     with bus_of(rig):
         code, answer, _ = bringup("check", "--port", rig.port)
     assert code == 3
