@@ -7,8 +7,10 @@ plan and event bit by bit. Exit code 0: identical; 1: it differs, and the first 
 from __future__ import annotations
 
 import argparse
+from bisect import bisect_right
 from collections import defaultdict
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from servoid.stack.runtime.backends import BACKENDS
 from servoid.stack.runtime.phases import DONE
 from servoid.stack.runtime.run import RunSettings, Script, run
 from servoid.stack.safety.event import Event
+from servoid.stack.safety.guard import Phase
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import add_json_argument, reporting
 
@@ -75,7 +78,7 @@ def replay(log: FlightLog) -> tuple[int, Difference | None]:
     if log.header["policy"]["name"] != log.header["settings"]["policy"]:
         raise ConfigError(f"{log.path}: recorded with a program's own policy: only that program can repeat it")
     stops = [Event(**event) for event in log.messages["/event"] if event["kind"] in ("interrupt", "record")]
-    plans = {int(message["requested"]): int(message["adopted"]) for message in log.messages["/plan"]}
+    plans = _plans(log)
     recorded = _by_tick(log)
     repeated: dict[int, Tick] = defaultdict(lambda: defaultdict(list))
 
@@ -96,11 +99,24 @@ def replay(log: FlightLog) -> tuple[int, Difference | None]:
     return len(recorded), None
 
 
+def _plans(log: FlightLog) -> list[dict[int, int]]:
+    """Requests and adoptions of plans, of each time that the policy began: at first, and when the robot had got up."""
+    phases = [(message["tick"], message["phase"]) for message in log.messages["/command"]]
+    again = [
+        tick for (_, before), (tick, now) in pairwise(phases) if (before, now) == (Phase.RECOVERING, Phase.RUNNING)
+    ]
+    plans: list[dict[int, int]] = [{} for _ in range(len(again) + 1)]
+    for message in log.messages["/plan"]:
+        plans[bisect_right(again, message["tick"])][int(message["requested"])] = int(message["adopted"])
+    return plans
+
+
 def changes(log: FlightLog) -> list[str]:
     """What is not as it was when the log was written: robot, policy, task, packages, source; as far as the log says."""
     from servoid.hw.robot.description import load_robot
     from servoid.policy.checkpoint import git_commit
     from servoid.policy.diffusion.settings import with_new_names
+    from servoid.stack.control.get_up import fingerprints
     from servoid.stack.control.policies import policy_fingerprint
     from servoid.stack.log.provenance import fingerprint, versions
 
@@ -111,6 +127,7 @@ def changes(log: FlightLog) -> list[str]:
         recorded["planner"] = with_new_names(recorded["planner"])
     header = {**log.header, **_part("policy", recorded)}
     now = fingerprint(load_robot(settings.robot)) | _part("policy", policy)
+    now["recovery"] = fingerprints(load_robot(settings.robot)) if settings.recover else None
     now |= _task(settings) | {"versions": versions(), "git_commit": git_commit()}
     names = {
         "robot": "the robot's file",
@@ -124,6 +141,7 @@ def changes(log: FlightLog) -> list[str]:
         "task": "the task's settings",
         "task_files": "a file that the task's settings name",
         "task_source": "the task's file",
+        "recovery": "a clip that it gets up by",
         "policy.source": "the policy's file",
         "versions": "installed packages",
         "git_commit": "the source",

@@ -17,7 +17,7 @@ from servoid.hw.config import ConfigError
 from servoid.tools.common.confidence import wilson
 from servoid.tools.common.exit_codes import exit_code, explain
 from servoid.tools.common.output import add_json_argument, reporting
-from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, settings
+from servoid.tools.common.parser import add_gain_argument, add_recover_argument, add_set_argument, check_seed, settings
 from servoid.tools.common.worker_pool import each
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first episode's stream (default: %(default)s)")
     add_set_argument(parser)
     add_gain_argument(parser)
+    add_recover_argument(parser)
     add_json_argument(parser)
 
 
@@ -101,6 +102,7 @@ def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[
             seed=seed,
             gain=args.gain,
             set=values,
+            recover=args.recover,
         )
         for seed in seeds
     ]

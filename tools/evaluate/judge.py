@@ -32,7 +32,7 @@ def judge(job: RunSettings) -> Judged:
     """One run, with everything that the truth shows of it.
 
     One that the guard broke off is no success, however far it came, and one that never began has no metrics but those
-    that count what was left undone. Raises KeyboardInterrupt where the run was told to end, by a Ctrl-C that it took
+    that count what was left undone. `fell` says that it fell and, where it may recover, did not get up again. Raises KeyboardInterrupt where the run was told to end, by a Ctrl-C that it took
     for itself: that is no episode, and there shall be none after it.
     """
     from servoid.hw.robot.description import load_robot
@@ -40,7 +40,7 @@ def judge(job: RunSettings) -> Judged:
     from servoid.tools.common.ground_truth import GroundTruth
 
     assignment, backend = prepare(job)
-    ground_truth = GroundTruth(simulation(backend), load_robot(job.robot).dt)
+    ground_truth = GroundTruth(simulation(backend), load_robot(job.robot).dt, recover=job.recover)
     result = run(job, backend=backend, on_tick=ground_truth)
     _give_memory_back()
     if result.interrupted:
@@ -48,6 +48,8 @@ def judge(job: RunSettings) -> Judged:
     trace = ground_truth.trace()
     began, undone = len(trace.yaw) > 0, assignment.task.counts_undone
     metrics = assignment.metrics(trace) if began or undone else {}
+    if ground_truth.falls is not None:
+        metrics = metrics | ground_truth.falls.metrics()
     fell = trace.fallen or result.outcome == "fell"
     row = {
         "seed": job.seed,
