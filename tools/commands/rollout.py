@@ -151,10 +151,24 @@ def summarise(args: argparse.Namespace, rows: list[dict[str, Any]], wall_seconds
         "fall_rate": sum(row["fell"] for row in rows) / n,
         "aborted_rate": sum(row["aborted"] for row in rows) / n,
         "fell_ending_rate": sum(row["fell_ending"] for row in rows) / n,
+        **(_recoveries(rows) if args.recover else {}),
         "mean_seconds": float(np.mean([row["seconds"] for row in rows])),
         "metrics": metrics,
         "wall_seconds": wall_seconds,
         "failed_seeds": [row["seed"] for row in rows if not row["success"]],
+    }
+
+
+def _recoveries(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Falls of all episodes, the share of them that the robot got up from, and the median time from lying still to
+    standing."""
+    import numpy as np
+
+    falls, seconds = sum(row["falls"] for row in rows), [s for row in rows for s in row["stand_seconds"]]
+    return {
+        "falls": falls,
+        "recovered_share": len(seconds) / falls if falls else None,
+        "time_to_stand_s": float(np.median(seconds)) if seconds else None,
     }
 
 

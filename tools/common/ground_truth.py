@@ -39,14 +39,6 @@ class Falls:
         if not standing:
             self._up = record.tick
 
-    def metrics(self) -> dict[str, float]:
-        """`falls`, `recovered_share` of them, and `time_to_stand_s`, the median; NaN where there was none."""
-        return {
-            "falls": float(self.falls),
-            "recovered_share": len(self.seconds) / self.falls if self.falls else float("nan"),
-            "time_to_stand_s": float(np.median(self.seconds)) if self.seconds else float("nan"),
-        }
-
 
 class GroundTruth:
     """An `on_tick` listener: one row for each tick of the task.
