@@ -130,9 +130,9 @@ class Run:
             raise ConfigError(
                 "nothing moves by itself on a real robot: give start=True (--start), or confirm at the prompt"
             )
-        self._odometry = load_odometry(self.robot)
         if settings.recover:
             self._get_up = get_up(self.robot)
+        self._odometry = load_odometry(self.robot)
         if settings.record is not None:
             check_new(settings.record)
         self.assignment = draw(task, settings.seed)
