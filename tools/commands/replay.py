@@ -10,7 +10,6 @@ import argparse
 from bisect import bisect_right
 from collections import defaultdict
 from dataclasses import dataclass, fields
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,8 @@ from servoid.stack.runtime.backends import BACKENDS
 from servoid.stack.runtime.phases import DONE
 from servoid.stack.runtime.run import RunSettings, Script, run
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import Phase
 from servoid.tools.common import exit_codes
+from servoid.tools.common.flightpath import got_up
 from servoid.tools.common.output import add_json_argument, reporting
 
 Tick = dict[str, list[dict[str, Any]]]  # channel -> its messages of one tick
@@ -101,10 +100,7 @@ def replay(log: FlightLog) -> tuple[int, Difference | None]:
 
 def _plans(log: FlightLog) -> list[dict[int, int]]:
     """Requests and adoptions of plans, of each time that the policy began: at first, and when the robot had got up."""
-    phases = [(message["tick"], message["phase"]) for message in log.messages["/command"]]
-    again = [
-        tick for (_, before), (tick, now) in pairwise(phases) if (before, now) == (Phase.RECOVERING, Phase.RUNNING)
-    ]
+    again = got_up(log)
     plans: list[dict[int, int]] = [{} for _ in range(len(again) + 1)]
     for message in log.messages["/plan"]:
         plans[bisect_right(again, message["tick"])][int(message["requested"])] = int(message["adopted"])

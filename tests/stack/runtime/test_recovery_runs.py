@@ -15,12 +15,13 @@ from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.description import load_robot, save_robot
 from servoid.sim.backend import SimBackend
 from servoid.stack.control.base import BasePolicy
-from servoid.stack.log.flightlog import read_log
+from servoid.stack.log.flightlog import FlightLog, read_log
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import Result, RunSettings, Script, run
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import DOWN, Phase
 from servoid.tools.commands.replay import changes, replay
+from servoid.tools.common.flightpath import plans
 from servoid.tools.common.ground_truth import GroundTruth
 
 ROBOT = load_robot()
@@ -184,6 +185,11 @@ def test_each_fall_has_its_tries_and_the_policy_begins_anew_after_each() -> None
     assert policy.resets == 1 + again
 
 
+def place_at(log: FlightLog, tick: int) -> Any:
+    """Where the robot believed to be at a tick `(2,)` m."""
+    return log.column("/state", "displacement")[log.ticks("/state").tolist().index(tick), :2]
+
+
 @pytest.mark.slow
 def test_a_run_with_a_fall_is_repeated_to_the_bit(tmp_path: Any) -> None:
     """By the planner: its plans count from when it begins, and here it begins twice."""
@@ -199,6 +205,7 @@ def test_a_run_with_a_fall_is_repeated_to_the_bit(tmp_path: Any) -> None:
         for late in (False, True)
     )
     assert set(first) & set(then)
+    assert all(np.abs(plan.path[0] - place_at(log, plan.adopted)).max() < 0.1 for plan in plans(log))
     assert sorted(log.header["recovery"]) == ["get-up-back", "get-up-front"]
     assert changes(log) == []
     assert replay(log)[1] is None
