@@ -250,6 +250,7 @@ def test_after_ctrl_c_the_figures_are_of_what_was_done(
     assert len(done.jobs) == 6
 
 
+@pytest.mark.slow
 def test_the_command_prints_and_writes_what_was_done_until_ctrl_c(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
