@@ -16,7 +16,14 @@ from typing import Any
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Progress, Report, add_json_argument, reporting
-from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, positive, settings
+from servoid.tools.common.parser import (
+    add_gain_argument,
+    add_set_argument,
+    check_seed,
+    out_of_reach,
+    positive,
+    settings,
+)
 from servoid.tools.common.pictures.drawing import prepare
 from servoid.tools.common.prompt import confirm
 
@@ -62,10 +69,9 @@ def main(args: argparse.Namespace) -> int:
         check_seed(args.seed)
         if args.video is not None:
             size = prepare(args.video, args.video_size)
-        from servoid.hw.robot.description import load_robot
         from servoid.stack.runtime.backends import backend_kind
         from servoid.stack.runtime.run import RunSettings, run
-        from servoid.stack.tasks import beyond, find, load_settings
+        from servoid.stack.tasks import find
         from servoid.tools.common.live import LiveLine
         from servoid.tools.common.summary import summary
 
@@ -85,7 +91,7 @@ def main(args: argparse.Namespace) -> int:
             realtime=(watched and not args.fast) if backend_kind(args.backend).simulated else None,
             port=args.port,
         )
-        for text in beyond(load_settings(args.task, settings(args), robot := load_robot(args.robot)), robot):
+        for text in out_of_reach(args):
             report.line(text)
         live = LiveLine(sys.stderr if args.json else sys.stdout)
         try:
