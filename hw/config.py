@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import enum
+import json
 import math
 import re
 import types
@@ -59,15 +60,18 @@ def available(kind: str) -> tuple[str, ...]:
 def resolve(kind: str, name: str | Path) -> Path:
     """Path of a configuration: a file as it is, or `configs/<kind>/<name>.yaml`.
 
-    Raises ConfigError with the nearest name when there is none.
+    Written so, that one is found from every folder: as shipped, where there is no such file. Raises ConfigError with
+    the nearest name when there is none.
     """
     path = Path(name)
     if path.suffix in (".yaml", ".yml") or path.name != str(name):
-        if not path.is_file():
-            siblings = [p.name for p in path.parent.glob("*.y*ml")] if path.parent.is_dir() else []
-            hint = nearest(path.name, siblings) if siblings else f"there is no YAML file in {path.parent}"
-            raise ConfigError(f"{path}: no such file; {hint}")
-        return path
+        if path.is_file():
+            return path
+        if path.parent == Path(CONFIGS.name, kind) and path.stem in available(kind):
+            return CONFIGS / kind / path.name
+        siblings = [p.name for p in path.parent.glob("*.y*ml")] if path.parent.is_dir() else []
+        hint = nearest(path.name, siblings) if siblings else f"there is no YAML file in {path.parent}"
+        raise ConfigError(f"{path}: no such file; {hint}; shipped: {', '.join(available(kind))}")
     if str(name) not in available(kind):
         raise ConfigError(f"unknown {kind.removesuffix('s')} '{name}': {nearest(str(name), available(kind))}")
     return CONFIGS / kind / f"{name}.yaml"
@@ -101,6 +105,17 @@ def load_marked(path: Path, cls: type[T], renamed: Mapping[str, str] | None = No
     if node is None:
         raise ConfigError(f"{path}:1: the file is empty; it needs {', '.join(_required(cls))}")
     return _Reader(marks, renamed or {}).read(node, cls, ""), marks
+
+
+def from_values(values: Mapping[str, Any], cls: type[T], path: Path) -> T:
+    """An instance of the dataclass `cls` from values as JSON has them, which are from the file `path`, such as a log.
+
+    Raises ConfigError naming file and key.
+    """
+    node = yaml.compose(json.dumps(values), Loader=yaml.SafeLoader)
+    assert node is not None
+    result: T = _Reader(Marks(path), {}).read(node, cls, "")
+    return result
 
 
 def parse_number(text: str, hint: type[int] | type[float]) -> int | float:

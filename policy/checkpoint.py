@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,16 @@ def resolve(name: str | Path) -> Path:
     near = get_close_matches(path.stem, shipped, n=1, cutoff=0.0)
     hint = f"; did you mean '{near[0]}'?" if near else "; none is shipped: train one, or give the path of a file"
     raise CheckpointError(f"{path}: no such checkpoint{hint}")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What the header of a trained network says of how it came about."""
+
+    data: str  # what it was trained on
+    licence: str  # of the data
+    results: Mapping[str, Any]  # what was measured
+    training: Mapping[str, Any]  # settings
 
 
 def header(
@@ -143,7 +154,7 @@ def part(tensors: Mapping[str, Array], name: str) -> dict[str, Array]:
 def check(path: Path, head: Mapping[str, Any], kind: str, robot: Robot) -> None:
     """Refuse a checkpoint of another kind, joint order or rate. The robot's name may differ. Raises CheckpointError."""
     if head["kind"] != kind:
-        raise CheckpointError(f"{path}: holds a {head['kind']} network, and a {kind} network is needed")
+        raise CheckpointError(f"{path}: holds a {head['kind']} network, but a {kind} network is needed")
     theirs, ours = list(head["joints"]), list(robot.names)
     # The one network that every run of a robot needs, and that a robot of one's own does not come with.
     remedy = f"; train it once: servoid train odometry --policy gait --robot FILE --out {path}"
@@ -153,7 +164,7 @@ def check(path: Path, head: Mapping[str, Any], kind: str, robot: Robot) -> None:
         raise CheckpointError(f"{path}: made for {head['robot']}, its joints do not fit {robot.name}: {reason}{remedy}")
     if head["rate"] != robot.rate:
         raise CheckpointError(
-            f"{path}: made for {head['rate']} ticks a second, and {robot.name} runs at {robot.rate}; "
+            f"{path}: made for {head['rate']} ticks a second, but {robot.name} runs at {robot.rate}; "
             f"set rate: {head['rate']} in the robot's file or use another checkpoint{remedy}"
         )
 
@@ -174,4 +185,4 @@ def difference(theirs: Sequence[str], ours: Sequence[str]) -> str:
         text += f"; not known here: {', '.join(extra)}" if extra else ""
         return text + (f"; missing: {', '.join(lacking)}" if lacking else "")
     i = next(i for i, (a, b) in enumerate(zip(theirs, ours, strict=True)) if a != b)
-    return f"entry {i} is {theirs[i]}, and {ours[i]} is needed"
+    return f"entry {i} is {theirs[i]}, but {ours[i]} is needed"

@@ -58,6 +58,6 @@ class Mlp:
         checkpoint.check(path, head, kind, robot)
         if len(tensors["mean"]) != inputs:
             raise checkpoint.CheckpointError(
-                f"{path}: takes {len(tensors['mean'])} inputs, and this program's features are {inputs}; train it again"
+                f"{path}: takes {len(tensors['mean'])} inputs, but this program's features are {inputs}; train it again"
             )
         return cls.from_tensors(tensors), head

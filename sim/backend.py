@@ -16,7 +16,7 @@ from servoid.hw.robot.description import Robot
 from servoid.hw.seeds import Stream, generator
 from servoid.sim.model import build
 from servoid.sim.scene import Stage, count_robots
-from servoid.sim.truth import Truth
+from servoid.sim.truth import SimulatedTruth
 from servoid.sim.worlds import Worlds
 
 
@@ -50,7 +50,7 @@ class SimBackend:
         self.simulation = Simulation(self.truth, self.push, self.stage, teammates)
 
     @property
-    def truth(self) -> Truth:
+    def truth(self) -> SimulatedTruth:
         """The world's truth; arrays have a leading dimension of one, or of all robots, this one first."""
         return self._worlds.truth
 

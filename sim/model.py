@@ -123,18 +123,19 @@ def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
     base = model.body(robot.base)
     if base.parent.name != "world":
         raise ConfigError(
-            f"{path}: body {robot.base!r} hangs on {base.parent.name!r}: a robot's base must be a child of <worldbody>"
+            f"{path}: body {robot.base!r} is a child of {base.parent.name!r}: "
+            "a robot's base must be a child of <worldbody>"
         )
     if [joint.type for joint in base.joints] != [mujoco.mjtJoint.mjJNT_FREE]:
         raise ConfigError(
-            f"{path}: body {robot.base!r} has no joint of its own but <freejoint/>, as a base needs: "
+            f"{path}: body {robot.base!r} needs <freejoint/> as its only joint: "
             f"it has {', '.join(repr(joint.name) for joint in base.joints) or 'none'}"
         )
     kinds = {joint.name: joint.type for joint in base.find_all("joint")}
     for joint in robot.joints:
         need("joint", joint.name, list(kinds))
         if kinds[joint.name] != mujoco.mjtJoint.mjJNT_HINGE:
-            raise ConfigError(f"{path}: joint {joint.name!r} is no hinge, and a servo turns")
+            raise ConfigError(f"{path}: joint {joint.name!r} is not a hinge, but a servo turns")
     need("site (the IMU's)", robot.imu_site, [site.name for site in base.find_all("site")])
     geoms = [geom.name for geom in base.find_all("geom")]
     for foot in robot.feet.values():
@@ -165,7 +166,7 @@ def _check_delays(robot: Robot) -> None:
                 raise ConfigError(
                     f"{robot.name}: {joint.name}: {key} of its servo {servo.name} is {getattr(servo, key):g} s, "
                     f"that of {robot.names[0]}'s {first.name} {getattr(first, key):g} s: simulation has one for all "
-                    "servos of a robot; give both files the same"
+                    "servos of a robot; write the same in both files"
                 )
 
 

@@ -15,7 +15,7 @@ FALL_HEIGHT = 0.6  # of the standing height
 FALL_TILT = np.deg2rad(60.0)
 
 
-class Truth:
+class SimulatedTruth:
     """Live views of the worlds' truth. All arrays are `(n, ...)`, world frame unless said otherwise."""
 
     def __init__(

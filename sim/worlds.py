@@ -6,7 +6,7 @@ number of worlds or on the number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -23,7 +23,7 @@ from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.multi_robot import Crowd
 from servoid.sim.randomise import Body, draw, longest
 from servoid.sim.scene import robot_bodies
-from servoid.sim.truth import Truth
+from servoid.sim.truth import SimulatedTruth
 
 NOISE_ROWS = 64  # ticks of sensor noise drawn at a time
 VELOCITY_NOISE = 0.02  # rad/s, standard deviation, before quantisation
@@ -36,6 +36,7 @@ class Worlds:
 
     `threads` 0 takes all cores; `randomise` is the share of episodes on a randomised robot. `together` puts all bodies
     into one world, whose `model` must hold them; its floor has the friction that was drawn with the last of them.
+    `drawn` draws a robot, as `randomise.draw` does.
     """
 
     def __init__(
@@ -47,8 +48,9 @@ class Worlds:
         randomise: float = 0.0,
         model: mujoco.MjModel | None = None,
         together: bool = False,
+        drawn: Callable[..., Body] = draw,
     ) -> None:
-        self.robot, self.n, self.randomise = robot, n, randomise
+        self.robot, self.n, self.randomise, self._drawn = robot, n, randomise, drawn
         self.model = build(robot) if model is None else model
         self.substeps = round(robot.dt / TIMESTEP)
         if abs(self.substeps * TIMESTEP - robot.dt) > 1e-9:
@@ -99,7 +101,7 @@ class Worlds:
         self._fresh = {key: value[:, -self.substeps :].copy() for key, value in self._record.items()}
         self.ticks = np.zeros(n, int)  # since each world's reset
         self.tick = 0
-        self.truth = Truth(
+        self.truth = SimulatedTruth(
             self.model, robot, self._state_qpos, self._state_qvel, self._sensors, self._fresh["sensordata"]
         )
 
@@ -116,7 +118,7 @@ class Worlds:
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for i, rng in zip(ids, rngs, strict=True):
             self._rngs[i] = rng
-            self._place(i, draw(rng, self.robot, self._bodies, rng.random() < self.randomise))
+            self._place(i, self._drawn(rng, self.robot, self._bodies, rng.random() < self.randomise))
         self._state_qpos[ids] = 0.0
         self._state_qpos[ids[:, None], self._qpos] = pose - self._zero[ids]
         self._put(ids, pose - self._zero[ids], start)

@@ -7,11 +7,13 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+parse = cache(ast.parse)  # several checks read each file
 
 # Each package and those that it may import. policy and sim stand side by side.
 BELOW: dict[str, set[str]] = {
@@ -28,6 +30,9 @@ HEAVY = {
 }
 LONGEST = 400  # lines of a file
 ROOMIEST = 12  # modules of a folder beside its folders
+MOST_ARGUMENTS = 7
+# Where there are more, since a class would only say them once again.
+MANY = {("stack/estimation/odometry.py", "push")}  # an array for each group of columns of a network's input
 # Where an object is asked what it has, since it is not ours: by file, what it is asked for.
 ASKED = {
     ("hw/clock.py", "prctl"),  # the C library's: Linux alone has it
@@ -61,7 +66,7 @@ def upward(package: str, code: str) -> list[str]:
     allowed = BELOW[package] | {package}
     return [
         f"line {line} imports {module}"
-        for line, module in imports(ast.parse(code))
+        for line, module in imports(parse(code))
         if (found := folder(module)) is not None and found not in allowed
     ]
 
@@ -103,7 +108,7 @@ def test_heavy_libraries_are_imported_where_they_are_used(library: str) -> None:
     for path in (path for package in BELOW for path in sources(package)):
         if name(path).startswith(HEAVY[library]):
             continue
-        top = ast.Module(ast.parse(path.read_text()).body, [])
+        top = ast.Module(parse(path.read_text()).body, [])
         direct = [n for n in top.body if isinstance(n, ast.Import | ast.ImportFrom)]
         modules = {module.split(".")[0] for _, module in imports(ast.Module(list(direct), []))}
         assert library not in modules, f"{name(path)} imports {library} when it is imported"
@@ -133,7 +138,7 @@ def name(path: Path) -> str:
 
 def asked(code: str) -> Iterator[tuple[int, str]]:
     """Line and member of every question whether an object has a member that is named there."""
-    for node in ast.walk(ast.parse(code)):
+    for node in ast.walk(parse(code)):
         if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) > 1):
             continue
         member = node.args[1]
@@ -155,12 +160,60 @@ def test_a_question_is_seen(code: str) -> None:
     assert len(list(asked(code))) == 1
 
 
+CLOCKS = {f"{name}{unit}" for name in ("time", "monotonic", "perf_counter", "process_time") for unit in ("", "_ns")}
+
+
+def timed(code: str) -> list[int]:
+    """Lines of comparisons with the time of a clock that is read there, or that an operand was calculated from. One
+    that is passed to a function, as a deadline is, counts for nothing."""
+
+    def reads(node: ast.AST, names: set[str]) -> bool:
+        if isinstance(node, ast.Call):
+            function = ast.unparse(node.func)
+            if function.removeprefix("time.") in CLOCKS:
+                return True
+            if function not in ("abs", "round", "float", "int", "min", "max"):
+                return False
+        of_one = isinstance(node, ast.Name) and node.id in names
+        return of_one or any(reads(child, names) for child in ast.iter_child_nodes(node))
+
+    found: set[int] = set()
+    if not any(f"{clock}(" in code for clock in CLOCKS):
+        return []
+    for scope in (node for node in ast.walk(parse(code)) if isinstance(node, ast.FunctionDef)):
+        names: set[str] = set()
+        for node in ast.walk(scope):
+            if isinstance(node, ast.Assign) and reads(node.value, names):
+                names |= {part.id for target in node.targets for part in ast.walk(target) if isinstance(part, ast.Name)}
+        found |= {node.lineno for node in ast.walk(scope) if isinstance(node, ast.Compare) and reads(node, names)}
+    return sorted(found)
+
+
+def test_no_test_asserts_on_a_clock() -> None:
+    """It would fail where two other programs are busy. How long a thing takes is for `servoid bench`; whatever waits
+    for something that may never come is ended by pytest's own timeout."""
+    found = {name(path): lines for path in sources("tests") if (lines := timed(path.read_text()))}
+    assert found == {}
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "assert time.monotonic() - began < 1.0",
+        "began = time.perf_counter(); work(); took = time.perf_counter() - began; assert took < 1.0",
+        "end = monotonic() + 5\n    while now() < end: pass",
+    ],
+)
+def test_an_assertion_on_a_clock_is_seen(body: str) -> None:
+    assert timed(f"def test():\n    {body}") != []
+
+
 def rooms(package: str) -> dict[str, set[str]]:
     """The folders of a package, and those of the same package that each imports from."""
     found: dict[str, set[str]] = {}
     for path in sources(package):
         here = found.setdefault(name(path.parent), set())
-        for _, module in imports(ast.parse(path.read_text())):
+        for _, module in imports(parse(path.read_text())):
             if module.startswith(f"servoid.{package}."):
                 here.add(room(module))
     return {at: others - {at} for at, others in found.items()}
@@ -194,6 +247,43 @@ def test_folders_of_a_package_do_not_import_each_other_in_a_circle() -> None:
 
 def test_a_circle_is_seen() -> None:
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == {frozenset("abc")}
+
+
+def classes(code: str) -> Iterator[str]:
+    return (node.name for node in ast.walk(parse(code)) if isinstance(node, ast.ClassDef))
+
+
+def test_a_class_name_stands_for_one_thing() -> None:
+    """Two things of one name are told apart by their imports alone, and in a log or an error by nothing."""
+    where: dict[str, list[str]] = {}
+    for path in (path for package in BELOW for path in sources(package)):
+        for found in classes(path.read_text()):
+            where.setdefault(found, []).append(name(path))
+    assert {found: paths for found, paths in where.items() if len(paths) > 1} == {}
+
+
+def crowds(code: str) -> Iterator[tuple[str, int]]:
+    """Name and number of the arguments of every function that takes more than `MOST_ARGUMENTS`."""
+    for node in ast.walk(parse(code)):
+        if isinstance(node, ast.FunctionDef):
+            taken = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+            count = len(taken) - (taken[:1] in (["self"], ["cls"]))
+            if count > MOST_ARGUMENTS:
+                yield node.name, count
+
+
+def test_what_takes_many_arguments_takes_a_dataclass() -> None:
+    found = {
+        (name(path), function)
+        for package in BELOW
+        for path in sources(package)
+        for function, _ in crowds(path.read_text())
+    }
+    assert found == MANY
+
+
+def test_a_crowd_of_arguments_is_seen() -> None:
+    assert list(crowds("class A:\n    def f(self, a, b, c, d, e, f, *, g, h): ...")) == [("f", 8)]
 
 
 def test_configs_hold_data_alone() -> None:

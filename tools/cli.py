@@ -11,6 +11,7 @@ import sys
 import traceback
 from dataclasses import dataclass, field
 from importlib import metadata
+from textwrap import fill
 from types import ModuleType
 
 from servoid.hw.signals import ignore_interrupts
@@ -29,61 +30,63 @@ class Verb:
 
 
 VERBS: dict[str, Verb] = {
-    "tasks": Verb("list what can be run, with settings", "servoid.tools.commands.tasks"),
-    "doctor": Verb("check whether this machine is ready", "servoid.tools.commands.doctor"),
+    "tasks": Verb("list tasks and their settings", "servoid.tools.commands.tasks"),
+    "doctor": Verb("check that this machine is ready", "servoid.tools.commands.doctor"),
     "run": Verb("run a task on a robot", "servoid.tools.commands.run"),
     "rollout": Verb("run a task many times in simulation and measure it", "servoid.tools.commands.rollout"),
     "virtual": Verb("serve a virtual rig on a serial port", "servoid.tools.commands.virtual"),
     "bringup": Verb(
-        "bring hardware up, step by step",
+        "bring up hardware, step by step",
         verbs={
             "find-port": Verb("find the robot's serial port", "servoid.tools.bringup.find_port"),
-            "scan": Verb("ask who is on the bus", "servoid.tools.bringup.scan"),
-            "setup": Verb("give a servo its ID and baud", "servoid.tools.bringup.setup"),
+            "scan": Verb("list the servos and boards on the bus", "servoid.tools.bringup.scan"),
+            "setup": Verb("set a servo's ID and baud", "servoid.tools.bringup.setup"),
             "check": Verb("compare every servo with the robot's file", "servoid.tools.bringup.check"),
             "off": Verb("switch torque off", "servoid.tools.bringup.off"),
-            "calibrate": Verb("measure zeros and directions, moved by hand", "servoid.tools.bringup.calibrate"),
-            "jog": Verb("move one joint, slowly and a little", "servoid.tools.bringup.jog"),
-            "watch": Verb("watch temperatures, voltages, loads and the bus", "servoid.tools.bringup.watch"),
+            "calibrate": Verb("measure zeros and directions, by hand", "servoid.tools.bringup.calibrate"),
+            "jog": Verb("move one joint slowly, a little", "servoid.tools.bringup.jog"),
+            "watch": Verb("show temperatures, voltages, loads and the bus", "servoid.tools.bringup.watch"),
         },
     ),
     "motions": Verb(
-        "clips: import, list, play, check, mirror and blend them",
+        "import, list, play, check, mirror and blend clips",
         verbs={
-            "import": Verb("make a clip from a file", "servoid.tools.motions.verbs.import_clip"),
+            "import": Verb("make clips from a file", "servoid.tools.motions.verbs.import_clip"),
             "list": Verb("list the clips of a library", "servoid.tools.motions.verbs.list_clips"),
             "play": Verb("play a clip open loop in physics", "servoid.tools.motions.verbs.play"),
-            "check": Verb("check joint ranges, speeds and the feet of clips", "servoid.tools.motions.verbs.check"),
+            "check": Verb("check joint ranges, speeds and feet of clips", "servoid.tools.motions.verbs.check"),
             "mirror": Verb("swap left and right", "servoid.tools.motions.verbs.mirror"),
             "blend": Verb("join two clips", "servoid.tools.motions.verbs.blend"),
         },
     ),
-    "collect": Verb("record demonstrations of the expert as a dataset", "servoid.tools.learn.collect"),
+    "collect": Verb("record demonstrations as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
         "train a network",
         verbs={
-            "expert": Verb("PPO: the tracker of references", "servoid.tools.learn.trainers.expert"),
-            "odometry": Verb("the correction of leg odometry", "servoid.tools.learn.trainers.odometry"),
+            "expert": Verb("train the tracker of references with PPO", "servoid.tools.learn.trainers.expert"),
+            "odometry": Verb("train the correction of leg odometry", "servoid.tools.learn.trainers.odometry"),
             "latent": Verb(
-                "latent actions, which the diffusion model may plan in", "servoid.tools.learn.trainers.latent"
+                "train latent actions for a diffusion model to plan in", "servoid.tools.learn.trainers.latent"
             ),
-            "diffusion": Verb("the diffusion planner-controller", "servoid.tools.learn.trainers.diffusion"),
+            "diffusion": Verb("train the diffusion model", "servoid.tools.learn.trainers.diffusion"),
         },
     ),
-    "evaluate": Verb("measure a policy the way that papers do, or yours", "servoid.tools.commands.evaluate"),
+    "evaluate": Verb("measure a policy as papers do, or as you define", "servoid.tools.commands.evaluate"),
     "bench": Verb(
-        "measure speed and what faults do, on this machine",
+        "measure speed, and how faults are handled",
         verbs={
-            "sim": Verb("batched simulation against the raw engine", "servoid.tools.bench.sim"),
-            "policy": Verb("planning time", "servoid.tools.bench.policy"),
-            "loop": Verb("lateness of the control loop", "servoid.tools.bench.loop"),
-            "kill": Verb("what becomes of the servos when the controller is killed", "servoid.tools.faults.kill"),
-            "interrupt": Verb("whether torque is off after Ctrl-C at any instant", "servoid.tools.faults.interrupt"),
-            "bus": Verb("time of a control cycle on the servo bus", "servoid.tools.bench.bus"),
-            "clients": Verb("what other people's clients do, against the virtual rig", "servoid.tools.bench.clients"),
-            "faults": Verb("what faults of the rig do to a walking robot", "servoid.tools.faults.campaign"),
-            "soak": Verb("long walk over a line that loses packets", "servoid.tools.faults.soak"),
-            "fuzz": Verb("random bytes into everything that reads bytes", "servoid.tools.faults.fuzz"),
+            "sim": Verb("compare the training world with raw MuJoCo", "servoid.tools.bench.sim"),
+            "policy": Verb("time the diffusion policy's plans", "servoid.tools.bench.policy"),
+            "loop": Verb("measure how late the control loop is", "servoid.tools.bench.loop"),
+            "kill": Verb("kill the controller and check the servo state after", "servoid.tools.faults.kill"),
+            "interrupt": Verb(
+                "press Ctrl-C at any instant and check that torque is off", "servoid.tools.faults.interrupt"
+            ),
+            "bus": Verb("time a control cycle on the servo bus", "servoid.tools.bench.bus"),
+            "clients": Verb("check other people's clients against the virtual rig", "servoid.tools.bench.clients"),
+            "faults": Verb("inject every fault while the robot walks", "servoid.tools.faults.campaign"),
+            "soak": Verb("walk for minutes over a line that loses packets", "servoid.tools.faults.soak"),
+            "fuzz": Verb("feed random bytes to everything that reads bytes", "servoid.tools.faults.fuzz"),
         },
     ),
     "replay": Verb("repeat a recorded run and compare", "servoid.tools.commands.replay"),
@@ -131,11 +134,11 @@ def _reader_left() -> bool:
 def _dispatch(prog: str, verbs: dict[str, Verb], argv: list[str]) -> int:
     if not argv or argv[0].startswith("-"):
         _overview(prog, verbs).parse_args(argv)
-        _overview(prog, verbs).error(f"say what to do: {', '.join(verbs)}")
+        _overview(prog, verbs).error(f"command missing; known: {', '.join(verbs)}")
     name, rest = argv[0], argv[1:]
     if name not in verbs:
         near = suggestion(name, verbs) or f"; known: {', '.join(verbs)}"
-        _overview(prog, verbs).error(f"unknown verb '{name}'{near}")
+        _overview(prog, verbs).error(f"unknown command '{name}'{near}")
     verb = verbs[name]
     if verb.verbs:
         return _dispatch(f"{prog} {name}", verb.verbs, rest)
@@ -149,6 +152,11 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=32)
 
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        """Paragraphs wrapped to the terminal; those with an indented line stay as they are."""
+        paragraphs = (part if "\n " in part else fill(part, width) for part in text.split("\n\n"))
+        return "\n\n".join(paragraphs)
+
 
 def _summary(module: ModuleType) -> str:
     return (module.__doc__ or "").strip()
@@ -160,9 +168,9 @@ def _overview(prog: str, verbs: dict[str, Verb]) -> Parser:
     lines = "\n".join(f"  {name:<{width}}  {verb.help}" for name, verb in verbs.items())
     parser = Parser(
         prog=prog,
-        usage=f"{prog} VERB ...",
-        description=f"verbs:\n{lines}",
-        epilog=f"{prog} VERB --help tells what a verb takes.",
+        usage=f"{prog} COMMAND ...",
+        description=f"commands:\n{lines}",
+        epilog=f"{prog} COMMAND --help explains a command.",
         formatter_class=_Formatter,
     )
     if prog == "servoid":

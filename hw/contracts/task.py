@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -43,6 +44,42 @@ class Episode:
     pushes: Mapping[int, Array] = field(
         default_factory=dict
     )  # by tick: change of planar velocity (2,) m/s, world frame
+    reach: float | None = None  # m from the goal that count as there, where that is judged
+    path: Array | None = None  # (n, 2) m to walk along, in the frame that the robot starts in
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """One condition of success: a figure of a finished run, and the bounds that it must keep. NaN keeps none."""
+
+    what: str  # the figure in words: "mean velocity error"
+    value: float
+    unit: str = ""
+    least: float = -math.inf
+    most: float = math.inf
+
+    @classmethod
+    def never(cls, what: str, happened: bool) -> Criterion:
+        """Of something that must not happen, in the past tense: "fell"."""
+        return cls(what, float(happened), most=0.0)
+
+    @property
+    def met(self) -> bool:
+        return self.least <= self.value <= self.most
+
+    def __str__(self) -> str:
+        """The figure, its bound and, where it is not met, by how much."""
+        if self.most == 0.0 and not self.unit:
+            return self.what if self.value else f"never {self.what}"
+        low = self.value < self.least or math.isinf(self.most)
+        bound, word = (self.least, "at least") if low else (self.most, "at most")
+        told = f"{self.what} {self._number(self.value)}, {word} {self._number(bound)}"
+        if self.met or not math.isfinite(self.value):
+            return told
+        return f"{told}: {self._number(abs(self.value - bound))} too {'little' if low else 'much'}"
+
+    def _number(self, value: float) -> str:
+        return "not measured" if math.isnan(value) else f"{value:.3g} {self.unit}".rstrip()
 
 
 class Behaviour(Protocol):
@@ -116,7 +153,13 @@ class Task(Protocol):
         """The guidance cost; None where it is zero: planners then need no gradient of it, and no samples."""
         ...
 
-    def success(self, trace: Trace, episode: Any) -> bool: ...
+    def criteria(self, trace: Trace, episode: Any) -> Sequence[Criterion]:
+        """All that a success needs; empty where the task has a `success` of its own and does not say."""
+        ...
+
+    def success(self, trace: Trace, episode: Any) -> bool:
+        """Whether every criterion is met."""
+        ...
 
     def metrics(self, trace: Trace, episode: Any) -> dict[str, float]: ...
 
@@ -127,6 +170,9 @@ class Assignment:
 
     task: Task
     episode: Episode
+
+    def criteria(self, trace: Trace) -> Sequence[Criterion]:
+        return self.task.criteria(trace, self.episode)
 
     def success(self, trace: Trace) -> bool:
         return self.task.success(trace, self.episode)

@@ -61,7 +61,7 @@ class DynamixelBackend:
     def connect(self) -> tuple[DynamixelSensors, DynamixelMotors]:
         """Find the robot and check it. Raises BackendError with the remedy, and leaves the port closed."""
         if self._port is not None:
-            raise BackendError(f"{self._port.name}: connected already")
+            raise BackendError(f"{self._port.name}: already connected")
         if self._given is None:
             raise BackendError(f"backend '{self.name}' needs a port: name it with --port")
         port = self._open(self._given, self._robot.bus.baud) if isinstance(self._given, str) else self._given
@@ -86,8 +86,8 @@ class DynamixelBackend:
         self.differences = tuple(differences)
         if any(difference.grave or self._exact for difference in differences):
             error = BackendError(
-                f"{len(differences)} registers are not as {self._robot.name} needs them, the first of "
-                f"{differences[0].joint}: let `servoid bringup check --fix` correct them"
+                f"{len(differences)} registers differ from what {self._robot.name} needs, the first on "
+                f"{differences[0].joint}: correct them with `servoid bringup check --fix`"
             )
             error.add_note(as_table(differences))
             raise error

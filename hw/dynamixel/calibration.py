@@ -57,7 +57,7 @@ def calibration_path(robot: Robot) -> Path:
     """
     folder = user_folder("XDG_CONFIG_HOME", ".config")
     if folder is None:
-        raise ConfigError("you have no home folder: set XDG_CONFIG_HOME to a folder that keeps your calibrations")
+        raise ConfigError("no home folder: set XDG_CONFIG_HOME to a folder for your calibrations")
     return folder / "calibration" / f"{quote(robot.name, safe='')}.yaml"
 
 
@@ -116,7 +116,7 @@ def _write(path: Path, data: bytes) -> None:
 
 def _cannot_write(path: Path, error: OSError) -> ConfigError:
     return ConfigError(
-        f"{path}: cannot be written: {error.strerror}: set XDG_CONFIG_HOME to a folder of yours, or give --out FILE"
+        f"{path}: cannot be written: {error.strerror}: set XDG_CONFIG_HOME to your own folder, or use --out FILE"
     )
 
 
@@ -163,7 +163,9 @@ def calibrated(robot: Robot) -> tuple[Robot, str]:
     try:
         there = path.exists()
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}: is there a calibration or not?") from error
+        raise ConfigError(
+            f"{path}: cannot be read ({error.strerror}), so it is unknown whether the robot is calibrated"
+        ) from error
     if not there:
         return robot, f"not calibrated: zero and direction are those of the robot's file (there is no {path})"
     calibration = load_calibration(path)

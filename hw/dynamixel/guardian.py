@@ -42,7 +42,7 @@ WRITE_SECONDS = 0.02  # that the adapter may take to accept a packet
 
 
 @dataclass(frozen=True)
-class Plan:
+class ReleasePackets:
     """What to send, and what to hear. `ask` asks everybody in one packet, which takes `ask_seconds`."""
 
     port: int  # file descriptor
@@ -57,7 +57,7 @@ class Plan:
     log: str  # file to add a line to, or nothing
 
     @classmethod
-    def parse(cls, line: bytes) -> Plan:
+    def parse(cls, line: bytes) -> ReleasePackets:
         values = json.loads(line)
         for key in ("damp", "off", "ask"):
             values[key] = bytes.fromhex(values[key])
@@ -66,7 +66,7 @@ class Plan:
         return cls(**values)
 
 
-class Line:
+class GuardedPort:
     """The port, in the few ways that are needed here. Methods raise OSError when it is gone."""
 
     def __init__(self, fd: int) -> None:
@@ -104,9 +104,9 @@ class Line:
             pass
 
 
-def release(plan: Plan) -> set[int]:
+def release(plan: ReleasePackets) -> set[int]:
     """Brake, then torque off. Returns the IDs that did not acknowledge. Raises OSError when the port is gone."""
-    line = Line(plan.port)
+    line = GuardedPort(plan.port)
     line.drain()
     for _ in range(DAMP_TIMES):
         line.write(plan.damp)
@@ -136,7 +136,7 @@ def release(plan: Plan) -> set[int]:
     return open_
 
 
-def report(plan: Plan, left: set[int], seconds: float, gone: OSError | None) -> str:
+def report(plan: ReleasePackets, left: set[int], seconds: float, gone: OSError | None) -> str:
     """One line for the person at the robot."""
     n = len(plan.proof)
     begins = f"servoid guardian: process {plan.controller} ended with torque on: "
@@ -182,7 +182,7 @@ def main() -> int:
             return 0  # the controller ended before it had told anything
         received += data
     line, _, states = received.partition(b"\n")
-    plan = Plan.parse(line)
+    plan = ReleasePackets.parse(line)
     with contextlib.suppress(OSError):  # the controller is gone already: that is seen next
         os.write(sys.stdout.fileno(), b"ready\n")
     if not wait(pipe, plan.controller, states):

@@ -14,7 +14,7 @@ from pathlib import Path
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.dynamixel import guardian
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import ALERT, OVERHEAD
+from servoid.hw.dynamixel.protocol.codec import ALERT, FRAME_BITS, OVERHEAD
 from servoid.hw.dynamixel.protocol.tables import ControlTable
 from servoid.hw.dynamixel.transport.port import SerialPort
 from servoid.hw.user_folders import user_folder
@@ -23,7 +23,6 @@ READY_SECONDS = 5.0  # that a busy machine may take to start it; torque waits fo
 CLOSE_SECONDS = guardian.GIVE_UP_SECONDS + 1.0
 STARTS = 5  # in a run; one that is killed is replaced, one that cannot live is an error
 PROOF_BYTES = 2  # torque and LED: of no other length that a controller reads, so that no other answer looks alike
-BITS = 10  # of a byte on the wire
 
 
 class Lifeline:
@@ -67,7 +66,7 @@ class Lifeline:
             if self._starts >= STARTS:
                 raise BackendError(
                     f"the guardian process ended {STARTS} times, the last with code {self._process.returncode}: "
-                    "who or what ends it?"
+                    "find out what ends it"
                 )
             process = self._start()  # first: where it cannot be started, torque off must still be possible
             self._forget()
@@ -123,7 +122,7 @@ def plan(port: SerialPort, ids: Sequence[int], table: ControlTable, return_delay
     """The guardian's plan as a line: what brakes the servos, what lets them go, and what proves that it did."""
     torque, first, last = (table.item(name) for name in ("torque_enable", "position_d_gain", "position_p_gain"))
     gains = bytes(last.end - first.address)
-    answers = len(ids) * ((OVERHEAD + PROOF_BYTES) * BITS / port.baud + return_delay)
+    answers = len(ids) * ((OVERHEAD + PROOF_BYTES) * FRAME_BITS / port.baud + return_delay)
     values = {
         "port": port.fileno(),
         "name": port.name,

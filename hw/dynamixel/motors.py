@@ -197,7 +197,7 @@ class DynamixelMotors:
             if all(self._present.fresh):
                 break
         if lost := [i for i, fresh in enumerate(self._present.fresh) if not fresh]:
-            raise BackendError(f"{self._names(lost)} did not say where it is: torque stays off")
+            raise BackendError(f"{self._names(lost)} did not report its position: torque stays off")
         turned = [int.from_bytes((data or b"")[-4:], "little", signed=True) for data in self._present.data]
         here = self._units.within_turn(np.array(turned))
         lower = np.array([servo.get("min_position_limit") for servo in self._found])

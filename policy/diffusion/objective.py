@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from servoid.policy.diffusion.model.config import TOGETHER, DenoiserConfig, Objective
+from servoid.policy.diffusion.model.config import TOGETHER, DenoiserConfig, TrainingObjective
 from servoid.policy.diffusion.model.denoiser import Denoiser
 
 UNTOLD = 0.1  # share of windows without an instruction
 
 
 def draw_levels(
-    config: DenoiserConfig, batch: int, generator: torch.Generator, objective: Objective
+    config: DenoiserConfig, batch: int, generator: torch.Generator, objective: TrainingObjective
 ) -> tuple[Tensor, Tensor]:
     """Noise levels `(batch, state tokens)` and `(batch, action tokens)`.
 
@@ -105,7 +105,7 @@ def losses(
     text: Tensor | None,
     signal: Tensor,
     generator: torch.Generator,
-    objective: Objective,
+    objective: TrainingObjective,
 ) -> tuple[Tensor, Tensor]:
     """State and action losses of a batch of clean windows: squared error of the predicted clean tokens (x0).
 

@@ -132,38 +132,44 @@ def pyramid(
     return _staggered(levels, levels, delays(state_frames), delays(action_frames) + lead, steps)
 
 
+@dataclass(frozen=True)
+class Rolling:
+    """Where a rolling plan goes on from. Levels are those of a network with 20, as in Diffuse-CLoC."""
+
+    state_level: int = 14
+    action_level: int = 4
+    ramp: int | None = None  # frames over which the level rises to pure noise; None: the whole window
+
+    def __post_init__(self) -> None:
+        if min(self.state_level, self.action_level, 1 if self.ramp is None else self.ramp) < 1:
+            raise ValueError("state_level, action_level and ramp must be at least 1")
+
+
 def rolling(
-    levels: int,
-    steps: int,
-    state_frames: Array,
-    action_frames: Array,
-    state_level: int,
-    action_level: int,
-    fresh: int = 1,
-    ramp: int = 1,
-    lead: int = 0,
+    levels: int, steps: int, state_frames: Array, action_frames: Array, start: Rolling, fresh: int = 1, lead: int = 0
 ) -> DenoisingMatrix:
     """A plan that goes on from an earlier one: the first-in, first-out buffer of Diffuse-CLoC (section 3.2).
 
-    The last `fresh` frames were pushed in since and are pure noise. Of the others, states go on from `state_level` and
-    actions from `action_level`; over the `ramp` frames before the fresh ones, or as many as there are, the level rises
-    to pure noise. Frames are those of `autoregressive`.
+    The last `fresh` frames were pushed in since and are pure noise. Of the others, states and actions go on from the
+    levels of `start`; over the frames of its ramp before the fresh ones, or as many as there are, the level rises to
+    pure noise. Frames are those of `autoregressive`.
     """
-    for name, level in (("states", state_level), ("actions", action_level)):
-        if not 1 <= level <= levels:
+    for name, level in (("states", start.state_level), ("actions", start.action_level)):
+        if level > levels:
             raise ValueError(f"rolling {name} must go on from a level of 1 to {levels}, not {level}")
-    if fresh < 0 or ramp < 1:
-        raise ValueError(f"fresh must not be negative and ramp must be at least 1 frame, not {fresh}, {ramp}")
+    if fresh < 0:
+        raise ValueError(f"fresh must not be negative, not {fresh}")
 
     def starts(frames: Array, level: int) -> Array:
         last = frames.max()  # of actions, there may be fewer
         kept = max(last + 1 - fresh, 1)
-        risen = np.clip(1 - (last + 1 - fresh - frames) / min(ramp, kept), 0.0, 1.0)  # 1 in the fresh frames
-        start: Array = np.round(level + (levels - level) * risen).astype(np.int64)
-        return start
+        ramp = kept if start.ramp is None else min(start.ramp, kept)
+        risen = np.clip(1 - (last + 1 - fresh - frames) / ramp, 0.0, 1.0)  # 1 in the fresh frames
+        risen_levels: Array = np.round(level + (levels - level) * risen).astype(np.int64)
+        return risen_levels
 
     states, actions = np.zeros_like(state_frames), np.zeros_like(action_frames)
-    starts_of = starts(state_frames, state_level), starts(action_frames, action_level)
+    starts_of = starts(state_frames, start.state_level), starts(action_frames, start.action_level)
     return _staggered(*starts_of, states, actions + lead, steps)
 
 

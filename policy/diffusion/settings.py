@@ -17,6 +17,7 @@ from servoid.policy.diffusion.schedule import (
     PYRAMID,
     TRAPEZOID,
     DenoisingMatrix,
+    Rolling,
     autoregressive,
     ddim_levels,
     full_sequence,
@@ -81,19 +82,6 @@ class Pyramid:
 
 
 @dataclass(frozen=True)
-class Rolling:
-    """See `servoid.policy.diffusion.schedule.rolling`. Levels are those of a network with 20, as in Diffuse-CLoC."""
-
-    state_level: int = 14
-    action_level: int = 4
-    ramp: int | None = None  # frames over which the level rises to pure noise; None: the whole window
-
-    def __post_init__(self) -> None:
-        if min(self.state_level, self.action_level, self.ramp or 1) < 1:
-            raise ValueError("state_level, action_level and ramp must be at least 1")
-
-
-@dataclass(frozen=True)
 class DiffusionSettings:
     """Settings of the diffusion policy; ticks are those of the control loop."""
 
@@ -147,23 +135,23 @@ class DiffusionSettings:
             most = getattr(network, name)
             if ours is not None and not 1 <= ours <= most:
                 raise ConfigError(
-                    f"diffusion policy: {name} {ours} is asked for, and this checkpoint has 1 to {most} ticks; "
+                    f"diffusion policy: {name} is {ours}, but this checkpoint takes 1 to {most} ticks; "
                     f"lower it, or train a model with --{name} {ours}"
                 )
         training, needed = training or {}, self.execution_horizon + self.delay
         if needed > (horizon := min(self.horizon or network.horizon, network.action_horizon)):
             raise ConfigError(
                 f"diffusion policy: a plan must last execution_horizon + delay = {needed} ticks, "
-                f"and this one has actions for {horizon}; lower execution_horizon or delay"
+                f"but this one has actions for {horizon}; lower execution_horizon or delay"
             )
         if needed > (near := _near_alone(training, needed)):
             raise ConfigError(
-                f"diffusion policy: a plan must last execution_horizon + delay = {needed} ticks, and this checkpoint "
-                f"learned the actions of the next {near} only; lower execution_horizon or delay"
+                f"diffusion policy: a plan must last execution_horizon + delay = {needed} ticks, but this checkpoint "
+                f"learned only the actions of the next {near}; lower execution_horizon or delay"
             )
         if self.delay > (longest := _longest_delay(training, self.delay)):
             raise ConfigError(
-                f"diffusion policy: delay {self.delay} is asked for, and this checkpoint was trained for at most "
+                f"diffusion policy: delay is {self.delay}, but this checkpoint was trained for at most "
                 f"{longest} ticks: lower it, or train with --inference-delay {self.delay}"
             )
         if self.stabilization_level > network.levels:
@@ -202,9 +190,7 @@ class DiffusionSettings:
         elif self.schedule == "pyramid":
             matrix = pyramid(levels, self.steps, *frames, self.pyramid.spread, self.pyramid.shape, lead)
         elif self.schedule == "rolling" and fresh is not None:
-            roll = self.rolling
-            start = roll.state_level, roll.action_level
-            matrix = rolling(levels, self.steps, *frames, *start, fresh, roll.ramp or horizon, lead)
+            matrix = rolling(levels, self.steps, *frames, self.rolling, fresh, lead)
         else:
             matrix = full_sequence(levels, self.steps, len(state_frames), len(action_frames), lead)
         states, actions = self.used(network)

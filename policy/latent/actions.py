@@ -18,20 +18,34 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError
-from servoid.policy.latent.proprioception import proprioception, proprioception_layout
+from servoid.policy.features import AnyArray, Layout, raw_layout
 from servoid.policy.mlp import Mlp
 
 KIND = "latent"  # of a checkpoint
 LAYOUT = "state_layout"  # key of a header: the fields of what latents are conditioned on
 _PARTS = ("encoder", "prior", "decoder")
+_HEIGHT = 2  # index of z among the displacement's x, y, z, which come first in a row, with yaw after them
+
+
+def proprioception_layout(n_joints: int) -> Layout:
+    """The fields of `proprioception`, SI units, frames as in `servoid.policy.features.raw_layout`."""
+    of_row = dict(raw_layout(n_joints).fields)
+    kept = ("velocity", "angular_velocity", "gravity", "position", "joint_velocity")
+    return Layout((("height", 1), *((name, of_row[name]) for name in kept)))
+
+
+def proprioception(raw: AnyArray) -> AnyArray:
+    """Raw rows `(..., raw size)` without the place: `(..., raw size - 3)`, a numpy array or a torch tensor."""
+    index = [_HEIGHT, *range(_HEIGHT + 2, raw.shape[-1])]
+    return raw[..., index]
 
 
 @dataclass(frozen=True)
 class LatentConfig:
     """Shape of the three networks. Stored in the checkpoint."""
 
-    size: Annotated[int, "numbers of a latent; PULSE has 32 for a human's 69 joints"] = 16
-    width: Annotated[int, "units of a hidden layer"] = 256
+    size: Annotated[int, "numbers in a latent; PULSE has 32 for a human's 69 joints"] = 16
+    width: Annotated[int, "units of each hidden layer"] = 256
     layers: Annotated[int, "hidden layers"] = 2
 
     def __post_init__(self) -> None:
@@ -91,7 +105,9 @@ class LatentActions:
             raise CheckpointError(f"{path}: its latent actions do not fit its own header: {error}") from error
         needed = [(n + n_joints, *hidden, 2 * z), (n, *hidden, 2 * z), (n + z, *hidden, n_joints)]
         if found != needed:
-            raise CheckpointError(f"{path}: its latent actions do not fit its own header: {found}, {needed} are needed")
+            raise CheckpointError(
+                f"{path}: its latent actions do not fit its own header: {found}, but {needed} are needed"
+            )
         return made
 
 
@@ -103,19 +119,9 @@ def same_latents(a: LatentActions | None, b: LatentActions | None) -> bool:
     return ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in ours)
 
 
-def save_latents(
-    path: Path,
-    latents: LatentActions,
-    robot: Robot,
-    *,
-    data: str,
-    licence: str,
-    results: Mapping[str, Any],
-    training: Mapping[str, Any],
-) -> None:
+def save_latents(path: Path, latents: LatentActions, robot: Robot, origin: checkpoint.Origin) -> None:
     """Write a checkpoint of the kind `latent`. Raises CheckpointError."""
-    about: dict[str, Any] = {"data": data, "licence": licence, "results": results, "training": dict(training)}
-    head = checkpoint.header(KIND, robot, **about, **latents.describe(len(robot.joints)))
+    head = checkpoint.header(KIND, robot, **vars(origin), **latents.describe(len(robot.joints)))
     checkpoint.write(path, latents.to_tensors(), head)
 
 

@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from servoid.hw.contracts.body import Array
 from servoid.policy.features import Normaliser
-from servoid.policy.latent.actions import LatentActions, LatentConfig
-from servoid.policy.latent.proprioception import proprioception
+from servoid.policy.latent.actions import LatentActions, LatentConfig, proprioception
 from servoid.policy.mlp import Mlp
 
 _LOG_VARIANCE = 10.0  # at most this far from 0: exp() of more than that is nothing to learn from
@@ -41,7 +40,7 @@ class Gaussian:
 
 
 @dataclass(frozen=True)
-class Terms:
+class LossTerms:
     """What a batch is scored by, each a mean over it."""
 
     reconstruction: Tensor  # squared error of normalised joint targets, mean over joints
@@ -68,7 +67,7 @@ class LatentNetwork(nn.Module):
         """E(z | s, a) of normalised states and actions."""
         return _gaussian(self.encoder(torch.cat([state, action], -1)))
 
-    def terms(self, rows: Tensor, targets: Tensor, generator: torch.Generator | None = None) -> Terms:
+    def terms(self, rows: Tensor, targets: Tensor, generator: torch.Generator | None = None) -> LossTerms:
         """Terms of the loss over ticks that follow each other: raw rows `(batch, ticks, raw size)` and targets [rad].
 
         Latents are drawn with `generator`; without one, the posterior's means are decoded.
@@ -77,7 +76,7 @@ class LatentNetwork(nn.Module):
         posterior, prior = self.posterior(state, action), _gaussian(self.prior(state))
         latent = posterior.mean if generator is None else posterior.draw(generator)
         decoded = self.decoder(torch.cat([state, latent], -1))
-        return Terms(
+        return LossTerms(
             reconstruction=(decoded - action).square().mean(),
             kl=posterior.kl(prior).mean(),
             change=posterior.mean.diff(dim=1).square().mean(),

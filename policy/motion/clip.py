@@ -134,7 +134,7 @@ class Clip:
         if self.about.ends != other.about.begins:
             raise ConfigError(
                 f"'{self.name}' ends {self.about.ends} and '{other.name}' begins {other.about.begins}: "
-                "nothing between them is known"
+                "no motion between the two is known"
             )
         place, turn = self.root_position[-blend], yaw_of(self.root_orientation[-blend])
         begin = other.placed()
@@ -225,7 +225,7 @@ def read_about(path: Path) -> tuple[str, About, dict[str, Any]]:
     """Name of a clip, what it is, and its header, without its frames. Raises CheckpointError."""
     head = checkpoint.read_header(path)
     if head["kind"] != "clip":
-        raise checkpoint.CheckpointError(f"{path}: holds a {head['kind']}, and no clip")
+        raise checkpoint.CheckpointError(f"{path}: holds a {head['kind']}, not a clip")
     try:
         return str(head["name"]), _about(head["about"]), head
     except (KeyError, TypeError, ValueError) as error:

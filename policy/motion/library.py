@@ -23,7 +23,7 @@ class Library:
         for path in sorted(folder.glob(f"*{SUFFIX}")):
             name = read_about(path)[0]
             if name in self._paths:
-                raise ConfigError(f"{path}: holds a clip called '{name}', as {self._paths[name].name} does")
+                raise ConfigError(f"{path}: holds a clip called '{name}', and so does {self._paths[name].name}")
             self._paths[name] = path
 
     @property
@@ -44,7 +44,7 @@ class Library:
         """Write a clip into the folder; its path. Raises ConfigError where one of its name is there already."""
         path = self.folder / f"{clip.name}{SUFFIX}"
         if not replace and (clip.name in self._paths or path.exists()):
-            raise ConfigError(f"{path}: exists already: give another name, or --replace")
+            raise ConfigError(f"{path}: already exists: choose another name, or --replace")
         save(clip, path, self.robot)
         self._paths[clip.name] = path
         return path

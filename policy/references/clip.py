@@ -29,7 +29,9 @@ class ClipReference(Reference):
             raise ConfigError("a clip reference needs at least one clip")
         for clip in clips:
             if clip.joints.shape[1] != len(robot.joints):
-                raise ConfigError(f"clip '{clip.name}' has {clip.joints.shape[1]} joints, {robot.name} has others")
+                raise ConfigError(
+                    f"clip '{clip.name}' has {clip.joints.shape[1]} joints, but {robot.name} has {len(robot.joints)}"
+                )
             beyond = np.maximum(robot.lower - clip.joints, clip.joints - robot.upper).max(0)
             if (beyond > 1e-6).any():
                 joint = int(beyond.argmax())

@@ -164,13 +164,13 @@ def diffusion_policy(
     planner: Planner
     if process and not settings.delay:
         raise ConfigError(
-            "diffusion policy: delay 0 wants plans that take no time: in real time set delay to 1 or more"
+            "diffusion policy: delay 0 needs plans that take no time: in real time set delay to 1 or more"
         )
     if process:
         planner = ProcessPlanner(partial(_build, robot, settings, cost))
     else:
         planner = InlinePlanner(_build(robot, settings, cost))
-    trim = Trim(robot.dt, settings.trim, shape) if settings.trim else None
+    trim = Trim(robot, settings.trim, shape) if settings.trim else None
     pace = Pace(config.history, settings.execution_horizon, settings.delay, wait=not process)
 
     def stand(pose: Array) -> MinJerk:

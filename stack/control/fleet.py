@@ -14,7 +14,7 @@ from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import Robot
 from servoid.hw.seeds import generator
 from servoid.policy.mlp import Mlp
-from servoid.sim.truth import Truth
+from servoid.sim.truth import SimulatedTruth
 from servoid.sim.worlds import Worlds
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.safety.limits import limit
@@ -52,7 +52,7 @@ class Fleet:
         self.state: State
 
     @property
-    def truth(self) -> Truth:
+    def truth(self) -> SimulatedTruth:
         """The worlds' truth, for rewards and evaluation."""
         return self.worlds.truth
 

@@ -89,8 +89,8 @@ class Gamepad:
         if self._pad is None and pygame.joystick.get_count():
             name = pygame.joystick.Joystick(0).get_name()
             raise ConfigError(
-                f"where the sticks of the gamepad '{name}' are is not known: give SDL its mapping in the environment "
-                "variable SDL_GAMECONTROLLERCONFIG, or steer by keys with --set device=keyboard"
+                f"the gamepad '{name}' is unknown to SDL: describe it in the environment variable "
+                "SDL_GAMECONTROLLERCONFIG, or steer by keys with --set device=keyboard"
             )
         if self._pad is None:
             raise ConfigError("no gamepad is connected: plug one in, or steer by keys with --set device=keyboard")

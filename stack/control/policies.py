@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from servoid.hw.config import ConfigError, nearest
+from servoid.hw.config import ConfigError, available, nearest
 from servoid.hw.contracts.control import Policy
 from servoid.hw.contracts.task import Task
 from servoid.hw.plugins import Plugin, Portable, installed, load_plugin
@@ -19,16 +19,23 @@ from servoid.stack.control.base import BasePolicy
 
 if TYPE_CHECKING:
     from servoid.policy.diffusion.settings import DiffusionSettings
+    from servoid.stack.control.diffusion import DiffusionPolicy
 
 Maker = Callable[[str, Robot, Task, bool, tuple[int, ...]], Policy]
 GROUP = "servoid.policies"  # of entry points
 
 
 def _diffusion(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
+    return _planned(_planner(source), robot, task, realtime, shape)
+
+
+def _planned(
+    planner: DiffusionSettings, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]
+) -> DiffusionPolicy:
     from servoid.stack.control.diffusion import diffusion_policy
 
     cost: Any = Portable(task.objective) if realtime else task.objective
-    return diffusion_policy(robot, _planner(source), cost, process=realtime, shape=shape)
+    return diffusion_policy(robot, planner, cost, process=realtime, shape=shape)
 
 
 def _planner(source: str) -> DiffusionSettings:
@@ -53,8 +60,17 @@ def _gait(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[in
     return policy
 
 
+def _clip(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
+    from servoid.policy.motion.clip import load
+    from servoid.stack.control.clip import ClipPolicy
+
+    policy: Policy = ClipPolicy(robot, load(Path(source), robot), shape)
+    return policy
+
+
+# Policies of Servoid's own; besides there are the planner's other settings in configs/policies/.
 POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "gait": _gait}
-_KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert}  # of checkpoints
+_KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert, "clip": _clip}  # of .safetensors files
 
 
 def _own(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
@@ -72,25 +88,41 @@ def _plugin(name: str) -> Plugin | None:
     return load_plugin(name, GROUP, BasePolicy, "policy")
 
 
+def names() -> tuple[str, ...]:
+    """Names of all policies: Servoid's own, its other settings of the planner, and those of installed packages."""
+    return tuple(dict.fromkeys((*POLICIES, *available("policies"), *installed(GROUP))))
+
+
 def check_policy(name: str) -> None:
     """Raises ConfigError, for an unknown name with the nearest one."""
     _maker(name)
 
 
-def make_policy(name: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...] = ()) -> Policy:
+def make_policy(
+    name: str,
+    robot: Robot,
+    task: Task,
+    realtime: bool,
+    shape: tuple[int, ...] = (),
+    planner: DiffusionSettings | None = None,
+) -> Policy:
     """A policy for a robot and a task, or for worlds of any leading `shape`.
 
-    Raises ConfigError for an unknown name, or for a checkpoint that does not fit. `name` is one of POLICIES, the
-    .safetensors file of a diffusion model or a tracker, a .yaml file of diffusion settings, an installed package's, or
+    Raises ConfigError for an unknown name, or for a checkpoint that does not fit. `name` is one of `names`, the
+    .safetensors file of a diffusion model, a tracker or a clip, a .yaml file of diffusion settings, or
     `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is
-    for.
+    for. `planner` holds the settings of a recorded diffusion policy: no file is read for them then.
     """
+    if planner is not None:
+        return _planned(planner, robot, task, realtime, shape)
     return _maker(name)(name, robot, task, realtime, shape)
 
 
-def policy_fingerprint(name: str) -> dict[str, Any]:
+def policy_fingerprint(name: str, gait: str = "gait") -> dict[str, Any]:
     """Name of a policy and what it is made of, for the flight log: its checkpoint and that of odometry by their hashes,
-    settings of the planner or of the gait, and the file of a user's own. None for what it has not. Raises ConfigError.
+    settings of the planner or of the robot's `gait`, and the file of a user's own. None for what it has not.
+
+    Raises ConfigError.
     """
     from servoid.policy.checkpoint import resolve
     from servoid.policy.references.gait import load_gait
@@ -99,14 +131,14 @@ def policy_fingerprint(name: str) -> dict[str, Any]:
     maker = _maker(name)
     planner = _planner(name) if maker is _diffusion else None
     own = _plugin(name) if maker is _own else None
-    named = name if maker is _expert else None if planner is None else planner.checkpoint
+    named = name if maker in (_expert, _clip) else None if planner is None else planner.checkpoint
     checkpoint = None if named is None else resolve(named)
     return {
         "name": name,
         "checkpoint_sha256": None if checkpoint is None else sha256(checkpoint),
         "odometry_sha256": sha256(resolve("odometry")),
         "planner": None if planner is None else described(planner),
-        "gait": described(load_gait()) if maker in (_gait, _expert) else None,
+        "gait": described(load_gait(gait)) if maker in (_gait, _expert) else None,
         "source": None if own is None else own.source(),
     }
 
@@ -114,15 +146,22 @@ def policy_fingerprint(name: str) -> dict[str, Any]:
 def _maker(name: str) -> Maker:
     if name in POLICIES:
         return POLICIES[name]
-    if name.endswith((".yaml", ".yml")):
+    if name.endswith((".yaml", ".yml")) or name in available("policies"):
         return _diffusion
     if name.endswith(".safetensors"):
         from servoid.policy.checkpoint import read_header
 
         kind = str(read_header(Path(name))["kind"])
         if kind not in _KINDS:
-            raise ConfigError(f"{name}: a checkpoint of kind '{kind}' is no policy; there are {', '.join(_KINDS)}")
+            raise ConfigError(f"{name}: a checkpoint of kind '{kind}' is not a policy; known: {', '.join(_KINDS)}")
         return _KINDS[kind]
     if _plugin(name) is not None:
         return _own
-    raise ConfigError(f"unknown policy '{name}': {nearest(name, (*POLICIES, *installed(GROUP)))}")
+    file = Path(name)
+    if file.suffix or file.name != name:
+        what = "no file of a policy" if file.exists() else "no such file"
+        raise ConfigError(
+            f"{name}: {what}: give a checkpoint or a clip (.safetensors), settings of the diffusion policy (.yaml), "
+            f"your own FILE.py:Class, or a name: {', '.join(names())}"
+        )
+    raise ConfigError(f"unknown policy '{name}': {nearest(name, names())}")

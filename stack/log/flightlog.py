@@ -20,6 +20,12 @@ from servoid.stack.log.format import FORMAT, SCHEMAS, unpack
 
 Message = dict[str, Any]
 
+# Of a header, what its readers go by: every run of this program has it.
+_NEEDED = (
+    "settings.task", "settings.backend", "settings.robot", "settings.policy", "settings.seed", "task", "backend",
+    "policy.name", "robot.joints", "robot.feet", "robot.rate",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class FlightLog:
@@ -77,16 +83,33 @@ def read_log(path: Path | str) -> FlightLog:
     header = found["/run"][0]
     if header.get("format") != FORMAT:
         raise ConfigError(f"{path}: log format {header.get('format')}, but this version reads {FORMAT}")
+    missing = [name for name in _NEEDED if not _has(header, name.split("."))]
+    if missing:
+        raise ConfigError(
+            f"{path}: a log whose header lacks {', '.join(missing)}: another program wrote it; record the run with "
+            "`servoid run`"
+        )
     return FlightLog(path, as_now(header), found, complete)
 
 
 def as_now(header: dict[str, Any]) -> dict[str, Any]:
-    """A header with the servos' gain where it is now: it was one of the task's settings, as text."""
-    settings = header.get("settings", {})
-    if "gain" not in settings.get("set", {}):
-        return header
-    chosen = {name: text for name, text in settings["set"].items() if name != "gain"}
-    return header | {"settings": settings | {"set": chosen, "gain": float(settings["set"]["gain"])}}
+    """A header as an older program wrote it, by the names of today.
+
+    The servos' gain was one of the task's settings, as text, and settings of the planner had other names.
+    """
+    settings, policy = header["settings"], header["policy"]
+    if "gain" in settings.get("set", {}):
+        chosen = {name: text for name, text in settings["set"].items() if name != "gain"}
+        settings = settings | {"set": chosen, "gain": float(settings["set"]["gain"])}
+    if policy.get("planner"):
+        from servoid.policy.diffusion.settings import with_new_names
+
+        policy = policy | {"planner": with_new_names(policy["planner"])}
+    return header | {"settings": settings, "policy": policy}
+
+
+def _has(values: Any, keys: list[str]) -> bool:
+    return isinstance(values, dict) and keys[0] in values and (len(keys) == 1 or _has(values[keys[0]], keys[1:]))
 
 
 # What the library raises at the point where a file was cut, depending on the record that it cuts.

@@ -153,7 +153,9 @@ def _make(path: Path) -> BinaryIO:
         path.parent.mkdir(parents=True, exist_ok=True)
         return path.open("xb")
     except FileExistsError:
-        raise ConfigError(f"{path}: exists already, and a log is never overwritten: give another name") from None
+        raise ConfigError(
+            f"{path}: already exists, and a log is never overwritten: choose another name, or delete it"
+        ) from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror}): choose another place") from None
 

@@ -49,15 +49,15 @@ def make_backend(
     kind = backend_kind(name)
     if scene is not None and scene.robots is not None and not kind.several:
         able = ", ".join(f"--backend {other}" for other, its in BACKENDS.items() if its.several)
-        raise ConfigError(f"backend '{name}' has one robot, and the task asks for {len(scene.robots) + 1}: give {able}")
+        raise ConfigError(f"backend '{name}' has one robot, but the task needs {len(scene.robots) + 1}: use {able}")
     if kind.simulated and port is not None:
         raise ConfigError(f"backend '{name}' has no port: drop --port, or choose --backend dynamixel")
     if port == "virtual":
-        raise ConfigError("--port virtual belongs to servoid bringup: for a run give --backend virtual, without --port")
+        raise ConfigError("--port virtual belongs to servoid bringup: for a run use --backend virtual, without --port")
     if not kind.simulated and port is None:
         raise ConfigError(f"backend '{name}' needs a port: give --port PATH (`servoid bringup find-port` finds it)")
     if not kind.simulated and randomise:
-        raise ConfigError(f"backend '{name}' is a robot that is what it is: drop --randomise")
+        raise ConfigError(f"backend '{name}': real hardware cannot be randomised: drop --randomise")
     make = getattr(import_module(kind.module), kind.attribute)
     chosen = {"seed": seed, "randomise": randomise, "scene": scene} if kind.simulated else {"port": port}
     backend: Backend = make(robot, **chosen, **kind.options)

@@ -16,7 +16,7 @@ from servoid.stack.runtime.interrupt import TWICE, Interrupt, Stops
 from servoid.stack.safety.guard import Guard
 
 
-class Estimator(Protocol):
+class StateEstimator(Protocol):
     """Makes states of observations; `applied` is the last accepted goal, `(n_joints,)` rad, and `ticks` is how many
     have passed since the observation before."""
 
@@ -43,7 +43,7 @@ class ControlledRobot:
 
     robot: Robot
     sensors: Sensors
-    estimator: Estimator
+    estimator: StateEstimator
     guard: Guard
 
 

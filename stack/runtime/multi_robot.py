@@ -11,7 +11,6 @@ import numpy as np
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.body import Clock
 from servoid.hw.contracts.task import Assignment, Behaviour
-from servoid.hw.robot.description import Robot
 from servoid.hw.seeds import teammate_seed
 from servoid.stack.control.policies import make_policy
 from servoid.stack.estimation.estimator import Estimator
@@ -21,7 +20,7 @@ from servoid.stack.runtime.clock import Schedule
 from servoid.stack.runtime.interrupt import Interrupt, Stops
 from servoid.stack.runtime.loop import ControlledRobot, Loop
 from servoid.stack.runtime.phases import Phases
-from servoid.stack.runtime.settings import RunSettings
+from servoid.stack.runtime.settings import RunSettings, Script
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import ENDED, Guard, Phase
 
@@ -47,16 +46,17 @@ class Teammates:
     def __init__(
         self,
         settings: RunSettings,
-        robot: Robot,
         assignment: Assignment,
         behaviours: Sequence[Behaviour],
         body: Backend,
-        first: Guard,
+        first: ControlledRobot,
         interrupt: Interrupt,
+        script: Script,
     ) -> None:
-        """`body` is the first robot's, whose world has a body for each of `behaviours`, and `first` its guard."""
+        """`body` is the first robot's, whose world has a body for each of `behaviours`."""
         assert body.simulation is not None
-        self._first, self._interrupt, self._robot = first, interrupt, robot
+        robot = self._robot = first.robot
+        self._first, self._interrupt = first.guard, interrupt
         self._clock: Clock = body.clock
         self._heard: list[Event] = []  # why the first robot ended: the others end with it
         self._open = ExitStack()
@@ -64,7 +64,7 @@ class Teammates:
         unpushed = replace(assignment, episode=replace(assignment.episode, pushes={}))  # it is the first that is pushed
         for number, (behaviour, other) in enumerate(zip(behaviours, body.simulation.teammates, strict=True), 1):
             # Its planner never runs beside the loop: the log, which is the first robot's, has to repeat it.
-            policy = make_policy(settings.policy, robot, assignment.task, realtime=False)
+            policy = make_policy(settings.policy, robot, assignment.task, realtime=False, planner=script.planner)
             self._open.callback(policy.close)
             policy.reset(None, np.array(teammate_seed(settings.seed, number)))
             sensors, motors = other.connect()

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from array import array
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from servoid.hw.contracts.task import Assignment, Trace
+from servoid.hw.contracts.task import Assignment, Criterion, Trace
 from servoid.stack.log.format import event_message, plain
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.phases import Phases
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Guard, Phase
 
-_SUMMARY = ("outcome", "success", "seconds", "ticks", "missed", "late_p50_ms", "late_p99_ms", "metrics")
+_SUMMARY = (
+    "outcome", "success", "seconds", "ticks", "missed", "late_p50_ms", "late_p99_ms", "metrics", "task_began",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -35,11 +37,14 @@ class Result:
     trace: Trace
     log: Path | None
     interrupted: bool = False  # whether it was told to end, be it after its task had ended
+    criteria: tuple[Criterion, ...] = ()  # of success; none where the task does not say them
+    task_began: float | None = None  # tick 0 of the task by the clock of the events, s since the run began
 
     def summary(self) -> dict[str, Any]:
         """The result as JSON values, without the trace."""
         values: dict[str, Any] = plain({name: vars(self)[name] for name in _SUMMARY})
-        return values | {"events": [event_message(event) for event in self.events]}
+        criteria: list[Any] = plain([asdict(criterion) | {"met": criterion.met} for criterion in self.criteria])
+        return values | {"criteria": criteria, "events": [event_message(event) for event in self.events]}
 
 
 class Tally:
@@ -49,8 +54,14 @@ class Tally:
         self.events: list[Event] = []
         self._late = array("q")  # ns; a list of numbers would be five times as large
         self._missed = 0
+        self._first_ns: int | None = None  # time of the first tick by the body's clock
+        self._began: float | None = None
 
     def __call__(self, record: TickRecord) -> None:
+        now = record.observation.time_ns
+        self._first_ns = now if self._first_ns is None else self._first_ns
+        if self._began is None and record.proposal.instruction is not None:
+            self._began = (now - self._first_ns) * 1e-9
         self.events += record.events
         if record.phase is Phase.RUNNING:
             self._late.append(record.timing.late)
@@ -76,6 +87,8 @@ class Tally:
             trace=trace,
             log=log,
             interrupted=interrupted,
+            criteria=tuple(assignment.criteria(trace)) if phases.task_ticks else (),
+            task_began=self._began,
         )
 
 

@@ -167,7 +167,9 @@ class Run:
         self.behaviour = self._behaviour()
         self._open.callback(self.behaviour.close)
         self._open.enter_context(self._interrupt)
-        self.policy = self._policy or make_policy(settings.policy, robot, task, self.realtime)
+        self.policy = self._policy or make_policy(
+            settings.policy, robot, task, self.realtime, planner=self._script.planner
+        )
         self._open.callback(self.policy.close)
         self._interrupt.check()
         self._open.callback(body.close)
@@ -197,7 +199,13 @@ class Run:
         clock = self.body.clock
         if behaviours := self.behaviour.teammates:
             clock = self._teammates = Teammates(
-                self.settings, self.robot, self.assignment, behaviours, self.body, self.guard, self._interrupt
+                self.settings,
+                self.assignment,
+                behaviours,
+                self.body,
+                self._controlled,
+                self._interrupt,
+                self._script,
             )
             self._open.callback(self._teammates.close)
             listeners.append(self._teammates)
@@ -250,7 +258,9 @@ class Run:
     def _record(self) -> Recorder:
         settings, own = self.settings, self._policy
         assert settings.record is not None
-        policy = policy_fingerprint(settings.policy) if own is None else {"name": type(own).__qualname__}
+        policy = (
+            policy_fingerprint(settings.policy, self.robot.gait) if own is None else {"name": type(own).__qualname__}
+        )
         facts = header(settings, self.robot, self.assignment, source(settings.task), self.body.name, policy)
         facts["recovery"] = None if self._get_up is None else fingerprints(self.robot)
         wait = self.body.simulation is not None and not self.realtime

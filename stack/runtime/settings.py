@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.stack.safety.event import Event
+
+if TYPE_CHECKING:
+    from servoid.policy.diffusion.settings import DiffusionSettings
 
 MAX_GAIN = 2.0  # times the firmware's configured gain; above, a servo of this class rings
 
@@ -36,7 +40,9 @@ class RunSettings:
         if not 0.0 < self.gain <= MAX_GAIN:
             raise ConfigError(f"gain: {self.gain:g} is outside 0 to {MAX_GAIN:g}: it scales the servos' position gain")
         if "gain" in self.set:
-            raise ConfigError(f"--set gain={self.set['gain']}: gain is no setting of a task: give --gain G (gain=G)")
+            raise ConfigError(
+                f"--set gain={self.set['gain']}: gain is not a setting of the task: use --gain G (gain=G)"
+            )
 
 
 @dataclass(frozen=True)
@@ -49,3 +55,4 @@ class Script:
     plans: Sequence[Mapping[int, int]] | None = None
     velocities: Array | None = None  # (ticks, 3) that a person steered by,
     ended: bool = False  # and whether the person ended the run
+    planner: DiffusionSettings | None = None  # what it planned with: the policy's file may have moved or changed

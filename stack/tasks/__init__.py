@@ -13,7 +13,7 @@ from servoid.hw.contracts.task import Task
 from servoid.hw.overrides import override
 from servoid.hw.plugins import Plugin, installed, load_plugin
 from servoid.hw.robot.description import Robot
-from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings, beyond, fitted
 from servoid.stack.tasks.cross import Cross
 from servoid.stack.tasks.forest import Forest
 from servoid.stack.tasks.goal import Goal
@@ -30,7 +30,7 @@ GROUP = "servoid.tasks"  # of entry points
 
 
 @dataclass(frozen=True)
-class Known:
+class TaskEntry:
     """A task that can be run: its class, by what name, and where it came from."""
 
     name: str
@@ -42,12 +42,12 @@ class Known:
 _CLASSES: tuple[type[BaseTask], ...] = (
     Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Cross, Inbetween, Survive, Text, Steer,
 )  # fmt: skip
-_OWN: dict[str, Known] = {
-    **{cls.name: Known(cls.name, cls, cls.description) for cls in _CLASSES},
+_OWN: dict[str, TaskEntry] = {
+    **{cls.name: TaskEntry(cls.name, cls, cls.description) for cls in _CLASSES},
     # The same classes with other files of settings.
-    "goal-near": Known("goal-near", Goal, "walk to a near point"),
-    "goal-far": Known("goal-far", Goal, "walk to a far point"),
-    "perturb": Known("perturb", Walk, "walk ahead while being pushed once a second"),
+    "goal-near": TaskEntry("goal-near", Goal, "walk to a near point"),
+    "goal-far": TaskEntry("goal-far", Goal, "walk to a far point"),
+    "perturb": TaskEntry("perturb", Walk, "walk ahead while being pushed once a second"),
 }
 
 
@@ -56,7 +56,7 @@ def names() -> tuple[str, ...]:
     return (*_OWN, *(name for name in installed(GROUP) if name not in _OWN))
 
 
-def find(name: str) -> Known:
+def find(name: str) -> TaskEntry:
     """The task of that name, or of a file: `FILE.py:Class`. Servoid's own hide others of their names.
 
     Raises ConfigError with the nearest name, or with what is wrong with a class of a user's own.
@@ -68,8 +68,10 @@ def find(name: str) -> Known:
         raise ConfigError(f"unknown task '{name}': {nearest(name, names())}")
     cls: type[BaseTask] = plugin.cls
     if not (cls.name and cls.description):
-        raise plugin.error(f'{cls.__name__}: say what it is: name = "..." and description = "..." in the class')
-    return Known(cls.name, cls, cls.description, plugin)
+        raise plugin.error(
+            f'{cls.__name__}: name or description missing: write name = "..." and description = "..." in the class'
+        )
+    return TaskEntry(cls.name, cls, cls.description, plugin)
 
 
 def source(name: str) -> dict[str, Any] | None:
@@ -78,15 +80,16 @@ def source(name: str) -> dict[str, Any] | None:
     return None if known.plugin is None else known.plugin.source()
 
 
-def load_settings(name: str, settings: dict[str, str] | None = None) -> Any:
+def load_settings(name: str, settings: dict[str, str] | None = None, robot: Robot | None = None) -> Any:
     """A task's settings, from its file or its class, with those changed that `--set key=value` gives as text.
 
-    Raises ConfigError.
+    Speeds and lengths of Servoid's own tasks are fitted to `robot`; what is typed stays. Raises ConfigError.
     """
     known = find(name)
     base: Settings
     if known.plugin is None:
         base = load_yaml(resolve("tasks", name), known.cls.settings_type)
+        base = base if robot is None else fitted(base, robot)
     else:
         try:
             base = known.cls.settings_type()
@@ -102,9 +105,12 @@ def load_task(name: str, settings: dict[str, str] | None = None, dt: float = 0.0
     Raises ConfigError for an unknown task or setting, a value that does not parse, or what `robot` cannot do.
     """
     known = find(name)
-    task = known.cls(load_settings(name, settings), dt, robot)
+    task = known.cls(load_settings(name, settings, robot), dt, robot)
     task.name = known.name
     return task
 
 
-__all__ = ["BaseBehaviour", "BaseTask", "Known", "Settings", "find", "load_settings", "load_task", "names", "source"]
+__all__ = [
+    "BaseBehaviour", "BaseTask", "Settings", "TaskEntry",
+    "beyond", "find", "load_settings", "load_task", "names", "source",
+]  # fmt: skip

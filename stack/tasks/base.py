@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Behaviour, Episode, Objective, Trace
+from servoid.hw.contracts.task import Behaviour, Criterion, Episode, Objective, Trace
 from servoid.hw.contracts.world import Percept
-from servoid.hw.robot.description import Robot, load_robot
-from servoid.hw.setting import Setting, check
+from servoid.hw.robot.description import Robot, shipped_robot
+from servoid.hw.setting import Setting, asks, check, rescaled
+from servoid.policy.references.gait import load_gait
 from servoid.stack.tasks.terms.guidance import Weights, total_cost
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -31,6 +36,50 @@ class Settings:
     def completed(typed: dict[str, str]) -> dict[str, str]:
         """Settings as typed on a command line, with those that follow from them."""
         return typed
+
+
+def beyond(settings: Any, robot: Robot) -> list[str]:
+    """A sentence about each speed that a task's settings ask for and the robot cannot reach."""
+    top = robot.walking
+    limits = {  # that way, and the opposite one
+        "forward": (top.forward, top.backward),
+        "backward": (top.backward, top.forward),
+        "left": (top.sideways, top.sideways),
+        "turning": (top.turning, top.turning),
+    }
+    told = []
+    for name, unit, way, speeds in asks(settings):
+        for speed in dict.fromkeys(speeds):
+            limit = limits[way][speed < 0.0]
+            if abs(speed) > limit + 1e-9:
+                told.append(f"{name}={speed:g} is more than {robot.name} can: {limit:g} {unit} at most that way")
+    return told
+
+
+def fitted(settings: T, robot: Robot) -> T:
+    """Settings that hold for the shipped robot as they hold for `robot`: speeds are the same shares of its top speeds,
+    lengths of its height, and times of its gait's cycle. Raises ConfigError."""
+    ours, theirs = (
+        {
+            "forward": (r.walking.forward, r.walking.backward),
+            "backward": (r.walking.backward, r.walking.forward),
+            "left": (r.walking.sideways, r.walking.sideways),
+            "turning": (r.walking.turning, r.walking.turning),
+            "height": (r.walking.height,),
+            "cycle": (load_gait(r.gait).cycle,),
+        }
+        for r in (robot, shipped_robot())
+    )
+
+    def factor(setting: Setting, value: float) -> float:
+        what = setting.of or setting.asks or "height"
+        opposite = setting.asks is not None and value < 0.0
+        return ours[what][opposite] / theirs[what][opposite]
+
+    try:
+        return rescaled(settings, factor)
+    except ValueError as error:
+        raise ConfigError(f"the task's settings do not fit {robot.name}: {error}") from error
 
 
 class BaseTask:
@@ -51,7 +100,12 @@ class BaseTask:
     @property
     def top(self) -> Array:
         """Top speeds `(3,)` of the robot, of the shipped one where none was given."""
-        return (self.robot or load_robot()).walking.scale
+        return (self.robot or shipped_robot()).walking.scale
+
+    @property
+    def cycle(self) -> float:
+        """Length of a cycle of the robot's gait [s]: within one, every walk sways."""
+        return load_gait((self.robot or shipped_robot()).gait).cycle
 
     def ticks(self, seconds: float) -> int:
         """The nearest number of ticks, at least one."""
@@ -70,8 +124,16 @@ class BaseTask:
         weights: Weights = self.settings.cost
         return None if self.guided_by_velocity_alone and not weights.twist else partial(total_cost, weights=weights)
 
+    def criteria(self, trace: Trace, episode: Any) -> Sequence[Criterion]:
+        """All that a success needs: what a run is told when it fails."""
+        return ()
+
     def success(self, trace: Trace, episode: Any) -> bool:
-        raise NotImplementedError(f"task {self.name} does not say what success is")
+        """Whether every criterion is met."""
+        criteria = self.criteria(trace, episode)
+        if not criteria:
+            raise NotImplementedError(f"task {self.name} does not say what success is")
+        return all(criterion.met for criterion in criteria)
 
     def metrics(self, trace: Trace, episode: Any) -> dict[str, float]:
         return {}

@@ -9,12 +9,11 @@ from typing import Annotated
 import numpy as np
 
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Episode, Trace
+from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading, turned
 from servoid.hw.setting import Setting
-from servoid.policy.references.gait import load_gait
-from servoid.stack.navigation.collision_avoidance import AvoidanceSettings, Motion, bearing_past
+from servoid.stack.navigation.collision_avoidance import AvoidanceSettings, MeanVelocity, bearing_past
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 from servoid.stack.tasks.terms import metrics as measures
@@ -27,7 +26,7 @@ class CrossSettings(Settings):
     robots: Annotated[int, Setting("number of robots", least=2, most=4)] = 3
     circle: Annotated[float, Setting("radius of the circle on which they start", "m", above=0)] = 1.1
     spread: Annotated[float, Setting("how far a start may be from its even place on the circle", "rad", least=0)] = 0.2
-    body: Annotated[float, Setting("distance from the middle of a robot to its side", "m", above=0)] = 0.15
+    body: Annotated[float, Setting("distance from the middle of a robot to its side", "m", above=0, of="height")] = 0.15
     radius: Annotated[float, Setting("distance from the goal that counts as reached", "m", above=0)] = 0.14
     approach: SpeedProfile = field(default_factory=SpeedProfile)
     passing: AvoidanceSettings = field(default_factory=AvoidanceSettings)
@@ -60,16 +59,21 @@ class Cross(BaseTask):
         rim = s.circle * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
         middle, goal = np.array([s.circle, 0.0]), np.array([2.0 * s.circle, 0.0])
         others = np.column_stack([middle + rim, angles - math.pi, middle - rim])
-        return Episode(Scene(np.zeros((0, 3)), np.zeros((0, 4)), goal, others), goal)
+        return Episode(Scene(np.zeros((0, 3)), np.zeros((0, 4)), goal, others), goal, reach=s.radius)
 
     def behaviour(self, episode: Episode) -> BaseBehaviour:
         """The first robot's, which knows those of the others."""
         teammates = tuple(_CrossOver(episode, self.settings, self.dt) for _ in range(self.settings.robots - 1))
         return _CrossOver(episode, self.settings, self.dt, teammates)
 
-    def success(self, trace: Trace, episode: Episode) -> bool:
+    def criteria(self, trace: Trace, episode: Episode) -> list[Criterion]:
         """None ever fell or touched another, and all are within the radius of their goals at the end."""
-        return not (trace.fallen or self._touched(trace)) and self._arrived(trace, episode) == self.settings.robots
+        arrived = self._arrived(trace, episode)
+        return [
+            Criterion.never("fell", trace.fallen),
+            Criterion.never("touched another robot", self._touched(trace)),
+            Criterion("arrived", arrived, "robots", least=self.settings.robots),
+        ]
 
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
         there = self._arrived(trace, episode)
@@ -77,7 +81,7 @@ class Cross(BaseTask):
             "arrived": float(there),
             "apart_m": _apart(trace),
             "touched": float(self._touched(trace)),
-            "path_m": measures.path_length(trace, load_gait().cycle),
+            "path_m": measures.path_length(trace, self.cycle),
             "seconds_to_cross": len(trace.yaw) * trace.dt if there == self.settings.robots else float("nan"),
         }
 
@@ -121,7 +125,7 @@ class _CrossOver(BaseBehaviour):
         self.arrived = self.ended = False
         self._settings = settings
         self._bearing = 0.0  # rad in the odometry frame, of the way that was chosen
-        self._motion = Motion(settings.passing.window, dt)
+        self._motion = MeanVelocity(settings.passing.window, dt)
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
         """The goal, the others as obstacles that move, and a velocity past them; standing, once arrived."""

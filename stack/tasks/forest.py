@@ -10,12 +10,11 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Episode, Trace
+from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Setting
-from servoid.policy.references.gait import load_gait
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.navigation.potential_field import FieldSettings, PotentialField
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
@@ -79,7 +78,8 @@ class Forest(BaseTask):
             goal = np.array([s.x or 0.0, s.y or 0.0])
         self._require_room("goal", goal, "move the pillar, or fix the goal by x and y")
         pillars = np.array(s.places, dtype=float).reshape(-1, 3)
-        return Episode(Scene(pillars if len(pillars) else self._draw(rng, goal), np.zeros((0, 4)), goal), goal)
+        scene = Scene(pillars if len(pillars) else self._draw(rng, goal), np.zeros((0, 4)), goal)
+        return Episode(scene, goal, reach=s.radius)
 
     def _draw(self, rng: np.random.Generator, goal: Array) -> Array:
         """Pillars `(n, 3)` m."""
@@ -100,17 +100,21 @@ class Forest(BaseTask):
     def behaviour(self, episode: Episode) -> BaseBehaviour:
         return _GoBetween(episode, self.settings, self.ticks(_RENEWAL))
 
-    def success(self, trace: Trace, episode: Episode) -> bool:
+    def criteria(self, trace: Trace, episode: Episode) -> list[Criterion]:
         """Never fallen, no pillar touched, and within the radius of the goal at the end."""
-        there = _final_distance(trace, episode) <= self.settings.radius
-        return there and not (trace.fallen or measures.touched(trace))
+        distance = _final_distance(trace, episode)
+        return [
+            Criterion.never("fell", trace.fallen),
+            Criterion.never("touched a pillar", measures.touched(trace)),
+            Criterion("final distance from the goal", distance, "m", most=self.settings.radius),
+        ]
 
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
         return {
             "final_distance_m": _final_distance(trace, episode),
             "clearance_m": measures.clearance(trace),
             "touched": float(measures.touched(trace)),
-            "path_m": measures.path_length(trace, load_gait().cycle),
+            "path_m": measures.path_length(trace, self.cycle),
             "seconds_to_goal": len(trace.yaw) * trace.dt if self.success(trace, episode) else float("nan"),
         }
 

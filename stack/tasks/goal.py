@@ -12,12 +12,11 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Episode, Trace
+from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Range, Setting
-from servoid.policy.references.gait import load_gait
 from servoid.policy.text.captions import MOTIONS
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
@@ -62,15 +61,22 @@ class Goal(BaseTask):
         goal = distance * np.array([math.cos(bearing), math.sin(bearing)])
         if s.x is not None or s.y is not None:
             goal = np.array([s.x or 0.0, s.y or 0.0])
-        return Episode(Scene(np.zeros((0, 3)), np.zeros((0, 4)), goal.copy()) if s.seen else None, goal)
+        scene = Scene(np.zeros((0, 3)), np.zeros((0, 4)), goal.copy()) if s.seen else None
+        return Episode(scene, goal, reach=s.radius)
 
     def behaviour(self, episode: Episode) -> BaseBehaviour:
         return _GoAndStand(episode, self.settings)
 
-    def success(self, trace: Trace, episode: Episode) -> bool:
+    def criteria(self, trace: Trace, episode: Episode) -> list[Criterion]:
         """Within the radius of the goal, and standing there, at the end. The trace is in the odometry frame."""
-        there = not trace.fallen and bool(_distances(trace, episode)[-1] <= self.settings.radius)
-        return there and (not self.settings.stand or measures.standing(trace))
+        distance = float(_distances(trace, episode)[-1])
+        found = [
+            Criterion.never("fell", trace.fallen),
+            Criterion("final distance from the goal", distance, "m", most=self.settings.radius),
+        ]
+        if self.settings.stand:
+            found.append(Criterion.never("moved in the last second", not measures.standing(trace)))
+        return found
 
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
         distances = _distances(trace, episode)
@@ -78,7 +84,7 @@ class Goal(BaseTask):
         arrival = int(outside[-1]) + 1 if len(outside) else 0  # the tick from which it stayed within the radius
         return {
             "final_distance_m": float(distances[-1]),
-            "path_m": measures.path_length(trace, load_gait().cycle),
+            "path_m": measures.path_length(trace, self.cycle),
             "seconds_to_goal": arrival * trace.dt if arrival < len(trace.displacement) else float("nan"),
         }
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Episode, Trace
+from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.setting import Setting
@@ -26,10 +26,10 @@ class ObstacleSettings(Settings):
     radius: Annotated[float, Setting("radius of the sphere", "m", above=0)] = 0.1
     sphere_speed: Annotated[float, Setting("speed at which the sphere rolls toward the robot", "m/s", least=0)] = 0.08
     escape: Annotated[float, Setting("distance from the sphere's middle that counts as escaped", "m", above=0)] = 0.825
-    speed: Annotated[float, Setting("fastest step forward", "m/s", above=0)] = 0.25
-    reverse: Annotated[float, Setting("fastest step backward", "m/s")] = 0.0
-    lateral: Annotated[float, Setting("fastest step to either side", "m/s")] = 0.0
-    yaw_rate: Annotated[float, Setting("fastest turn", "rad/s")] = 1.0
+    speed: Annotated[float, Setting("fastest step forward", "m/s", above=0, asks="forward")] = 0.25
+    reverse: Annotated[float, Setting("fastest step backward", "m/s", asks="backward")] = 0.0
+    lateral: Annotated[float, Setting("fastest step to either side", "m/s", asks="left")] = 0.0
+    yaw_rate: Annotated[float, Setting("fastest turn", "rad/s", asks="turning")] = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -55,11 +55,14 @@ class Obstacle(BaseTask):
     def behaviour(self, episode: Episode) -> BaseBehaviour:
         return _GetAway(episode, self.settings, self.dt)
 
-    def success(self, trace: Trace, episode: Episode) -> bool:
+    def criteria(self, trace: Trace, episode: Episode) -> list[Criterion]:
         """Never fallen, never touched, and far from the sphere at the end."""
-        if trace.fallen or measures.touched(trace) or trace.obstacles is None or not len(trace.obstacles):
-            return False
-        return measures.clearance(trace, slice(-1, None)) + self.settings.radius >= self.settings.escape
+        s, distance = self.settings, measures.clearance(trace, slice(-1, None)) + self.settings.radius
+        return [
+            Criterion.never("fell", trace.fallen),
+            Criterion.never("touched the sphere", measures.touched(trace)),
+            Criterion("final distance from the sphere", distance, "m", least=s.escape),
+        ]
 
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
         return {

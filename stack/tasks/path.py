@@ -10,11 +10,10 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Episode, Trace
+from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.setting import Setting
-from servoid.policy.references.gait import load_gait
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 from servoid.stack.tasks.terms import metrics as measures
 
@@ -30,10 +29,10 @@ class PathSettings(Settings):
         (0.8, 0.0),
         (0.8, 0.8),
     )
-    speed: Annotated[float, Setting("speed along the path", "m/s", above=0)] = 0.15
+    speed: Annotated[float, Setting("speed along the path", "m/s", above=0, asks="forward")] = 0.15
     lookahead: Annotated[float, Setting("how far along the path the robot heads", "m", above=0)] = 0.15
     horizon: Annotated[int, Setting("how far ahead a planner is given places on the path", "ticks", above=0)] = 64
-    yaw_rate: Annotated[float, Setting("fastest turn", "rad/s", above=0)] = 0.8
+    yaw_rate: Annotated[float, Setting("fastest turn", "rad/s", above=0, asks="turning")] = 0.8
     seen: Annotated[bool, Setting("whether the robot sees the path's end, as by a camera: else odometry tells it")] = (
         True
     )
@@ -51,7 +50,7 @@ class PathSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Course(Episode):
-    points: Array  # (n, 2) m of the path, a centimetre apart, from the robot on
+    path: Array  # (n, 2) m, a centimetre apart, from the robot on
 
 
 class Path(BaseTask):
@@ -63,24 +62,30 @@ class Path(BaseTask):
         """Lay out the path, which starts at the robot; its end is a mark on the floor, where it shall be seen."""
         points = _layout(self.settings)
         scene = Scene(np.zeros((0, 3)), np.zeros((0, 4)), points[-1].copy()) if self.settings.seen else None
-        return Course(scene, points[-1], points=points)
+        return Course(scene, points[-1], path=points, reach=self.settings.tolerance)
 
     def behaviour(self, episode: Course) -> BaseBehaviour:
         return _Follow(episode, self.settings, self.dt)
 
-    def success(self, trace: Trace, episode: Course) -> bool:
+    def criteria(self, trace: Trace, episode: Course) -> list[Criterion]:
         """Never fallen, near the path on average, and at its end by way of it. The trace is in the odometry frame."""
-        error, end, left = self._errors(trace, episode.points)
-        return not trace.fallen and max(error, end, left) <= self.settings.tolerance
+        error, end, left = self._errors(trace, episode.path)
+        tolerance = self.settings.tolerance
+        return [
+            Criterion.never("fell", trace.fallen),
+            Criterion("mean distance from the path", error, "m", most=tolerance),
+            Criterion("final distance from its end", end, "m", most=tolerance),
+            Criterion("way left on it", left, "m", most=tolerance),
+        ]
 
     def metrics(self, trace: Trace, episode: Course) -> dict[str, float]:
-        error, end, left = self._errors(trace, episode.points)
+        error, end, left = self._errors(trace, episode.path)
         return {
             "path_error_m": error,
             "final_distance_m": end,
             "left_m": left,
-            "length_m": _SPACING * (len(episode.points) - 1),
-            "path_m": measures.path_length(trace, load_gait().cycle),
+            "length_m": _SPACING * (len(episode.path) - 1),
+            "path_m": measures.path_length(trace, self.cycle),
         }
 
     def _errors(self, trace: Trace, points: Array) -> tuple[float, float, float]:
@@ -106,7 +111,7 @@ class _Follow(BaseBehaviour):
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
         """Where to be at the next ticks, and a velocity toward a point ahead on the path (pure pursuit)."""
-        s, points = self._settings, self.episode.points
+        s, points = self._settings, self.episode.path
         if percept.goal is not None:
             points = points + (percept.goal - points[-1])  # odometry has drifted by so much
         self._at = _walked(self._at, points, state.displacement[:2], s.lookahead)
@@ -123,7 +128,7 @@ class _Follow(BaseBehaviour):
 
     def done(self, state: State) -> bool:
         """At the end of the path."""
-        return self._at >= len(self.episode.points) - max(round(0.4 * self._settings.tolerance / _SPACING), 1)
+        return self._at >= len(self.episode.path) - max(round(0.4 * self._settings.tolerance / _SPACING), 1)
 
 
 def _walked(at: int, points: Array, place: Array, lookahead: float) -> int:

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Episode, Trace
+from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.setting import Setting
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
@@ -27,8 +27,12 @@ class Stand(BaseTask):
     def behaviour(self, episode: Episode) -> BaseBehaviour:
         return _Still(episode)
 
-    def success(self, trace: Trace, episode: Episode) -> bool:
-        return not trace.fallen and len(trace.displacement) > 0 and _wandered(trace) <= self.settings.radius
+    def criteria(self, trace: Trace, episode: Episode) -> list[Criterion]:
+        return [
+            Criterion.never("fell", trace.fallen),
+            Criterion.never("ended before it began", len(trace.displacement) == 0),
+            Criterion("distance wandered", _wandered(trace), "m", most=self.settings.radius),
+        ]
 
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
         return {"wandered_m": _wandered(trace)}

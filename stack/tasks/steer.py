@@ -9,10 +9,9 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Episode, Trace
+from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.setting import Setting
-from servoid.policy.references.gait import load_gait
 from servoid.stack.control.operator import Controls, Steering, open_steering
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 from servoid.stack.tasks.terms import metrics as measures
@@ -23,10 +22,12 @@ Stick = Literal["leftx", "lefty", "rightx", "righty"]
 @dataclass(frozen=True)
 class SteerSettings(Settings):
     device: Annotated[Literal["auto", "gamepad", "keyboard"], Setting("auto, gamepad or keyboard")] = "auto"
-    forward: Annotated[float, Setting("forward, with the stick pushed all the way", "m/s", above=0)] = 0.25
-    backward: Annotated[float, Setting("backward, the same", "m/s", above=0)] = 0.1
-    sideways: Annotated[float, Setting("to either side, the same", "m/s", above=0)] = 0.1
-    turning: Annotated[float, Setting("turning, the same", "rad/s", above=0)] = 0.8
+    forward: Annotated[float, Setting("forward, with the stick pushed all the way", "m/s", above=0, asks="forward")] = (
+        0.25
+    )
+    backward: Annotated[float, Setting("backward, the same", "m/s", above=0, asks="backward")] = 0.1
+    sideways: Annotated[float, Setting("to either side, the same", "m/s", above=0, asks="left")] = 0.1
+    turning: Annotated[float, Setting("turning, the same", "rad/s", above=0, asks="turning")] = 0.8
     forward_stick: Annotated[Stick, Setting("part of the gamepad that walks forward and back")] = "lefty"
     sideways_stick: Annotated[Stick, Setting("part of it that walks sideways")] = "leftx"
     turning_stick: Annotated[Stick, Setting("part of it that turns")] = "rightx"
@@ -45,13 +46,16 @@ class Steer(BaseTask):
         controls = Controls(s.forward_stick, s.sideways_stick, s.turning_stick, s.end_button)
         return Steered(episode, open_steering(s.device, controls), s)
 
-    def success(self, trace: Trace, episode: Episode) -> bool:
-        return not trace.fallen and len(trace.displacement) > 0
+    def criteria(self, trace: Trace, episode: Episode) -> list[Criterion]:
+        return [
+            Criterion.never("fell", trace.fallen),
+            Criterion.never("ended before it began", len(trace.displacement) == 0),
+        ]
 
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
         return {
             "top_speed_mps": measures.top_speed(trace),
-            "distance_m": measures.path_length(trace, load_gait().cycle),
+            "distance_m": measures.path_length(trace, self.cycle),
         }
 
 

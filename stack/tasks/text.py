@@ -11,7 +11,7 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Episode, Trace
+from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Setting
@@ -29,9 +29,9 @@ class TextSettings(Settings):
         "held_out"
     )
     sentence: Annotated[str | None, Setting("what to do all the time, instead of sentences drawn")] = None
-    cycle: Annotated[float, Setting("length of a gait cycle: motion is measured over whole ones", "s", above=0)] = (
-        field(default_factory=lambda: load_gait().cycle)
-    )
+    cycle: Annotated[
+        float, Setting("length of a gait cycle: motion is measured over whole ones", "s", above=0, of="cycle")
+    ] = field(default_factory=lambda: load_gait().cycle)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -75,9 +75,10 @@ class Text(BaseTask):
     def behaviour(self, episode: Sentences) -> BaseBehaviour:
         return _Tell(episode, self.ticks(self.settings.every), self.top)
 
-    def success(self, trace: Trace, episode: Sentences) -> bool:
+    def criteria(self, trace: Trace, episode: Sentences) -> list[Criterion]:
         """Never fallen, and every sentence followed."""
-        return not trace.fallen and self._followed(trace, episode) == 1.0
+        share = self._followed(trace, episode)
+        return [Criterion.never("fell", trace.fallen), Criterion("share of sentences followed", share, least=1.0)]
 
     def metrics(self, trace: Trace, episode: Sentences) -> dict[str, float]:
         return {"followed_share": self._followed(trace, episode)}

@@ -11,7 +11,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Episode, Trace
+from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.geometry import turned
 from servoid.hw.setting import Range, Setting
@@ -23,16 +23,16 @@ from servoid.stack.tasks.terms import metrics as measures
 @dataclass(frozen=True)
 class VelocitySettings(Settings):
     seconds: Annotated[float, Setting("length of an episode", "s", above=0)] = 183.0
-    speed: Annotated[Range, Setting("speed over the ground", "m/s", least=0)] = (0.0, 0.44)
+    speed: Annotated[Range, Setting("speed over the ground", "m/s", least=0, asks="forward")] = (0.0, 0.44)
     turn: Annotated[Range, Setting("how far the direction changes each time", "rad")] = (-1.0, 1.0)
     every: Annotated[float, Setting("time between changes", "s", above=0)] = 8.7
     settle: Annotated[float, Setting("time after each change that does not count", "s", least=0)] = 2.1
-    cycle: Annotated[float, Setting("length of a gait cycle: velocity is averaged over it", "s", above=0)] = field(
-        default_factory=lambda: load_gait().cycle
-    )
+    cycle: Annotated[
+        float, Setting("length of a gait cycle: velocity is averaged over it", "s", above=0, of="cycle")
+    ] = field(default_factory=lambda: load_gait().cycle)
     tolerance: Annotated[float, Setting("largest mean velocity error of a success", "m/s", above=0)] = 0.04
     turn_gain: Annotated[float, Setting("turning rate for each rad of wrong heading", "1/s", above=0)] = 1.5
-    yaw_rate: Annotated[float, Setting("fastest turn", "rad/s", above=0)] = 0.8
+    yaw_rate: Annotated[float, Setting("fastest turn", "rad/s", above=0, asks="turning")] = 0.8
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -66,8 +66,12 @@ class Velocity(BaseTask):
     def behaviour(self, episode: Velocities) -> BaseBehaviour:
         return _FaceAndWalk(episode, self.settings, self.ticks(self.settings.every))
 
-    def success(self, trace: Trace, episode: Velocities) -> bool:
-        return not trace.fallen and self._error(trace, episode) <= self.settings.tolerance
+    def criteria(self, trace: Trace, episode: Velocities) -> list[Criterion]:
+        error = self._error(trace, episode)
+        return [
+            Criterion.never("fell", trace.fallen),
+            Criterion("mean velocity error", error, "m/s", most=self.settings.tolerance),
+        ]
 
     def metrics(self, trace: Trace, episode: Velocities) -> dict[str, float]:
         return {

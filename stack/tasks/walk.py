@@ -11,7 +11,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.task import Episode, Trace
+from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.setting import Range, Setting
 from servoid.policy.references.gait import load_gait
@@ -24,15 +24,18 @@ _COMPONENTS = ("vx", "vy", "yaw_rate")
 
 @dataclass(frozen=True)
 class WalkSettings(Settings):
-    vx: Annotated[Range, Setting("forward; with one component given, the others are 0", "m/s")] = (-0.1, 0.3)
-    vy: Annotated[Range, Setting("to the left", "m/s")] = (-0.1, 0.1)
-    yaw_rate: Annotated[Range, Setting("turning left", "rad/s")] = (-0.8, 0.8)
+    vx: Annotated[Range, Setting("forward; with one component given, the others are 0", "m/s", asks="forward")] = (
+        -0.1,
+        0.3,
+    )
+    vy: Annotated[Range, Setting("to the left", "m/s", asks="left")] = (-0.1, 0.1)
+    yaw_rate: Annotated[Range, Setting("turning left", "rad/s", asks="turning")] = (-0.8, 0.8)
     every: Annotated[float, Setting("time between changes of the command", "s", above=0)] = 5.0
     push: Annotated[Range, Setting("size of each push, in a random direction", "m/s", least=0)] = (0.0, 0.0)
     push_every: Annotated[float, Setting("time between pushes", "s", above=0)] = 1.0
-    cycle: Annotated[float, Setting("length of a gait cycle: velocity is averaged over it", "s", above=0)] = field(
-        default_factory=lambda: load_gait().cycle
-    )
+    cycle: Annotated[
+        float, Setting("length of a gait cycle: velocity is averaged over it", "s", above=0, of="cycle")
+    ] = field(default_factory=lambda: load_gait().cycle)
     tolerance: Annotated[
         float | None, Setting("largest mean velocity error of a success; none: not falling is enough", "m/s", above=0)
     ] = 0.1
@@ -44,7 +47,7 @@ class WalkSettings(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Commands(Episode):
+class WalkEpisode(Episode):
     commands: Array  # (changes, 3) m/s forward, m/s to the left, rad/s
 
 
@@ -53,7 +56,7 @@ class Walk(BaseTask):
     description = "walk with a commanded velocity that changes every few seconds"
     settings_type = WalkSettings
 
-    def scenario(self, rng: np.random.Generator) -> Commands:
+    def scenario(self, rng: np.random.Generator) -> WalkEpisode:
         """Draw all commands and pushes. The first push comes one interval after the start."""
         s = self.settings
         ranges = np.array([s.vx, s.vy, s.yaw_rate])
@@ -64,16 +67,21 @@ class Walk(BaseTask):
         pushes = size[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
         ticks = self.ticks(s.push_every)
         due = {(number + 1) * ticks: push for number, push in enumerate(pushes)}
-        return Commands(commands=commands, pushes=due if s.push[1] > 0.0 else {})
+        return WalkEpisode(commands=commands, pushes=due if s.push[1] > 0.0 else {})
 
-    def behaviour(self, episode: Commands) -> BaseBehaviour:
+    def behaviour(self, episode: WalkEpisode) -> BaseBehaviour:
         return FollowCommands(episode, self.ticks(self.settings.every))
 
-    def success(self, trace: Trace, episode: Episode) -> bool:
+    def criteria(self, trace: Trace, episode: Episode) -> list[Criterion]:
         """Never fallen, and the velocity followed, as far as the run was long enough for a gait cycle that counts."""
+        found = [
+            Criterion.never("fell", trace.fallen),
+            Criterion.never("ended before it began", len(trace.displacement) == 0),
+        ]
         error, tolerance = measures.velocity_error(trace, self.settings.cycle), self.settings.tolerance
-        followed = tolerance is None or not error > tolerance
-        return followed and not trace.fallen and len(trace.displacement) > 0
+        if tolerance is not None and not math.isnan(error):
+            found.append(Criterion("mean velocity error", error, "m/s", most=tolerance))
+        return found
 
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
         return {
@@ -86,7 +94,7 @@ class Walk(BaseTask):
 class FollowCommands(BaseBehaviour):
     """Asks for each command of the episode for `ticks` ticks, and for the last one from then on."""
 
-    def __init__(self, episode: Commands, ticks: int) -> None:
+    def __init__(self, episode: WalkEpisode, ticks: int) -> None:
         super().__init__(episode)
         self._ticks = ticks
 
@@ -114,7 +122,7 @@ class Survive(Walk):
     settings_type = SurviveSettings
     guided_by_velocity_alone = True
 
-    def behaviour(self, episode: Commands) -> BaseBehaviour:
+    def behaviour(self, episode: WalkEpisode) -> BaseBehaviour:
         return _ToldAtFirst(episode, self.ticks(self.settings.every), self.settings.told, self)
 
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
@@ -122,7 +130,7 @@ class Survive(Walk):
 
 
 class _ToldAtFirst(FollowCommands):
-    def __init__(self, episode: Commands, ticks: int, told: float, task: BaseTask) -> None:
+    def __init__(self, episode: WalkEpisode, ticks: int, told: float, task: BaseTask) -> None:
         """`told`: s for which a sentence says how to walk."""
         super().__init__(episode, ticks)
         self._told, self._dt, self._top = told, task.dt, task.top

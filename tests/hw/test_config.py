@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from servoid.hw.config import CONFIGS, ConfigError, load_marked, load_yaml, resolve
+from servoid.hw.config import CONFIGS, ConfigError, from_values, load_marked, load_yaml, resolve
 from servoid.hw.overrides import override
 
 
@@ -127,8 +127,37 @@ def test_missing_file_and_name_offer_the_nearest(tmp_path: Path) -> None:
         resolve("robots", tmp_path / "mien.yaml")
     with pytest.raises(ConfigError, match="unknown robot 'op4': did you mean 'op3'"):
         resolve("robots", "op4")
-    with pytest.raises(ConfigError, match=r"no such file; there is no YAML file"):
+    with pytest.raises(ConfigError, match=r"no such file; there is no YAML file .*; shipped: .*op3"):
         resolve("robots", tmp_path / "nowhere" / "x.yaml")
+
+
+def test_what_is_shipped_is_found_by_its_path_from_everywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pages name it so; an installed package is not where one works."""
+    monkeypatch.chdir(tmp_path)
+    assert resolve("policies", "configs/policies/uniphys.yaml") == CONFIGS / "policies" / "uniphys.yaml"
+    with pytest.raises(ConfigError, match=r"configs/policies/unifys\.yaml: no such file; .*shipped: .*uniphys"):
+        resolve("policies", "configs/policies/unifys.yaml")
+    own = tmp_path / "configs" / "policies" / "uniphys.yaml"
+    own.parent.mkdir(parents=True)
+    own.touch()
+    assert resolve("policies", "configs/policies/uniphys.yaml").resolve() == own
+
+
+def test_values_of_a_file_that_is_no_yaml_are_checked_alike() -> None:
+    """A log's header holds settings of long ago."""
+    values = {"name": "a", "rate": 50, "step": 1e-05}
+    assert from_values(values, Values, Path("a.mcap")) == Values("a", 50.0, 1e-05, None)
+    for wrong, said in (({"rate": "x"}, "rate: expected a number"), ({"rates": 1}, "unknown key; did you mean 'rate'")):
+        with pytest.raises(ConfigError, match=rf"a\.mcap.*{said}"):
+            from_values({**values, **wrong}, Values, Path("a.mcap"))
+
+
+@dataclass(frozen=True)
+class Values:
+    name: str
+    rate: float
+    step: float
+    most: int | None = None
 
 
 def test_marks_find_lines_inside_lists(tmp_path: Path) -> None:

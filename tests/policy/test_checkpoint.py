@@ -50,7 +50,7 @@ def fewer_joints(robot: Robot) -> Robot:
     ("change", "reason"),
     [
         (other_rate, "runs at 100"),
-        (other_order, "entry 0 is head_pan, and head_tilt is needed"),
+        (other_order, "entry 0 is head_pan, but head_tilt is needed"),
         (fewer_joints, "not known here: head_pan"),
     ],
 )
@@ -66,7 +66,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused_with_the_reason(tmp_path: Pat
 
 
 def test_another_kind_is_refused_and_another_name_of_the_robot_is_not() -> None:
-    with pytest.raises(CheckpointError, match="holds a test network, and a diffusion network is needed"):
+    with pytest.raises(CheckpointError, match="holds a test network, but a diffusion network is needed"):
         checkpoint.check(Path("net"), head(), "diffusion", ROBOT)
     checkpoint.check(Path("net"), head(), "test", replace(ROBOT, name="op3-of-mine"))
 
@@ -74,7 +74,7 @@ def test_another_kind_is_refused_and_another_name_of_the_robot_is_not() -> None:
 def test_a_layout_that_differs_is_refused() -> None:
     ours = [["gravity", 3], ["yaw", 1]]
     checkpoint.check_layout(Path("net"), "token", ours, ours)
-    with pytest.raises(CheckpointError, match=r"entry 1 is yaw\(2\), and yaw\(1\) is needed"):
+    with pytest.raises(CheckpointError, match=r"entry 1 is yaw\(2\), but yaw\(1\) is needed"):
         checkpoint.check_layout(Path("net"), "token", [["gravity", 3], ["yaw", 2]], ours)
 
 

@@ -62,9 +62,9 @@ def test_a_file_gives_the_same_network_back(tmp_path: Path) -> None:
 def test_what_does_not_fit_is_refused_with_the_reason(tmp_path: Path) -> None:
     path = tmp_path / "net.safetensors"
     saved(path)
-    with pytest.raises(CheckpointError, match="takes 7 inputs, and this program's features are 8"):
+    with pytest.raises(CheckpointError, match="takes 7 inputs, but this program's features are 8"):
         Mlp.load(path, "tracker", ROBOT, 8)
-    with pytest.raises(CheckpointError, match="holds a tracker network, and a odometry network"):
+    with pytest.raises(CheckpointError, match="holds a tracker network, but a odometry network"):
         Mlp.load(path, "odometry", ROBOT, 7)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(CheckpointError, match="truncated"):

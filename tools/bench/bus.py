@@ -1,9 +1,9 @@
-"""Time and CPU of a control cycle on the servo bus, beside the official SDK and the limit of the wire.
+"""Measure time and CPU of a control cycle on the servo bus, beside the official SDK and the limit of the wire.
 
 A cycle writes the goals of 20 servos (4 bytes), reads their current, velocity and position (10 bytes) and the board's
-block with the IMU. Servos and wire are a process of their own on a pty, so that nothing but the client is timed; it
-watches the line without sleeping, as the SDK does, so two cores must be idle. Clients take turns, a batch of cycles
-each; `wire` is what the bytes of a cycle take at the baud.
+block with the IMU. Servos and wire are a separate process on a pty, so that only the client is timed; it watches the
+line without sleeping, as the SDK does, so two cores must be idle. Clients take turns, a batch of cycles each; `wire`
+is the time that the bytes of a cycle take at the baud.
 """
 
 from __future__ import annotations
@@ -30,10 +30,14 @@ _PAUSE = 0.0002  # s between cycles, which are not timed
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--cycles", type=int, default=1250, metavar="N", help="of each client, mode and baud (default: %(default)s)"
+        "--cycles",
+        type=int,
+        default=1250,
+        metavar="N",
+        help="cycles of each client, mode and baud (default: %(default)s)",
     )
     parser.add_argument(
-        "--baud", type=int, action="append", metavar="BPS", help="instead of 1, 2, 3 and 4 Mbit/s; can be repeated"
+        "--baud", type=int, action="append", metavar="BPS", help="baud; may be repeated (default: 1, 2, 3 and 4 Mbit/s)"
     )
     add_json_argument(parser)
 
@@ -41,11 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         if args.cycles < 1:
-            raise ConfigError(f"--cycles {args.cycles}: give a number from 1 on")
+            raise ConfigError(f"--cycles must be at least 1, not {args.cycles}")
         bauds = tuple(args.baud or BAUDS)
         for baud in bauds:
             if baud not in BAUDS:
-                raise ConfigError(f"--baud {baud}: the official SDK goes at {', '.join(map(str, BAUDS))} here")
+                raise ConfigError(f"--baud {baud}: here the official SDK runs at {', '.join(map(str, BAUDS))}")
         rows = measure(report, bauds, args.cycles)
         report.table(COLUMNS, [[_cell(row[key]) for key in COLUMNS] for row in rows])
         report.result({"cycles": args.cycles, "servos": SERVOS, "rows": rows})
@@ -73,7 +77,7 @@ def measure(report: Report, bauds: tuple[int, ...], cycles: int) -> list[dict[st
             for mode in ("sync", "fast"):
                 limit = wire_ms(mode, baud)
                 rows += [runs[name, mode].row(name, mode, baud, limit) for name in CLIENTS]
-                rows.append(_row("wire", mode, baud, limit, limit, 0.0, 0, limit))
+                rows.append(_row("wire", mode, baud, limit, limit, 0.0, 0, 1.0))
             report.line(f"{baud} bit/s: {len(runs)} x {cycles} cycles")
     return rows
 
@@ -115,12 +119,13 @@ class ClientTimes:
         import numpy as np
 
         median, p99 = (float(value) * 1e-6 for value in np.percentile(self.wall, (50, 99)))
-        return _row(client, mode, baud, median, p99, float(np.mean(self.cpu)) * 1e-3, self.failed, limit_ms)
+        cpu = float(np.mean(self.cpu)) * 1e-3
+        return _row(client, mode, baud, median, p99, cpu, self.failed, median / limit_ms)
 
 
 def wire_ms(mode: str, baud: int) -> float:
     """Time that the bytes of a cycle take on a wire, without any pause between them."""
-    from servoid.hw.dynamixel.transport.bus import BITS
+    from servoid.hw.dynamixel.protocol.codec import FRAME_BITS
     from servoid.hw.dynamixel.transport.group_read import GroupRead
     from servoid.tools.bench.bus_clients import BOARD, BOARD_BYTES, GOAL_BYTES, PRESENT, PRESENT_BYTES
 
@@ -128,7 +133,7 @@ def wire_ms(mode: str, baud: int) -> float:
     board = GroupRead([(BOARD_ID, BOARD, BOARD_BYTES)]).request_all()
     goals = 14 + SERVOS * (1 + GOAL_BYTES)
     count = goals + sum(len(request.packet) + request.answer for request in (present, board))
-    return 1e3 * BITS * count / baud
+    return 1e3 * FRAME_BITS * count / baud
 
 
 @contextmanager
@@ -149,10 +154,7 @@ def responder() -> Iterator[str]:
         process.stdout.close()
 
 
-def _row(
-    client: str, mode: str, baud: int, median: float, p99: float, cpu: float, failed: int, limit: float
-) -> dict[str, Any]:
-    values = (client, mode, baud, median, p99, cpu, failed, median / limit)
+def _row(*values: Any) -> dict[str, Any]:
     return dict(zip(COLUMNS, values, strict=True))
 
 

@@ -1,7 +1,7 @@
-"""What other people's clients do, against the virtual rig: every verb of theirs, and whether the rig answers as servos.
+"""Check other people's clients against the virtual rig: whether it answers each of their verbs as servos do.
 
-The verbs go through the official SDK, as those clients do, in the rig's own time: the result does not depend on how
-busy this machine is. Nothing of the clients' code is used.
+The verbs go through the official SDK, as in those clients, and in the rig's own time, so the result does not depend on
+how busy this machine is. None of the clients' code is used.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from servoid.tools.common.output import Report, add_json_argument, reporting
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--client", action="append", metavar="NAME", help="only this one; can be repeated")
+    parser.add_argument("--client", action="append", metavar="NAME", help="only this client; may be repeated")
     add_json_argument(parser)
 
 

@@ -1,4 +1,4 @@
-"""Lateness of the control loop on this machine: the real loop in real time, the gait walking in simulation."""
+"""Measure how late the control loop is on this machine: the real loop in real time, the gait walking in simulation."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import argparse
 from servoid.hw.robot.description import load_robot
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, run
-from servoid.tools.commands.run import positive
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import add_json_argument, reporting
+from servoid.tools.common.parser import positive
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seconds", type=positive, default=20.0, metavar="S", help="how long (default: 20)")
+    parser.add_argument("--seconds", type=positive, default=20.0, metavar="S", help="length of the walk (default: 20)")
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     add_json_argument(parser)
 

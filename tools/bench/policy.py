@@ -1,4 +1,4 @@
-"""`servoid bench policy`: how long the diffusion policy takes for a plan, on one thread, by engine and runtime."""
+"""Time the plans of the diffusion policy on one thread, by engine and runtime."""
 
 from __future__ import annotations
 
@@ -44,22 +44,31 @@ COLUMNS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid bench policy`."""
-    parser.add_argument("--checkpoint", help=f"name or file; '{RANDOM}': weights made up (default: the shipped one)")
-    parser.add_argument("--robot", default="op3", help="robot name or file (default op3)")
-    parser.add_argument("--plans", type=int, default=100, help="plans to time for each row (default 100)")
-    parser.add_argument("--width", type=int, default=192, help="width of made-up weights (default 192)")
-    parser.add_argument("--layers", type=int, default=2, help="layers of made-up weights (default 2)")
+    parser.add_argument(
+        "--checkpoint", metavar="NAME|FILE", help=f"checkpoint; '{RANDOM}': random weights (default: the shipped one)"
+    )
+    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
+    parser.add_argument("--plans", type=int, default=100, metavar="N", help="plans to time for each row (default: 100)")
+    parser.add_argument(
+        "--width", type=int, default=192, metavar="N", help="width of a network with random weights (default: 192)"
+    )
+    parser.add_argument(
+        "--layers", type=int, default=2, metavar="N", help="layers of a network with random weights (default: 2)"
+    )
     parser.add_argument(
         "--shape",
         default=PAPER_SHAPE,
         metavar="PAST,STATES,ACTIONS",
-        help="window of a second network, as wide and deep as the checkpoint's, its weights made up: states up to the "
+        help="window of a second network, as wide and deep as the checkpoint's, with random weights: states up to the "
         f"present, states to come, actions to come; '{NONE}': no second network (default {PAPER_SHAPE})",
     )
     parser.add_argument(
-        "--engine", action="append", metavar="NAME", help="only this engine; may be repeated (default: all installed)"
+        "--engine",
+        action="append",
+        metavar="NAME",
+        help="only this engine; may be repeated (default: all that are installed)",
     )
-    parser.add_argument("--runtime", choices=RUNTIMES, help="only this one (default: both)")
+    parser.add_argument("--runtime", choices=RUNTIMES, help="only this runtime (default: both)")
     add_json_argument(parser)
 
 
@@ -101,9 +110,9 @@ def _run(args: argparse.Namespace, report: Report) -> None:
             except ConfigError as error:
                 skipped[f"{network.name}: {engine}"] = str(error)
                 continue
-            call_ms = _call_times(loaded, network.model, args.plans)
+            timed = _Timed(engine, loaded, _call_times(loaded, network.model, args.plans))
             for runtime, settings in runtimes.items():
-                rows += _time(network, engine, loaded, runtime, settings, robot, args.plans, call_ms)
+                rows += _time(network, timed, runtime, settings, robot, args.plans)
     peak = peak_gflops()
     for row in rows:
         row["peak_gflops"] = peak
@@ -130,20 +139,19 @@ def due_ms(settings: DiffusionSettings, dt: float) -> float:
     return 1000 * (settings.delay or settings.execution_horizon) * dt
 
 
-def _time(
-    network: Network,
-    engine: str,
-    loaded: Engine,
-    runtime: str,
-    settings: DiffusionSettings,
-    robot: Robot,
-    plans: int,
-    call_ms: list[float],
-) -> list[dict[str, Any]]:
-    """Rows of one engine and runtime: unguided, and guided by each kind of gradient that the engine has.
+@dataclass(frozen=True)
+class _Timed:
+    """An engine with the times of single calls, which are the same in all of its rows."""
 
-    `call_ms` are times of single calls, which are the same in all of them.
-    """
+    name: str
+    engine: Engine
+    call_ms: list[float]
+
+
+def _time(
+    network: Network, timed: _Timed, runtime: str, settings: DiffusionSettings, robot: Robot, plans: int
+) -> list[dict[str, Any]]:
+    """Rows of one engine and runtime: unguided, and guided by each kind of gradient that the engine has."""
     from servoid.policy.diffusion.engines import REFERENCE
     from servoid.policy.diffusion.runtime import Runtime
     from servoid.stack.tasks import load_task
@@ -151,31 +159,31 @@ def _time(
     cost = load_task("walk", dt=robot.dt).objective
     request = _request(robot, network.model, settings.delay)
     rows = []
-    for gradient in (NONE, "analytic", "network") if engine == REFERENCE else (NONE, "analytic"):
+    for gradient in (NONE, "analytic", "network") if timed.name == REFERENCE else (NONE, "analytic"):
         guided = gradient != NONE
         guidance = replace(settings.guidance, gradient=gradient if guided else "analytic")
         guidance = replace(guidance, weight=guidance.weight or 1.0)  # timed even where it is switched off
-        chosen = replace(settings, engine=engine, guidance=guidance)
-        planner = Runtime(network.model, chosen, robot, cost if guided else None, loaded)
+        chosen = replace(settings, engine=timed.name, guidance=guidance)
+        planner = Runtime(network.model, chosen, robot, cost if guided else None, timed.engine)
         plan_ms, cpu_ms = _plan_times(planner, request, plans)
         rows.append(
             {
                 "network": network.name,
-                "engine": engine,
+                "engine": timed.name,
                 "runtime": runtime,
                 "guided": guided,
                 "gradient": gradient,
                 "parameters": network.model.denoiser.parameter_count,
                 "tokens": network.model.config.tokens,
                 "calls_per_plan": planner.matrix.calls,
-                "call_median_ms": float(np.median(call_ms)),
-                "call_p99_ms": float(np.percentile(call_ms, 99)),
+                "call_median_ms": float(np.median(timed.call_ms)),
+                "call_p99_ms": float(np.percentile(timed.call_ms, 99)),
                 "plan_median_ms": float(np.median(plan_ms)),
                 "plan_p99_ms": float(np.percentile(plan_ms, 99)),
                 "plan_cpu_ms": float(np.median(cpu_ms)),
                 "plans_per_s": 1000 / float(np.median(plan_ms)),
                 "plan_due_ms": due_ms(settings, robot.dt),
-                "gflops": network.gflop / (float(np.median(call_ms)) / 1000),
+                "gflops": network.gflop / (float(np.median(timed.call_ms)) / 1000),
             }
         )
     return rows

@@ -18,8 +18,7 @@ import sys
 import time
 
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import Instruction
-from servoid.hw.dynamixel.transport.bus import BITS
+from servoid.hw.dynamixel.protocol.codec import FRAME_BITS, InstructionCode
 from servoid.sim.rig.process.pty import Pty
 from servoid.stack.runtime.realtime import undisturbed
 
@@ -77,17 +76,17 @@ class Responder:
         return seen
 
     def _execute(self, packet: bytes, now: int) -> None:
-        byte_ns = BITS * 1e9 / self.pty.baud
+        byte_ns = FRAME_BITS * 1e9 / self.pty.baud
         _, id, _, instruction = _HEAD.unpack_from(packet)
         params = packet[8:-2]
         self._free_ns = max(self._free_ns, now) + round(len(packet) * byte_ns)
-        if instruction == Instruction.SYNC_WRITE:
+        if instruction == InstructionCode.SYNC_WRITE:
             for at in range(4, len(params), 5):
                 self._goals[params[at]] = int.from_bytes(params[at + 1 : at + 5], "little", signed=True)
             return
-        if instruction == Instruction.READ:
+        if instruction == InstructionCode.READ:
             answer = codec.status(id, 0, bytes(int.from_bytes(params[2:4], "little")))
-        elif instruction == Instruction.SYNC_READ:
+        elif instruction == InstructionCode.SYNC_READ:
             answer = b"".join(codec.status(id, 0, self._present(id)) for id in params[4:])
         else:
             answer = codec.fast_status([(id, 0, self._present(id)) for id in params[4:]])

@@ -1,7 +1,7 @@
-"""Speed of the batched training world beside stepping the same model raw, in turn in one run, on all cores.
+"""Compare the speed of the batched training world with raw MuJoCo, in turn in one run, on all cores.
 
 The training world is all that the learner waits for: physics, sensors, estimator, reference, limits, rewards, resets.
-Raw is MuJoCo's batch alone, from the same states and controls.
+Raw is MuJoCo's own batch, from the same states and controls.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from servoid.tools.common.output import add_json_argument, reporting
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
-    parser.add_argument("--worlds", type=int, default=512, help="(default: %(default)s)")
-    parser.add_argument("--ticks", type=int, default=100, help="measured (default: %(default)s)")
+    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
+    parser.add_argument(
+        "--worlds", type=int, default=512, metavar="N", help="robots side by side (default: %(default)s)"
+    )
+    parser.add_argument("--ticks", type=int, default=100, metavar="N", help="ticks to time (default: %(default)s)")
     add_json_argument(parser)
 
 

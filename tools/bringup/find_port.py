@@ -15,9 +15,9 @@ from dataclasses import asdict
 from servoid.hw.contracts.body import BackendError
 from servoid.tools.bringup.line import VIRTUAL, add_line_arguments
 from servoid.tools.bringup.ports import PortInfo, usb_ports
-from servoid.tools.commands.run import positive
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, reporting
+from servoid.tools.common.parser import positive
 
 PATIENCE = 60.0  # s
 _POLL = 0.2  # s

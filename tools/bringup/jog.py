@@ -106,7 +106,9 @@ def _jog(
     for event in events:
         if event.kind not in ("phase", "task"):
             report.line(event.text)
-    report.line(f"{args.joint} went from {shown.low - here[i]:+.3f} to {shown.high - here[i]:+.3f} rad; torque is off")
+    report.line(
+        f"{args.joint} was at {here[i]:+.3f} rad and went from {shown.low:+.3f} to {shown.high:+.3f}; torque is off"
+    )
     return {
         "joint": args.joint,
         "start": float(here[i]),

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import io
+import shutil
 import sys
 from collections import deque
 from contextlib import ExitStack, suppress
@@ -14,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from servoid.hw.robot.description import Robot
 from servoid.tools.bringup.line import Line, add_line_arguments, assembled, is_virtual, open_line
-from servoid.tools.commands.run import positive
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, reporting
+from servoid.tools.common.parser import positive
 
 if TYPE_CHECKING:
     from servoid.hw.contracts.body import Observation
@@ -107,19 +109,27 @@ class Watched:
         if self._newest is None:
             return
         rows = [tuple(row.values()) for row in self._rows()]
-        if redraw and self._drawn:
-            report.line(f"\x1b[{self._drawn + 1}F\x1b[J")
         head = ("joint", "ID", "angle", "supply", "lowest", "heat", "hottest", "effort", "state")
-        shown = [(*row[:2], *map(_text, row[2:8], _UNITS), row[8]) for row in rows]
-        report.table(head, shown)
-        report.line(self._imu())
+        text = io.StringIO()
+        Report(False, text).table(head, [(*row[:2], *map(_text, row[2:8], _UNITS), row[8]) for row in rows])
         bus = self._statistics()
-        report.line(
-            f"bus: {bus['reads']} reads, median {bus['read_ms_p50']:.2f} ms, p99 {bus['read_ms_p99']:.2f} ms; "
-            f"{bus['lost']} answers lost, {bus['recovered']} of them recovered, {bus['bad_crc']} damaged, "
-            f"{bus['refused']} refused, {bus['conflicts']} conflicts"
-        )
-        self._drawn = len(rows) + 3
+        below = [
+            self._imu(),
+            f"bus: {bus['reads']} reads, median {bus['read_ms_p50']:.2f} ms, p99 {bus['read_ms_p99']:.2f} ms",
+            f"     lost {bus['lost']}, recovered {bus['recovered']}, damaged {bus['bad_crc']}, "
+            f"refused {bus['refused']}, conflicts {bus['conflicts']}",
+        ]
+        title, *table = text.getvalue().splitlines()
+        if redraw:
+            size = shutil.get_terminal_size()
+            wrong = [row[8] != "ok" for row in rows]
+            table = fitted(table, wrong, size.lines - len(below) - 2)
+            lines = [line[: size.columns - 1] for line in (title, *table, *below)]
+            report.line((f"\x1b[{self._drawn}F\x1b[J" if self._drawn else "") + "\n".join(lines))
+            self._drawn = len(lines)
+        else:
+            for line in (title, *table, *below):
+                report.line(line)
 
     def summary(self) -> dict[str, Any]:
         """The newest values and the bus's statistics, as JSON values."""
@@ -177,6 +187,16 @@ class Watched:
         values: dict[str, Any] = {name: getattr(now, name) - getattr(before, name) for name in _names(now)}
         p50, p99 = np.percentile(list(self._times) or [0.0], [50, 99])
         return {"reads": self._reads, "read_ms_p50": float(p50), "read_ms_p99": float(p99)} | values
+
+
+def fitted(rows: list[str], wrong: list[bool], room: int) -> list[str]:
+    """The rows that fit into so many lines, in their order: those of servos with something wrong before all others."""
+    if len(rows) <= room:
+        return rows
+    ranked = sorted(range(len(rows)), key=lambda i: not wrong[i])[: max(room - 1, 0)]
+    left = [wrong[i] for i in range(len(rows)) if i not in ranked]
+    note = f"... {len(left)} more, {'all ok' if not any(left) else f'{sum(left)} of them not ok'}: enlarge the window"
+    return [*(rows[i] for i in sorted(ranked)), note]
 
 
 _UNITS = (("rad", 3), ("V", 1), ("V", 1), ("C", 0), ("C", 0), ("N m", 2))

@@ -1,8 +1,8 @@
-"""Measure a policy the way that papers do, and print its figures beside theirs.
+"""Measure a policy as papers do, and print its figures beside theirs.
 
-EVALUATION is `papers`, the tables of UniPhys and Diffuse-CLoC, or a YAML file of your own. Episodes that were done are
-kept under --out and not repeated, as long as checkpoint, settings, task and code are the same: an evaluation that was
-interrupted goes on where it was. docs/evaluation.md says what each row means, and how to write an evaluation.
+EVALUATION is `papers`, the tables of UniPhys and Diffuse-CLoC, or your own YAML file. Finished episodes are kept under
+--out and not repeated while checkpoint, settings, task and code are the same, so an interrupted evaluation continues
+where it stopped. docs/evaluation.md explains every row, and how to write an evaluation.
 """
 
 from __future__ import annotations
@@ -28,27 +28,36 @@ QUICK_MINUTES = 9.0  # one more is for the start and for drawing
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     names = ", ".join(available("evaluation"))
-    parser.add_argument("evaluation", metavar="EVALUATION", help=f"{names}, or a YAML file of your own")
-    parser.add_argument("--quick", action="store_true", help="few episodes of the main rows, in under 10 minutes")
+    parser.add_argument("evaluation", metavar="EVALUATION", help=f"{names}, or your own YAML file")
+    parser.add_argument("--quick", action="store_true", help="only the main rows and few episodes, in under 10 minutes")
     parser.add_argument(
         "--rows",
         nargs="+",
         default=[],
         metavar="NAME",
-        help="only these; patterns such as 'uniphys/goal-*' or '*@virtual'",
+        help="only these rows; patterns such as 'uniphys/goal-*' or '*@virtual'",
     )
-    parser.add_argument("--list", action="store_true", help="list the names of the rows, and do nothing")
-    parser.add_argument("--policy", default="diffusion", help="name or file as in `run` (default: %(default)s)")
-    parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
-    parser.add_argument("--out", type=Path, help="folder (default: runs/EVALUATION)")
-    parser.add_argument("--workers", type=int, default=0, help="processes (default: one a core)")
-    parser.add_argument("--episodes", type=int, help="episodes of each row (default: its own number, 100 for most)")
-    parser.add_argument("--seconds", type=float, help="end each episode then, for a try: figures mean little")
+    parser.add_argument("--list", action="store_true", help="list the names of the rows and stop")
     parser.add_argument(
-        "--minutes", type=float, help="stop after so many; the same command goes on. 0: print what was done"
+        "--policy", default="diffusion", metavar="POLICY", help="controller, as in `servoid run` (default: diffusion)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="random seed (default: %(default)s)")
-    parser.add_argument("--fresh", action="store_true", help="do all episodes anew")
+    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (default: runs/EVALUATION)")
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: one per core)")
+    parser.add_argument(
+        "--episodes", type=int, metavar="N", help="episodes of each row (default: the row's own, mostly 100)"
+    )
+    parser.add_argument(
+        "--seconds", type=float, metavar="S", help="cut each episode short, to try it out: the figures mean little"
+    )
+    parser.add_argument(
+        "--minutes",
+        type=float,
+        metavar="M",
+        help="time limit; the same command continues; 0: print what is done so far",
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument("--fresh", action="store_true", help="repeat all episodes")
     add_json_argument(parser)
 
 
@@ -101,13 +110,13 @@ def options_of(args: argparse.Namespace, evaluation: Evaluation) -> Options:
 def _check(args: argparse.Namespace) -> None:
     for name, value in (("episodes", args.episodes), ("seconds", args.seconds)):
         if value is not None and value <= 0:
-            raise ConfigError(f"--{name}: must be positive, not {value:g}")
+            raise ConfigError(f"--{name} must be positive, not {value:g}")
     if args.minutes is not None and args.minutes < 0:
-        raise ConfigError(f"--minutes: must not be negative, not {args.minutes:g}")
+        raise ConfigError(f"--minutes must not be negative, not {args.minutes:g}")
     if args.minutes == 0 and args.fresh:
-        raise ConfigError("--fresh forgets what --minutes 0 would tell: leave out one of them")
+        raise ConfigError("--fresh discards what --minutes 0 would print: drop one of them")
     if args.workers < 0:
-        raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
+        raise ConfigError(f"--workers must not be negative, not {args.workers}; 0 is one per core")
     check_seed(args.seed)
 
 

@@ -1,8 +1,8 @@
-"""Write a flight log as tables: one of ticks, a column a number, and one of events.
+"""Write a flight log as two tables: ticks, with one column per number, and events.
 
-They are called after the log (demo.mcap: demo-ticks.csv, demo-events.csv) and put beside it, or into --out. Columns
+They are named after the log (demo.mcap: demo-ticks.csv, demo-events.csv) and written beside it, or to --out. Columns
 are named by channel, field and joint, axis or foot: observation.position.l_knee. What was not measured is empty.
-docs/files.md says what each field is.
+docs/files.md explains each field.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ Columns = dict[str, Array]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", type=Path, help="flight log (.mcap)")
+    parser.add_argument("log", type=Path, metavar="LOG", help="flight log (.mcap)")
     kind = parser.add_mutually_exclusive_group(required=True)
     kind.add_argument("--csv", action="store_true", help="comma-separated text")
     kind.add_argument("--parquet", action="store_true", help="Apache Parquet; needs the 'train' extra")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write into (default: that of the log)")
-    parser.add_argument("--replace", action="store_true", help="overwrite tables that are there")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write into (default: the log's)")
+    parser.add_argument("--replace", action="store_true", help="overwrite existing tables")
     add_json_argument(parser)
 
 
@@ -49,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
         paths = {name: folder / f"{args.log.stem}-{name}{suffix}" for name in ("ticks", "events")}
         for path in paths.values():
             if path.exists() and not args.replace:
-                raise ConfigError(f"{path}: exists already: give --replace, or another folder with --out")
+                raise ConfigError(f"{path}: already exists: use --replace, or choose another folder with --out")
         tables = {"ticks": ticks_table(log), "events": events_table(log)}
         rows = {name: len(next(iter(table.values()))) for name, table in tables.items()}
         try:

@@ -1,7 +1,8 @@
 """Repeat a recorded simulated run and say whether it comes out identical.
 
 Runs the log's configuration and seed again, without its observations, and compares every observation, state, command,
-plan and event bit by bit. Exit code 0: identical; 1: it differs, and the first difference is named.
+plan and event bit by bit. A planner has the settings that the log holds, whatever became of the file that they were in.
+Exit code 0: identical; 1: it differs, and the first difference is named.
 """
 
 from __future__ import annotations
@@ -9,11 +10,12 @@ from __future__ import annotations
 import argparse
 from bisect import bisect_right
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from servoid.hw.config import ConfigError
+from servoid.hw.config import ConfigError, from_values
 from servoid.stack.log.flightlog import FlightLog, read_log
 from servoid.stack.log.format import MACHINE_DEPENDENT, event_message, messages, plain
 from servoid.stack.log.tick import TickRecord
@@ -22,14 +24,17 @@ from servoid.stack.runtime.phases import DONE
 from servoid.stack.runtime.run import RunSettings, Script, run
 from servoid.stack.safety.event import Event
 from servoid.tools.common import exit_codes
-from servoid.tools.common.flightpath import got_up
 from servoid.tools.common.output import add_json_argument, reporting
+from servoid.tools.common.pictures.flightpath import got_up
+
+if TYPE_CHECKING:
+    from servoid.policy.diffusion.settings import DiffusionSettings
 
 Tick = dict[str, list[dict[str, Any]]]  # channel -> its messages of one tick
 
 
 @dataclass(frozen=True)
-class Difference:
+class Divergence:
     tick: int
     channel: str
     field: str
@@ -44,12 +49,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
     with reporting(args.json) as report:
         log = read_log(args.log)
         changed = changes(log)
         for text in changed:
             report.line(f"not as it was recorded: {text}")
-        ticks, difference = replay(log)
+        with tqdm(total=_ticks(log), unit="tick", disable=None) as bar:
+            ticks, difference = replay(log, bar.update)
         if difference is None:
             report.line(f"identical over {ticks} ticks" + ("" if log.complete else ", as far as the log goes"))
         else:
@@ -66,8 +74,11 @@ def main(args: argparse.Namespace) -> int:
     return exit_codes.DONE if difference is None else exit_codes.FAILED
 
 
-def replay(log: FlightLog) -> tuple[int, Difference | None]:
-    """Repeat a log's run: how many ticks were compared, and the first difference. Raises ConfigError."""
+def replay(log: FlightLog, done: Callable[[], object] = lambda: None) -> tuple[int, Divergence | None]:
+    """Repeat a log's run: how many ticks were compared, and the first difference. `done` hears of each tick.
+
+    Raises ConfigError.
+    """
     settings = _settings(log)
     body = log.header["backend"]
     if body not in BACKENDS or not BACKENDS[body].simulated:
@@ -82,13 +93,15 @@ def replay(log: FlightLog) -> tuple[int, Difference | None]:
     repeated: dict[int, Tick] = defaultdict(lambda: defaultdict(list))
 
     def compare(record: TickRecord) -> None:
+        done()
         for channel, message in messages(record):
             if channel != "/event":
                 repeated[record.tick][channel].append(plain(message))
 
     velocities = log.column("/instruction", "velocity").reshape(-1, 3)
     ended = any(event["kind"] == "task" and event["text"] == DONE for event in log.messages["/event"])
-    result = run(settings, on_tick=compare, script=Script(tuple(stops), plans, velocities, ended))
+    script = Script(tuple(stops), plans, velocities, ended, _planner(log))
+    result = run(settings, on_tick=compare, script=script)
     for event in result.events:  # of their own ticks, as in the log: what befalls other robots comes between two
         repeated[event.tick]["/event"].append(plain(event_message(event)))
     for number in sorted(recorded.keys() | (repeated.keys() if log.complete else set())):
@@ -110,20 +123,25 @@ def _plans(log: FlightLog) -> list[dict[int, int]]:
 def changes(log: FlightLog) -> list[str]:
     """What is not as it was when the log was written: robot, policy, task, packages, source; as far as the log says."""
     from servoid.hw.robot.description import load_robot
-    from servoid.policy.checkpoint import git_commit
-    from servoid.policy.diffusion.settings import with_new_names
+    from servoid.policy.checkpoint import git_commit, resolve
     from servoid.stack.control.get_up import fingerprints
     from servoid.stack.control.policies import policy_fingerprint
-    from servoid.stack.log.provenance import fingerprint, versions
+    from servoid.stack.log.provenance import fingerprint, sha256, versions
 
     settings = _settings(log)
-    policy, recorded = policy_fingerprint(settings.policy), dict(log.header["policy"])
+    robot = load_robot(settings.robot)
+    planner, header = _planner(log), {**log.header, **_part("policy", log.header["policy"])}
+    try:
+        policy = policy_fingerprint(settings.policy, robot.gait)
+    except ConfigError:
+        if planner is None:
+            raise
+        policy = policy_fingerprint("diffusion") | {"planner": None}  # the file is gone
+    if planner is not None:  # whatever the file says today
+        policy["checkpoint_sha256"] = sha256(resolve(planner.checkpoint))
     policy["name"] = log.header["settings"]["policy"]  # as it was typed
-    if recorded.get("planner"):
-        recorded["planner"] = with_new_names(recorded["planner"])
-    header = {**log.header, **_part("policy", recorded)}
-    now = fingerprint(load_robot(settings.robot)) | _part("policy", policy)
-    now["recovery"] = fingerprints(load_robot(settings.robot)) if settings.recover else None
+    now = fingerprint(robot) | _part("policy", policy)
+    now["recovery"] = fingerprints(robot) if settings.recover else None
     now |= _task(settings) | {"versions": versions(), "git_commit": git_commit()}
     names = {
         "robot": "the robot's file",
@@ -132,7 +150,7 @@ def changes(log: FlightLog) -> list[str]:
         "policy.name": "the policy",
         "policy.checkpoint_sha256": "the policy's checkpoint",
         "policy.odometry_sha256": "the odometry's checkpoint",
-        "policy.planner": "the planner's settings",
+        "policy.planner": "the file of the planner's settings (those of the log are used)",
         "policy.gait": "the gait's settings",
         "task": "the task's settings",
         "task_files": "a file that the task's settings name",
@@ -145,19 +163,29 @@ def changes(log: FlightLog) -> list[str]:
     return [text for key, text in names.items() if key in header and header[key] != now[key]]
 
 
+def _planner(log: FlightLog) -> DiffusionSettings | None:
+    """What the run's planner was set to; None for another policy, and in old logs, which do not say. Raises
+    ConfigError."""
+    from servoid.policy.diffusion.settings import DiffusionSettings
+
+    recorded = log.header["policy"].get("planner")
+    return None if recorded is None else from_values(recorded, DiffusionSettings, log.path)
+
+
 def _part(name: str, values: dict[str, Any]) -> dict[str, Any]:
     return {f"{name}.{key}": value for key, value in values.items()}
 
 
 def _task(settings: RunSettings) -> dict[str, Any]:
     """The task as a log's header has it, by the files of today."""
+    from servoid.hw.robot.description import load_robot
     from servoid.stack.log.provenance import described, files
     from servoid.stack.tasks import find, load_settings, source
 
     chosen = dict(settings.set)
     if settings.seconds is not None:
         chosen["seconds"] = repr(settings.seconds)
-    task = load_settings(settings.task, chosen)
+    task = load_settings(settings.task, chosen, load_robot(settings.robot))
     named = {"name": find(settings.task).name} | described(task)
     return {"task": named, "task_files": files(task), "task_source": source(settings.task)}
 
@@ -172,6 +200,10 @@ def _settings(log: FlightLog) -> RunSettings:
     return RunSettings(**(values | {"record": None, "realtime": False}))
 
 
+def _ticks(log: FlightLog) -> int:
+    return len(log.messages["/timing"])
+
+
 def _by_tick(log: FlightLog) -> dict[int, Tick]:
     ticks: dict[int, Tick] = defaultdict(lambda: defaultdict(list))
     for channel, channel_messages in log.messages.items():
@@ -182,17 +214,17 @@ def _by_tick(log: FlightLog) -> dict[int, Tick]:
     return ticks
 
 
-def _difference(number: int, recorded: Tick | None, repeated: Tick | None) -> Difference | None:
+def _difference(number: int, recorded: Tick | None, repeated: Tick | None) -> Divergence | None:
     if recorded is None or repeated is None:
-        return Difference(number, "/run", "length: " + ("the repetition is longer" if repeated else "it ended earlier"))
+        return Divergence(number, "/run", "length: " + ("the repetition is longer" if repeated else "it ended earlier"))
     compared = [name for name in recorded.keys() | repeated.keys() if MACHINE_DEPENDENT.get(name, ()) is not None]
     for channel in sorted(compared):
         before, after = recorded.get(channel, []), repeated.get(channel, [])
         if len(before) != len(after):
-            return Difference(number, channel, f"{len(before)} messages, now {len(after)}")
+            return Divergence(number, channel, f"{len(before)} messages, now {len(after)}")
         ignored = MACHINE_DEPENDENT.get(channel) or ()
         for old, new in zip(before, after, strict=True):
             for field in sorted(old.keys() | new.keys()):
                 if field not in ignored and old.get(field) != new.get(field):
-                    return Difference(number, channel, field)
+                    return Divergence(number, channel, field)
     return None

@@ -1,68 +1,111 @@
 """Run a task many times in simulation and judge it by the truth.
 
 Every episode is a `servoid run` of its own, with its own random stream: results do not depend on the number of workers,
-and any episode can be repeated with `servoid run TASK --seed S`. An episode that cannot be done ends the rollout with
-its error, after the figures of those that were.
+and any episode can be repeated with `servoid run TASK --seed S`. Several policies (`--policy expert --policy gait`, or
+`--policy expert,gait`) do the same episodes; the difference of each to the first is told with its 95 % interval, paired
+by seed.
+
+With --out, every episode is kept as it is done, a line of JSON each, and the same command goes on where it was. After
+Ctrl-C, or an episode that cannot be done, the figures of those that were are told.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
-from servoid.tools.common.confidence import wilson
+from servoid.tools.common.compare import difference_table, differences, summarise, table
 from servoid.tools.common.exit_codes import exit_code, explain
-from servoid.tools.common.output import add_json_argument, reporting
-from servoid.tools.common.parser import add_gain_argument, add_recover_argument, add_set_argument, check_seed, settings
+from servoid.tools.common.folder_lock import locked
+from servoid.tools.common.output import Report, add_json_argument, reporting
+from servoid.tools.common.parser import (
+    add_gain_argument,
+    add_recover_argument,
+    add_set_argument,
+    check_seed,
+    out_of_reach,
+    positive,
+    settings,
+)
 from servoid.tools.common.worker_pool import each
+from servoid.tools.evaluate.cache import EpisodeCache, depends_on, key
+from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult
+from servoid.tools.evaluate.judge import judge
+from servoid.tools.evaluate.progress import EpisodeBar, Forecast
 
 if TYPE_CHECKING:
     from servoid.stack.runtime.run import RunSettings
 
+Rows = dict[int, dict[str, Any]]  # of a policy's episodes, by their numbers
+Work = Callable[[EpisodeJob], EpisodeResult]
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", metavar="TASK", help="a name (servoid tasks), or FILE.py:Class")
-    parser.add_argument("--episodes", type=int, default=50, help="(default: %(default)s)")
-    parser.add_argument("--workers", type=int, default=0, help="processes (default: one a core)")
+    parser.add_argument("--episodes", type=int, default=50, metavar="N", help="of each policy (default: %(default)s)")
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: one a core)")
     parser.add_argument("--backend", default="sim", help="sim or virtual (default: %(default)s)")
-    parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
+    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: %(default)s)")
     parser.add_argument(
-        "--policy", default="diffusion", help="diffusion (default), expert, gait, or a file as in `run`"
+        "--policy",
+        action="append",
+        metavar="NAME|FILE",
+        help="as in `run` (default: diffusion); may be given again, to compare",
     )
     parser.add_argument("--randomise", action="store_true", help="draw the robot anew for each episode")
-    parser.add_argument("--seconds", type=float, help="instead of the task's own")
-    parser.add_argument("--seed", type=int, default=0, help="of the first episode's stream (default: %(default)s)")
+    parser.add_argument("--seconds", type=positive, metavar="S", help="length of the task instead of its own")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: %(default)s)")
     add_set_argument(parser)
     add_gain_argument(parser)
     add_recover_argument(parser)
+    parser.add_argument("--out", type=Path, metavar="DIR", help="keep every episode there, and go on where it was")
+    parser.add_argument("--fresh", action="store_true", help="with --out: do all episodes anew")
     add_json_argument(parser)
 
 
-def main(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace, work: Work | None = None) -> int:
+    """`work` does an episode. Raises ConfigError, and what ended an episode, after the figures of the others."""
     with reporting(args.json) as report:
+        names = policies(args.policy)
         _check(args)
+        for text in out_of_reach(args):
+            report.line(text)
         begun = time.monotonic()
-        rows: dict[int, dict[str, Any]] = {}
-        failure: Exception | None = None
-        try:
-            for episode, row in run_all(args, settings(args)):
-                rows[episode] = row
-        except Exception as error:
-            if not rows:
-                raise
-            failure = error  # raised below, when what was done is told
-        summary = summarise(args, [rows[episode] for episode in sorted(rows)], time.monotonic() - begun)
+        failure: BaseException | None = None
+        with nullcontext() if args.out is None else locked(args.out):
+            plan = [_prepare(args, name) for name in names]
+            try:
+                _run_all(plan, args, work or _do)
+            except (Exception, KeyboardInterrupt) as error:
+                if not any(one.rows for one in plan):
+                    raise
+                failure = error  # raised below, when what was done is told
+        if isinstance(failure, KeyboardInterrupt) and args.out is not None:
+            failure = KeyboardInterrupt("interrupted: what was done is kept; the same command goes on")
+        result = _tell(report, args, plan) | {"wall_seconds": time.monotonic() - begun}
         if failure is not None:
-            summary |= {"error": explain(failure), "exit_code": exit_code(failure)}
-        report.table(["figure", "value"], [[key, _text(value)] for key, value in summary.items()])
-        report.result(summary)
+            result |= {"error": explain(failure), "exit_code": exit_code(failure)}
+        report.result(result)
         if failure is not None:
             raise failure
     return 0
+
+
+def policies(given: Sequence[str] | None) -> list[str]:
+    """Policies that were asked for, in their order. Raises ConfigError for one that is given twice, or empty."""
+    names = [name for text in given or ["diffusion"] for name in text.split(",")]
+    for name in names:
+        if not name or names.count(name) > 1:
+            raise ConfigError(f"--policy '{name}': " + ("given twice" if name else "give a name or a file"))
+    return names
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -74,109 +117,142 @@ def _check(args: argparse.Namespace) -> None:
     if args.workers < 0:
         raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
     check_seed(args.seed)
+    if args.fresh and args.out is None:
+        raise ConfigError("--fresh does the episodes in --out anew: give --out")
     if find(args.task).cls.steered:
         raise ConfigError(f"task '{args.task}' is steered by a person: use `servoid run {args.task}`")
     if not backend_kind(args.backend).simulated:
         raise ConfigError(f"backend '{args.backend}' has no truth to judge by: use a simulated one, or `servoid run`")
 
 
-def run_all(args: argparse.Namespace, values: dict[str, str]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """All episodes with their rows, as they are done by `--workers` processes. Bad settings are refused before any.
+@dataclass(frozen=True)
+class _Policy:
+    """What one policy is to do, and what it has done."""
+
+    settings: RunSettings  # of the rollout: its seed is not yet an episode's
+    rows: Rows
+    cache: EpisodeCache | None
+    made_of: tuple[Any, ...]  # files that its episodes read: they must stay as they are
+
+
+def _prepare(args: argparse.Namespace, name: str) -> _Policy:
+    """Raises ConfigError for a bad choice, and where --out holds episodes of others."""
+    from servoid.stack.runtime.run import RunSettings
+
+    chosen = RunSettings(
+        task=args.task,
+        backend=args.backend,
+        robot=args.robot,
+        policy=name,
+        randomise=args.randomise,
+        seconds=args.seconds,
+        seed=args.seed,
+        gain=args.gain,
+        set=settings(args),
+        recover=args.recover,
+    )
+    if args.out is None:
+        return _Policy(chosen, {}, None, ())
+    made_of = _made_of(chosen)
+    policy = {key: value for key, value in made_of[-1].items() if key != "name" or not made_of[-1]["checkpoint_sha256"]}
+    cache = EpisodeCache(args.out / f"{_file_name(name)}.jsonl", depends_on(chosen, policy), args.fresh)
+    rows = {i: row for i, row in cache.records.items() if i < args.episodes}
+    return _Policy(chosen, rows, cache, made_of)
+
+
+def _made_of(chosen: RunSettings) -> tuple[Any, ...]:
+    from servoid.stack.control.policies import policy_fingerprint
+    from servoid.tools.evaluate.code_hash import read_anew
+
+    return *read_anew(chosen.robot), policy_fingerprint(chosen.policy)
+
+
+def _file_name(policy: str) -> str:
+    """A policy's name, or for a file that and a hash, since others may be called so in other folders."""
+    if re.fullmatch(r"[\w-]+", policy):
+        return policy
+    stem = re.sub(r"[^\w-]+", "-", Path(policy).stem)[:40]
+    return f"{stem}-{key({'policy': policy})[:6]}"
+
+
+def _run_all(plan: Sequence[_Policy], args: argparse.Namespace, work: Work) -> None:
+    """Do all episodes that are lacking, on `--workers` processes; bad settings are refused before any.
 
     Raises what the first episode raises that cannot be done; the others are given up then.
     """
-    from tqdm import tqdm
-
     from servoid.hw.seeds import episode_seed
-    from servoid.stack.runtime.run import RunSettings
+    from servoid.stack.tasks import load_settings
 
-    seeds = [episode_seed(args.seed, i) for i in range(args.episodes)]
     jobs = [
-        RunSettings(
-            task=args.task,
-            backend=args.backend,
-            robot=args.robot,
-            policy=args.policy,
-            randomise=args.randomise,
-            seconds=args.seconds,
-            seed=seed,
-            gain=args.gain,
-            set=values,
-            recover=args.recover,
-        )
-        for seed in seeds
+        EpisodeJob(number, i, replace(one.settings, seed=episode_seed(args.seed, i)))
+        for i in range(args.episodes)
+        for number, one in enumerate(plan)
+        if i not in one.rows
     ]
-    workers = min(args.workers or os.cpu_count() or 1, len(jobs))
-    if workers > 1:
-        episode_check(jobs[0])
-    done = each(_numbered, enumerate(jobs), workers)
-    yield from tqdm(done, total=len(jobs), unit="episode", mininterval=2.0)
+    workers = max(min(args.workers or os.cpu_count() or 1, len(jobs)), 1)
+    if workers > 1 or len(plan) > 1:
+        for number in {job.experiment: job for job in jobs}.values():
+            episode_check(number.settings)
+    limit = args.seconds or load_settings(args.task, settings(args)).seconds
+    left = [sum(job.experiment == number for job in jobs) for number in range(len(plan))]
+    bar = EpisodeBar(Forecast([limit] * len(plan), left), workers, None)
+    try:
+        for done in each(work, jobs, workers):
+            one, i = plan[done.job.experiment], done.job.episode
+            if one.cache is not None:
+                if _made_of(one.settings) != one.made_of:
+                    raise ConfigError(
+                        f"policy '{one.settings.policy}', the robot, the code or a file in configs/ changed while "
+                        "episodes ran: what was done before is kept"
+                    )
+                one.cache.add(i, done.record)
+            one.rows[i] = done.record
+            bar.done(done.job.experiment, done.wall_seconds)
+    finally:
+        bar.close()
 
 
-def _numbered(job: tuple[int, RunSettings]) -> tuple[int, dict[str, Any]]:
-    from servoid.tools.evaluate.judge import judge
-
-    return job[0], judge(job[1]).row
+def _do(job: EpisodeJob) -> EpisodeResult:
+    begun = time.monotonic()
+    return EpisodeResult(job, judge(job.settings).row, wall_seconds=time.monotonic() - begun)
 
 
 def episode_check(job: RunSettings) -> None:
     """Raise here, in the parent, what every episode would raise: an unknown task, policy, robot or key."""
-    from dataclasses import replace
-
     from servoid.stack.runtime.run import run
 
     run(replace(job, seconds=0.1))
 
 
-def summarise(args: argparse.Namespace, rows: list[dict[str, Any]], wall_seconds: float) -> dict[str, Any]:
-    """What `--json` prints. Metrics are means over the episodes that have them."""
-    import numpy as np
-
-    n, successes = len(rows), sum(row["success"] for row in rows)
-    measured = [{**row["metrics"], "odometry_error_m": row["odometry_error_m"]} for row in rows]
-    metrics: dict[str, Any] = {}
-    for name in sorted({name for row in measured for name in row}):
-        values = np.array([row.get(name, np.nan) for row in measured], dtype=float)
-        metrics[name] = float(np.nanmean(values)) if np.isfinite(values).any() else None
-    return {
-        "task": args.task,
-        "policy": args.policy,
-        "backend": args.backend,
-        "robot": args.robot,
-        "randomised": args.randomise,
-        "episodes": n,
-        "seed": args.seed,
-        "success_rate": successes / n,
-        "success_ci95": wilson(successes, n),
-        "fall_rate": sum(row["fell"] for row in rows) / n,
-        "aborted_rate": sum(row["aborted"] for row in rows) / n,
-        "fell_ending_rate": sum(row["fell_ending"] for row in rows) / n,
-        **(_recoveries(rows) if args.recover else {}),
-        "mean_seconds": float(np.mean([row["seconds"] for row in rows])),
-        "metrics": metrics,
-        "wall_seconds": wall_seconds,
-        "failed_seeds": [row["seed"] for row in rows if not row["success"]],
-    }
+def _tell(report: Report, args: argparse.Namespace, plan: Sequence[_Policy]) -> dict[str, Any]:
+    """Print the figures, and return what `--json` prints."""
+    done = {one.settings.policy: [one.rows[i] for i in sorted(one.rows)] for one in plan if one.rows}
+    found = {name: summarise(rows) for name, rows in done.items()}
+    chosen: dict[str, Any] = {name: vars(args)[name] for name in ("task", "backend", "robot", "seed")}
+    chosen |= {"randomised": args.randomise} | ({} if args.out is None else {"out": args.out})
+    report.table(*table(found))
+    report.line("± standard deviation over episodes; (95 % interval, Wilson)")
+    for name, summary in found.items():
+        if seeds := summary["failed_seeds"]:
+            shown = " ".join(map(str, seeds[:10])) + (" ..." if len(seeds) > 10 else "")
+            report.line(f"seeds that failed with {name}: {shown}")
+    if len(plan) == 1:
+        return chosen | {"policy": plan[0].settings.policy} | found[plan[0].settings.policy]
+    return chosen | {"policies": found, "differences": _tell_differences(report, done)}
 
 
-def _recoveries(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Falls of all episodes, the share of them that the robot got up from, and the median time from lying still to
-    standing."""
-    import numpy as np
-
-    falls, seconds = sum(row["falls"] for row in rows), [s for row in rows for s in row["stand_seconds"]]
-    return {
-        "falls": falls,
-        "recovered_share": len(seconds) / falls if falls else None,
-        "time_to_stand_s": float(np.median(seconds)) if seconds else None,
-    }
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, dict):
-        return ", ".join(f"{key} {_text(item)}" for key, item in value.items())
-    if isinstance(value, list):
-        return ", ".join(_text(item) for item in value[:10]) + (" ..." if len(value) > 10 else "")
-    return str(value)
+def _tell_differences(report: Report, done: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """Those of each policy to the first."""
+    if not done:
+        return []
+    first, *others = done
+    results = []
+    for name in others:
+        apart = differences(done[name], done[first])
+        report.line()
+        report.line(f"{name} minus {first}, by seed:")
+        report.table(*difference_table(apart))
+        results.append({"policy": name, "minus": first, "figures": apart})
+    if others:
+        report.line("95 % intervals: bootstrap of the differences; - where there are too few, or all are equal")
+    return results

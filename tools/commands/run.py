@@ -7,7 +7,6 @@ turns torque off at once. Exit code 0: the goal was met; 1: the task failed; 4: 
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from datetime import datetime
 from functools import partial
@@ -16,8 +15,17 @@ from typing import Any
 
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
-from servoid.tools.common.output import Report, add_json_argument, reporting
-from servoid.tools.common.parser import add_gain_argument, add_recover_argument, add_set_argument, check_seed, settings
+from servoid.tools.common.output import Progress, Report, add_json_argument, reporting
+from servoid.tools.common.parser import (
+    add_gain_argument,
+    add_recover_argument,
+    add_set_argument,
+    check_seed,
+    out_of_reach,
+    positive,
+    settings,
+)
+from servoid.tools.common.pictures.drawing import prepare
 from servoid.tools.common.prompt import confirm
 
 EXIT_CODES = {
@@ -27,14 +35,6 @@ EXIT_CODES = {
     "timed_out": exit_codes.FAILED,
     "stopped": exit_codes.STOPPED,
     "interrupted": exit_codes.INTERRUPTED,
-}
-WORDS = {
-    "succeeded": "goal met",
-    "failed": "goal not met",
-    "fell": "the robot fell",
-    "timed_out": "time ran out",
-    "stopped": "stopped by the guard",
-    "interrupted": "interrupted",
 }
 
 
@@ -59,6 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", action="store_true", help="move a real robot without asking")
     parser.add_argument("--record", type=Path, metavar="FILE", help="flight log (default: runs/DATE-TASK.mcap)")
     parser.add_argument("--video", type=Path, metavar="FILE", help="film the run afterwards: MP4, and its path as PNG")
+    parser.add_argument(
+        "--video-size", default="1280x720", metavar="WxH", help="size of the film (default: %(default)s)"
+    )
     parser.add_argument("--fast", action="store_true", help="do not keep a simulation to real time on a terminal")
     add_json_argument(parser)
 
@@ -67,11 +70,12 @@ def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         check_seed(args.seed)
         if args.video is not None:
-            _prepare_video(args.video)
+            size = prepare(args.video, args.video_size)
         from servoid.stack.runtime.backends import backend_kind
         from servoid.stack.runtime.run import RunSettings, run
         from servoid.stack.tasks import find
         from servoid.tools.common.live import LiveLine
+        from servoid.tools.common.summary import summary
 
         watched = (sys.stdout.isatty() and not args.json) or find(args.task).cls.steered
         plan = RunSettings(
@@ -90,6 +94,8 @@ def main(args: argparse.Namespace) -> int:
             port=args.port,
             recover=args.recover,
         )
+        for text in out_of_reach(args):
+            report.line(text)
         live = LiveLine(sys.stderr if args.json else sys.stdout)
         try:
             result = run(plan, on_tick=live, confirm=partial(confirm, remedy="give --start to let the robot move"))
@@ -97,9 +103,10 @@ def main(args: argparse.Namespace) -> int:
             live.close()
             tell_lateness(report, args.port)
         files: dict[str, Any] = {"log": result.log}
-        _summarise(report, result)
+        for text in summary(result, report.columns):
+            report.line(text)
         if args.video is not None and result.log is not None:
-            files |= _film(report, result.log, args.video)
+            files |= _film(report, result.log, args.video, size)
         for name, path in files.items():
             if path is not None:
                 report.line(f"{name:>8}: {path}")
@@ -124,17 +131,6 @@ def tell_lateness(report: Report, port: str | None) -> None:
             report.line(text)
 
 
-def positive(text: str) -> float:
-    """An argument that is a positive number."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
-    return value
-
-
 def _default_log(task: str) -> Path:
     """A name that is free: runs/DATE-TASK.mcap, numbered when two runs start in one second."""
     stem = f"{datetime.now():%Y%m%d-%H%M%S}-{task}"
@@ -142,31 +138,16 @@ def _default_log(task: str) -> Path:
     return next(name for name in names if not name.exists())
 
 
-def _prepare_video(path: Path) -> None:
-    """Refuse a file that cannot be made before the robot moves; choose how to draw before MuJoCo is loaded."""
-    if path.suffix != ".mp4":
-        raise ConfigError(f"--video {path}: give a name that ends in .mp4")
-    if path.exists():
-        raise ConfigError(f"--video {path}: exists already: give another name")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-        path.unlink()
-    except OSError as error:
-        raise ConfigError(f"--video {path}: cannot be written ({error.strerror}): give another name") from None
-    if not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
-
-
-def _film(report: Report, log: Path, path: Path) -> dict[str, Path]:
+def _film(report: Report, log: Path, path: Path, size: tuple[int, int]) -> dict[str, Path]:
     """Video and plot of a run; where they cannot be made, the reason. The run itself has succeeded or not before."""
     from servoid.stack.log.flightlog import read_log
-    from servoid.tools.common.video import VideoError, make_video
+    from servoid.tools.common.pictures.video import VideoError, make_video
 
     made: dict[str, Path] = {}
     failures = (VideoError, ConfigError, OSError, ValueError)  # a full disk, say, or no encoder
     try:
-        make_video(read_log(log), path)
+        with Progress("filming") as progress:
+            make_video(read_log(log), path, size, progress)
         made["video"] = path
     except failures as error:
         report.line(f"no video: {error}")
@@ -180,16 +161,3 @@ def _film(report: Report, log: Path, path: Path) -> dict[str, Path]:
     except failures as error:
         report.line(f"no plot: {error}")
     return made
-
-
-def _summarise(report: Report, result: Any) -> None:
-    for event in result.events:
-        if event.kind not in ("phase", "task"):
-            report.line(f"{event.time:6.2f} s  {event.text}")
-    report.line(f"{WORDS[result.outcome]} after {result.seconds:.1f} s")
-    for name, value in result.metrics.items():
-        report.line(f"{name:>24}: {value:.3f}")
-    report.line(
-        f"{result.ticks} ticks, {result.missed} missed, late p50 {result.late_p50_ms:.2f} ms,"
-        f" p99 {result.late_p99_ms:.2f} ms"
-    )

@@ -16,6 +16,7 @@ import math
 import os
 import select
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TextIO
@@ -34,6 +35,11 @@ class Report:
     def line(self, text: str = "") -> None:
         """A line for a person."""
         say(text, sys.stderr if self.as_json else self._stdout)
+
+    @property
+    def columns(self) -> int | None:
+        """Width of the terminal that lines go to, as it is now; None where they go elsewhere."""
+        return columns(sys.stderr if self.as_json else self._stdout)
 
     def table(self, head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
         """A table for a person, columns aligned."""
@@ -62,16 +68,55 @@ def say(text: str, stream: TextIO) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # Python writes once more at exit
 
 
+def columns(stream: TextIO) -> int | None:
+    """Width of the terminal behind a stream, as it is now; None where there is none, or it does not say."""
+    if not stream.isatty():
+        return None
+    try:
+        return os.get_terminal_size(stream.fileno()).columns or None
+    except OSError:  # a terminal in memory
+        return None
+
+
 class Screen:
     """A stream that nobody waits for, for the line that is rewritten while a control loop runs.
 
     What it does not take at once is left out: a terminal that Ctrl-S stopped, or an ssh connection that hangs. When a
-    write fails, because the reader is gone, nothing is written any more.
+    write fails, because the reader is gone, nothing is written any more. `rewrites`: whether a line can be written
+    over, which it cannot in a file, a pipe or a terminal that is dumb.
     """
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: TextIO, term: str | None = None) -> None:
+        """`term` is the kind of terminal, that of the environment unless given."""
+        dumb = (os.environ.get("TERM") if term is None else term) in ("dumb", "unknown")
         self.tty = stream.isatty()
+        self.rewrites = self.tty and not dumb
         self._stream: TextIO | None = stream
+        self._shown = 0  # columns of the line that can be written over
+
+    def rewrite(self, text: str) -> None:
+        """Write over the line that stands there; what does not fit the terminal as it is now is cut off."""
+        room = self.columns
+        text = text[:room]
+        if self.write("\r" + text.ljust(min(self._shown, room))):
+            self._shown = len(text)
+
+    @property
+    def columns(self) -> int:
+        """What a line that is rewritten may take: a full one would go on in the next."""
+        return max((columns(self._stream) if self._stream is not None else None) or 80, 2) - 1
+
+    def clear(self) -> None:
+        """Take away the line that was rewritten."""
+        if self._shown:
+            self.write("\r" + " " * self._shown + "\r")
+        self._shown = 0
+
+    def end(self) -> None:
+        """Leave the line that was rewritten standing."""
+        if self._shown:
+            self.write("\n")
+        self._shown = 0
 
     def write(self, text: str) -> bool:
         """Write a line at most, to be seen at once; whether it was."""
@@ -83,6 +128,36 @@ class Screen:
         except OSError:  # the robot goes on without it
             self._stream = None
         return self._stream is not None
+
+
+class Progress:
+    """How far something is that takes a while: call it with how much of how much is done.
+
+    A terminal's line is rewritten; elsewhere a line comes at first, and every ten seconds.
+    """
+
+    def __init__(self, what: str, stream: TextIO | None = None, term: str | None = None) -> None:
+        """`what` is being done, such as "filming"; `stream` is standard error unless given."""
+        self._what, self._screen = what, Screen(stream or sys.stderr, term)
+        self._began, self._shown = time.monotonic(), -math.inf
+
+    def __call__(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if now - self._shown < (0.2 if self._screen.rewrites else 10.0):
+            return
+        self._shown = now
+        left = f", {(now - self._began) / done * (total - done):.0f} s left" if done else ""
+        text = f"{self._what}: {100 * done // max(total, 1)} % of {total}{left}"
+        if self._screen.rewrites:
+            self._screen.rewrite(text)
+        else:
+            self._screen.write(text + "\n")
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._screen.clear()
 
 
 def _takes(stream: TextIO) -> bool:

@@ -40,10 +40,21 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     return f"; did you mean '{close[0]}'?" if close else ""
 
 
+def positive(text: str) -> float:
+    """An argument that is a positive number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
+    return value
+
+
 def check_seed(seed: int) -> None:
     """Raise ConfigError for a `--seed` that no generator takes."""
     if seed < 0:
-        raise ConfigError(f"--seed {seed}: give a number from 0 on")
+        raise ConfigError(f"--seed must not be negative, not {seed}")
 
 
 def add_set_argument(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +64,7 @@ def add_set_argument(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="change a setting of the task (servoid tasks)",
+        help="change a setting of the task (see servoid tasks TASK)",
     )
 
 
@@ -66,7 +77,11 @@ def add_recover_argument(parser: argparse.ArgumentParser) -> None:
 def add_gain_argument(parser: argparse.ArgumentParser) -> None:
     """`--gain G`, for `RunSettings.gain`."""
     parser.add_argument(
-        "--gain", type=float, default=1.0, metavar="G", help="scale the servos' position gain; below 1 is softer"
+        "--gain",
+        type=float,
+        default=1.0,
+        metavar="G",
+        help="factor on the servos' position gain; below 1 is softer (default: 1)",
     )
 
 
@@ -81,3 +96,12 @@ def settings(args: argparse.Namespace) -> dict[str, str]:
             raise ConfigError(f"--set {item}: {key} is set twice")
         result[key] = value
     return result
+
+
+def out_of_reach(args: argparse.Namespace) -> list[str]:
+    """A sentence about each speed that is asked of the chosen robot and is more than it can. Raises ConfigError."""
+    from servoid.hw.robot.description import load_robot
+    from servoid.stack.tasks import beyond, load_settings
+
+    robot = load_robot(args.robot)
+    return beyond(load_settings(args.task, settings(args), robot), robot)

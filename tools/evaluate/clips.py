@@ -26,7 +26,7 @@ def recipe(robot: str) -> dict[str, Any]:
 
     return {
         "expert": sha256(resolve("expert")),
-        "gait": asdict(load_gait()),
+        "gait": asdict(load_gait(load_robot(robot).gait)),
         "robot": fingerprint(load_robot(robot)),
         "seconds": SECONDS,
         "seed": SEED,
@@ -63,4 +63,6 @@ def record_clips(folder: Path, robot: str, number: int, say: Callable[[str], Non
         clips.append(path.resolve())
         if len(clips) == number:
             return clips
-    raise ConfigError(f"{place}: the expert fell in most of its walks: only {len(clips)} of {number} clips are there")
+    raise ConfigError(
+        f"{place}: the expert fell in most of its walks: only {len(clips)} of {number} clips were recorded"
+    )

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
+from servoid.tools.common.pictures.panels import GOAL, OBSTACLE, ROBOT
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-ROBOT, PLAN, GOAL, OBSTACLE, FAILED = "#3459b8", "#f28e1c", "#26a65b", "#8c6b51", "#c1403d"
+FAILED = "#c1403d"
 PANELS = 12  # episodes that are drawn one by one, where each has a scene of its own
 
 

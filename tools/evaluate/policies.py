@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from servoid.hw.config import ConfigError
-from servoid.tools.evaluate.cache import key
-from servoid.tools.evaluate.code_hash import code
+from servoid.hw.config import ConfigError, available
+from servoid.tools.evaluate.cache import depends_on, key
 from servoid.tools.evaluate.spec import Experiment, OwnNetwork
 
 if TYPE_CHECKING:
@@ -108,10 +107,12 @@ class Policies:
         share, last = _share(path), path.with_name(_LAST)
         if share is None:
             raise ConfigError(
-                f"{last} does not say that the training was finished: train anew: {self._command(network, path)}"
+                f"{last}: does not record that the training finished; train it again: {self._command(network, path)}"
             )
         if share < 1.0:
-            raise ConfigError(f"{last}: {share:.1%} of its training are done: go on: {self._command(network, path)}")
+            raise ConfigError(
+                f"{last}: only {share:.1%} of its training is done; continue it: {self._command(network, path)}"
+            )
 
     def fingerprint(self, experiment: Experiment) -> dict[str, Any]:
         """Everything about the policy of an experiment that its episodes depend on: checkpoints by their hash."""
@@ -162,7 +163,9 @@ def _check_training(path: Path, network: OwnNetwork) -> None:
     for name, value in given.items():
         if name in asked and name not in whatever and asked[name] != value:
             option = "--" + name.replace("_", "-")
-            raise ConfigError(f"{path}: trained with {option} {value}, and this row is of {asked[name]}: train it anew")
+            raise ConfigError(
+                f"{path}: trained with {option} {value}, but this row needs {asked[name]}: train it again"
+            )
 
 
 def _diffusion_settings(policy: str) -> DiffusionSettings | None:
@@ -174,7 +177,7 @@ def _diffusion_settings(policy: str) -> DiffusionSettings | None:
         if read_header(Path(policy))["kind"] != "diffusion":
             return None
         settings = replace(load_settings(), checkpoint=policy)
-    elif policy == "diffusion" or policy.endswith((".yaml", ".yml")):
+    elif policy.endswith((".yaml", ".yml")) or policy in set(available("policies")) - {"gait"}:
         settings = load_settings(policy)
     else:
         return None
@@ -184,23 +187,16 @@ def _diffusion_settings(policy: str) -> DiffusionSettings | None:
 def dependencies(
     experiment: Experiment, policies: Policies, robot: str, seed: int, seconds: float | None, clips: str | None
 ) -> Mapping[str, Any]:
-    """What the episodes of an experiment depend on: the same dependencies, the same episodes. Raises ConfigError."""
-    from servoid.hw.robot.description import load_robot
-    from servoid.stack.log.provenance import described, fingerprint, versions
-    from servoid.stack.tasks import load_settings, source
+    """What the episodes of an experiment depend on. Raises ConfigError."""
+    from servoid.stack.runtime.run import RunSettings
 
-    own = source(experiment.task)
-    return {
-        **({} if own is None else {"source": own}),
-        "task": experiment.task,
-        "settings": described(load_settings(experiment.task, dict(experiment.set))),
-        "seconds": seconds,
-        "policy": policies.fingerprint(experiment),
-        "robot": fingerprint(load_robot(robot)),
-        "backend": experiment.backend,
-        "randomise": experiment.randomise,
-        "seed": seed,
-        "clips": clips,
-        "code": code(),
-        "versions": versions(),
-    }
+    settings = RunSettings(
+        task=experiment.task,
+        backend=experiment.backend,
+        robot=robot,
+        randomise=experiment.randomise,
+        seconds=seconds,
+        seed=seed,
+        set=dict(experiment.set),
+    )
+    return depends_on(settings, policies.fingerprint(experiment)) | {"clips": clips}

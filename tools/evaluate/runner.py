@@ -75,6 +75,7 @@ def evaluate(
     say: Callable[[str], None] = print,
     work: Work = do_episode,
     pool: Pool = each,
+    now: Callable[[], float] = time.monotonic,
 ) -> dict[str, Measured]:
     """Do the episodes that `rows` lack, and return what was measured by the rows' names.
 
@@ -84,7 +85,7 @@ def evaluate(
     """
     from servoid.policy.checkpoint import git_commit
 
-    begun = time.monotonic()
+    begun = now()
     read = read_anew(options.robot)
     policies = Policies(options.policy, options.out)
     measured, prepared = _prepare_all(rows, policies, options, say)
@@ -111,7 +112,7 @@ def evaluate(
             ):
                 raise ConfigError(
                     f"the policy of {', '.join(one.rows)}, the robot, the code or a file in configs/ changed while"
-                    " episodes ran: what was done is kept; give the same command again when the files stay as they are"
+                    " episodes ran: finished ones are kept; run the same command again once the files no longer change"
                 )
             one.cache.add(result.job.episode, {**result.record, "commit": commit})
             bar.done(result.job.experiment, result.wall_seconds)
@@ -186,7 +187,7 @@ def _prepare(experiment: Experiment, policies: Policies, options: Options, say: 
         policy=_made_of(policies, experiment, settings.policy),
         limit=shortest,
         episodes=options.episodes or experiment.episodes,
-        cache=EpisodeCache(options.out / "episodes", kept, options.fresh),
+        cache=EpisodeCache(options.out / "episodes" / f"{key(kept)}.jsonl", kept, options.fresh),
     )
 
 

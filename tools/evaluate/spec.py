@@ -243,7 +243,7 @@ def _check(experiment: Experiment) -> None:
     from servoid.stack.tasks import load_settings
 
     if experiment.episodes < 1:
-        raise ConfigError(f"episodes: {experiment.episodes} is not a number of episodes; give 1 or more")
+        raise ConfigError(f"episodes must be at least 1, not {experiment.episodes}")
     if not backend_kind(experiment.backend).simulated:
         raise ConfigError(f"backend '{experiment.backend}' has no truth to judge by")
     load_settings(experiment.task, dict(experiment.set))

@@ -1,9 +1,9 @@
-"""The fault campaign: every fault that the virtual rig knows, while the robot walks, and what became of it.
+"""Inject every fault of the virtual rig while the robot walks, and judge how the run handles it.
 
-Each fault is declared as to be absorbed (the run goes on), named (in the log, with the servo) or fatal (named, and the
-robot damped and off; where the bus cannot be reached, stopped by the servos' watchdog). Each goal that a servo accepted
-is judged against the joint's range and speed by the rig's own record. A trial that does not end is killed and counted,
-and so is one whose process dies; any trial is repeated with --fault KIND --first SEED --seeds 1.
+Each fault is declared absorbed (the run continues), named (in the log, with the servo) or fatal (named, and the robot
+damped and off; where the bus cannot be reached, stopped by the servos' watchdog). Every goal that a servo accepted is
+judged against the joint's range and speed by the rig's own record. A trial that hangs is killed and counted, and so is
+one whose process dies. To repeat a trial: --fault KIND --first SEED --seeds 1.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import time
 from typing import Any
 
 from servoid.hw.config import ConfigError, nearest
-from servoid.tools.commands.run import positive
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, add_json_argument, reporting
+from servoid.tools.common.parser import positive
 
 QUICK = (
     "drop",
@@ -33,14 +33,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seeds", type=int, default=20, metavar="N", help="trials of each fault (default: %(default)s)"
     )
-    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="seed of the first (default: %(default)s)")
-    parser.add_argument("--fault", action="append", metavar="KIND", help="only this fault; can be repeated")
-    parser.add_argument("--quick", action="store_true", help=f"only {', '.join(QUICK)}")
-    parser.add_argument("--workers", type=int, default=0, help="processes (default: one a core)")
     parser.add_argument(
-        "--deadline", type=positive, default=TRIAL_SECONDS, metavar="S", help="of a trial (default: %(default)s)"
+        "--first", type=int, default=0, metavar="SEED", help="seed of the first trial (default: %(default)s)"
     )
-    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="default: op3")
+    parser.add_argument("--fault", action="append", metavar="KIND", help="only this fault; may be repeated")
+    parser.add_argument("--quick", action="store_true", help=f"only {', '.join(QUICK)}")
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: one per core)")
+    parser.add_argument(
+        "--deadline",
+        type=positive,
+        default=TRIAL_SECONDS,
+        metavar="S",
+        help="longest trial, in real time (default: %(default)s)",
+    )
+    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     add_json_argument(parser)
 
 
@@ -49,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
 
     with reporting(args.json) as report:
         if args.seeds < 1 or args.first < 0 or args.workers < 0:
-            raise ConfigError("--seeds takes 1 or more, --first and --workers 0 or more")
+            raise ConfigError("--seeds must be at least 1, and --first and --workers must not be negative")
         kinds = tuple(args.fault or (QUICK if args.quick else KINDS))
         for kind in kinds:
             if kind not in KINDS:

@@ -1,9 +1,9 @@
-"""Random and damaged byte streams into everything that reads bytes.
+"""Feed random and damaged byte streams to everything that reads bytes.
 
-They go into the codec, the driver's bus, the IMU parsers and the virtual servos. Exceptions, hangs and allocation
-without bound are counted, and each is printed with the command that repeats it.
+The targets are the codec, the driver's bus, the IMU parsers and the virtual servos. Exceptions, hangs and unbounded
+allocation are counted, and each is printed with the command that repeats it.
 
-A target keeps its state from stream to stream, and begins anew every 2000, so a failure is repeated from there.
+A target keeps its state from stream to stream and starts afresh every 2000, so a failure is repeated from there.
 """
 
 from __future__ import annotations
@@ -34,17 +34,21 @@ class Hang(Exception):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--streams", type=int, default=1_000_000, metavar="N", help="(default: %(default)s)")
-    parser.add_argument("--first", type=int, default=0, metavar="N", help="number of the first (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of all streams (default: %(default)s)")
-    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="whose servos (default: op3)")
+    parser.add_argument(
+        "--streams", type=int, default=1_000_000, metavar="N", help="number of streams (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--first", type=int, default=0, metavar="N", help="number of the first stream (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: %(default)s)")
+    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     add_json_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         if args.streams < 1 or args.first < 0:
-            raise ConfigError("--streams takes 1 or more, --first 0 or more")
+            raise ConfigError("--streams must be at least 1, and --first must not be negative")
         check_seed(args.seed)
         result = fuzz(report, args)
         figures = {key: value for key, value in result.items() if key != "failures"}

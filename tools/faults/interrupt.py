@@ -1,8 +1,8 @@
-"""Interrupt runs (Ctrl-C) at random instants, on virtual rigs in real time, and see that torque is off afterwards.
+"""Interrupt runs (Ctrl-C) at random instants, on virtual rigs in real time, and check that torque is off afterwards.
 
-An instant is any from the first byte on the bus: while connecting, homing, standing, walking. Every fourth run gets a
-second Ctrl-C while it comes to rest, is lowered or damped. All servos must have said that torque is off, or the run
-ends with another exit code; and the rig must agree.
+Any instant from the first byte on the bus may be drawn: connecting, homing, standing, walking. Every fourth run gets a
+second Ctrl-C while the robot comes to rest, is lowered or is damped. All servos must report that torque is off, or the
+run must say so by its exit code; and the rig must agree.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ TRIES = 10  # for a run that goes on until then: on a machine that is too busy t
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--times", type=int, default=200, help="(default: %(default)s)")
-    parser.add_argument("--workers", type=int, default=1, help="rigs side by side (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the instants (default: %(default)s)")
+    parser.add_argument("--times", type=int, default=200, metavar="N", help="number of runs (default: %(default)s)")
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="rigs in parallel (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: %(default)s)")
     add_json_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         if args.times < 1 or args.workers < 1:
-            raise ConfigError(f"--times {args.times} --workers {args.workers}: give numbers from 1 on")
+            raise ConfigError(f"--times {args.times} --workers {args.workers}: both must be at least 1")
         result = summarise(measure(report, args.times, args.workers, args.seed))
         report.table(["figure", "value"], [[key, value] for key, value in result.items()])
         report.result(result)

@@ -1,7 +1,7 @@
-"""Kill the controller in mid-walk (kill -9) and see what becomes of the servos, on a virtual rig in real time.
+"""Kill the controller in mid-walk (kill -9) and check the servo state after, on a virtual rig in real time.
 
-The guardian must have them damped and then without torque, all of them, within 100 ms by the rig's own record; the
-flight log must read back. Then the same with the guardian killed too: the servos' own watchdog must stop them.
+The guardian must damp all servos and then switch their torque off, within 100 ms by the rig's own record, and the
+flight log must be readable. Then the guardian is killed too, and the servos' own watchdog must stop them.
 """
 
 from __future__ import annotations
@@ -24,18 +24,20 @@ _LATEST = 1.0  # s after a kill that are waited for what should have come in a t
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--kills", type=int, default=20, help="with a guardian (default: %(default)s)")
-    parser.add_argument("--unguarded", type=int, default=5, help="with the guardian killed too (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the instants (default: %(default)s)")
+    parser.add_argument(
+        "--kills", type=int, default=20, metavar="N", help="kills with a guardian (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--unguarded", type=int, default=5, metavar="N", help="kills of controller and guardian (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: %(default)s)")
     add_json_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         if args.kills < 0 or args.unguarded < 0 or args.kills + args.unguarded < 1:
-            raise ConfigError(
-                f"--kills {args.kills} --unguarded {args.unguarded}: give numbers from 0 on, one of them not 0"
-            )
+            raise ConfigError(f"--kills {args.kills} --unguarded {args.unguarded}: must not be negative, nor both be 0")
         result = measure(report, args.kills, args.unguarded, random.Random(args.seed))
         report.table(["figure", "value"], [[key, value] for key, value in result.items()])
         report.result(result)

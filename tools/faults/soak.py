@@ -1,7 +1,7 @@
-"""A long walk in real time on the virtual rig, over a line that loses and damages status packets.
+"""Walk for minutes in real time on the virtual rig, over a line that loses and damages status packets.
 
-The rig is a process of its own at the machine's pace, and the robot is driven as hardware is: real port, real clock,
-the same backend. Wanted are no stop, no fall, and no memory that grows.
+The rig is a separate process in real time, and the robot is driven like hardware: real port, real clock, the same
+backend. The run must not stop, the robot must not fall, and memory must not grow.
 """
 
 from __future__ import annotations
@@ -12,31 +12,36 @@ from pathlib import Path
 from typing import Any
 
 from servoid.hw.config import ConfigError
-from servoid.tools.commands.run import positive
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, add_json_argument, reporting
-from servoid.tools.common.parser import check_seed
+from servoid.tools.common.parser import check_seed, positive
 
 TELL_SECONDS = 60.0
 VELOCITY = {"vx": "0.1", "vy": "0", "yaw_rate": "0.3"}  # round in a circle, not away
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--minutes", type=positive, default=10.0, metavar="M", help="of walking (default: %(default)s)")
     parser.add_argument(
-        "--warm-up", type=positive, default=10.0, metavar="S", help="of walking before anything counts (default: 10)"
+        "--minutes", type=positive, default=10.0, metavar="M", help="length of the walk (default: %(default)s)"
     )
-    parser.add_argument("--share", type=float, default=0.01, help="of packets lost or damaged (default: %(default)s)")
-    parser.add_argument("--policy", default="gait", help="diffusion, expert or gait (default: %(default)s)")
-    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="default: op3")
-    parser.add_argument("--seed", type=int, default=0, help="default: 0")
+    parser.add_argument(
+        "--warm-up", type=positive, default=10.0, metavar="S", help="seconds of walking that do not count (default: 10)"
+    )
+    parser.add_argument(
+        "--share", type=float, default=0.01, metavar="X", help="share of packets lost or damaged (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--policy", default="gait", metavar="NAME", help="diffusion, expert or gait (default: %(default)s)"
+    )
+    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
     add_json_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         if not 0.0 <= args.share <= 1.0:
-            raise ConfigError(f"--share {args.share}: give a share from 0 to 1")
+            raise ConfigError(f"--share {args.share}: must be between 0 and 1")
         check_seed(args.seed)
         result = soak(report, args)
         report.table(["figure", "value"], [[key.replace("_", " "), _cell(value)] for key, value in result.items()])

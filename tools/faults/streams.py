@@ -8,15 +8,15 @@ from collections.abc import Callable
 from itertools import pairwise
 
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import Instruction, Reset
+from servoid.hw.dynamixel.protocol.codec import InstructionCode, Reset
 from servoid.hw.imu import bno08x, witmotion
 
 IDS = tuple(range(1, 21))
 BOARD_ID = 200
 WIDTH = 10  # bytes of each servo in the reads of a control cycle
 _LONG = 0.01  # share of packets longer than a parser waits for
-_RARE = (Instruction.REBOOT, Instruction.FACTORY_RESET)  # after which devices are silent for long
-_COMMON = tuple(instruction for instruction in Instruction if instruction not in _RARE)
+_RARE = (InstructionCode.REBOOT, InstructionCode.FACTORY_RESET)  # after which devices are silent for long
+_COMMON = tuple(instruction for instruction in InstructionCode if instruction not in _RARE)
 
 
 def stream(seed: int, number: int) -> list[bytes]:

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import MAX_LENGTH, Parser
+from servoid.hw.dynamixel.protocol.codec import MAX_LENGTH, PacketParser
 from servoid.hw.dynamixel.transport.bus import Bus
 from servoid.hw.dynamixel.transport.group_read import GroupRead
 from servoid.hw.imu.bno08x import Bno08x
@@ -48,7 +48,7 @@ class CodecTarget:
     name = "codec"
 
     def __init__(self) -> None:
-        self._parser = Parser()
+        self._parser = PacketParser()
         self._heads = [codec.status_head(id, WIDTH) for id in IDS]
         self._fast_head = codec.fast_head([WIDTH] * len(IDS))
 

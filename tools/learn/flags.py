@@ -10,17 +10,17 @@ from dataclasses import asdict, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 from servoid.hw.config import ConfigError, load_yaml, parse_number, resolve
-from servoid.tools.learn.settings import TITLES, Run, StepRun
+from servoid.tools.learn.settings import TITLES, StepRun, TrainingRun
 
-T = TypeVar("T", bound=Run)
+T = TypeVar("T", bound=TrainingRun)
 
 
-def add_setting_flags(parser: argparse.ArgumentParser, base: Run, run: argparse._ArgumentGroup) -> None:
+def add_setting_flags(parser: argparse.ArgumentParser, base: TrainingRun, run: argparse._ArgumentGroup) -> None:
     """A flag for each setting of `base`, grouped by `TITLES`; settings of the run itself go into the group `run`.
 
     A flag that is not given leaves nothing in the namespace, so that a file may say otherwise: see `read_settings`.
     """
-    groups = {TITLES[Run]: run}
+    groups = {TITLES[TrainingRun]: run}
     for title in dict.fromkeys(TITLES.values()):
         for f in fields(base):
             owner = _owner(type(base), f.name)
@@ -59,7 +59,7 @@ def read_settings(args: argparse.Namespace, base: T) -> T:
         raise ConfigError(flags) from error
 
 
-def plain(settings: Run) -> dict[str, Any]:
+def plain(settings: TrainingRun) -> dict[str, Any]:
     """Settings as YAML has them, for a header, or for a file that `--config` takes."""
     return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(settings).items()}
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
 from servoid.hw.config import nearest
-from servoid.policy.diffusion.model.config import DenoiserShape, Objective
+from servoid.policy.diffusion.model.config import DenoiserShape, TrainingObjective
 from servoid.policy.latent.actions import LatentConfig
 from servoid.policy.tracker.rewards import TERMS
 
@@ -19,13 +19,13 @@ Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainingRun:
     """How long, and how often to look."""
 
     # Fields that may change when a run goes on.
     FREE: ClassVar[frozenset[str]] = frozenset({"minutes", "steps", "samples", "evaluate_every"})
 
-    minutes: Annotated[float, "minutes of training in all; evaluations are not counted"] = 45.0
+    minutes: Annotated[float, "minutes of training in all, evaluations not counted"] = 45.0
     evaluate_every: Annotated[float, "minutes of training between evaluations; 0: only at the end"] = 5.0
     seed: Annotated[int, "random seed"] = 0
 
@@ -43,10 +43,10 @@ class Run:
 
 
 @dataclass(frozen=True)
-class StepRun(Run):
+class StepRun(TrainingRun):
     """A run that may be measured in steps of the optimiser."""
 
-    steps: Annotated[int, "steps to train for instead of minutes, the same on any machine; 0: by minutes"] = 0
+    steps: Annotated[int, "steps to train for, instead of minutes: as much on any machine; 0: use minutes"] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,10 +62,10 @@ class StepRun(Run):
 class DataRun(StepRun):
     """A training on a recorded dataset, judged in closed loop."""
 
-    FREE: ClassVar[frozenset[str]] = Run.FREE | {"survival_seconds", "survival_worlds", "licence"}
+    FREE: ClassVar[frozenset[str]] = TrainingRun.FREE | {"survival_seconds", "survival_worlds", "licence"}
 
     survival_seconds: Annotated[float, "seconds that the network walks in each evaluation"] = 10.0
-    survival_worlds: Annotated[int, "worlds it walks in; 0: keep the best by its loss on held-out data instead"] = 32
+    survival_worlds: Annotated[int, "worlds it walks in; 0: judge by the loss on held-out data instead"] = 32
     licence: Annotated[str, "licence of the data, kept in the checkpoint"] = "Apache-2.0"
 
     def __post_init__(self) -> None:
@@ -89,7 +89,7 @@ class Layers:
 class Optimiser:
     """Of networks that learn from examples."""
 
-    batch: Annotated[int, "windows, pairs of ticks or chunks a step"] = 128
+    batch: Annotated[int, "windows, pairs of ticks or chunks per step"] = 128
     learning_rate: Annotated[float, "learning rate at its highest"] = 6e-4
 
     def __post_init__(self) -> None:
@@ -108,20 +108,20 @@ class DecayedOptimiser(Optimiser):
 class DiffusionNetwork(DenoiserShape):
     """A denoiser, and what it is shown."""
 
-    text: Annotated[str, "encoder of instructions; empty: a model that takes none"] = "words"
+    text: Annotated[str, "encoder of instructions; empty: a model without instructions"] = "words"
     emphasis: Annotated[float, "emphasis of global states; 0: no projection"] = 5.0
 
 
 @dataclass(frozen=True)
-class DiffusionTraining(DecayedOptimiser, Objective, DiffusionNetwork, DataRun):
+class DiffusionTraining(DecayedOptimiser, TrainingObjective, DiffusionNetwork, DataRun):
     """`servoid train diffusion`."""
 
     warmup_steps: Annotated[int, "steps over which the learning rate rises"] = 200
-    average: Annotated[float, "decay of the averaged weights, which are the ones that are kept"] = 0.999
+    average: Annotated[float, "decay of the averaged weights, which are the ones saved"] = 0.999
     precision: Annotated[Literal["bf16", "fp32"], "arithmetic of the network"] = "bf16"
 
     def __post_init__(self) -> None:
-        for part in (DataRun, DenoiserShape, Objective, Optimiser):
+        for part in (DataRun, DenoiserShape, TrainingObjective, Optimiser):
             part.__post_init__(self)
         if self.history < 2:
             raise ValueError(f"history must be at least 2, not {self.history}: what ran last is an action of the past")
@@ -141,11 +141,11 @@ class LatentTraining(Optimiser, LatentConfig, DataRun):
     evaluate_every: float = 1.0
     batch: int = 512
     learning_rate: float = 1e-3
-    beta: Annotated[Range, "weight of the KL divergence, first and last, geometric in between, as PULSE's"] = (
+    beta: Annotated[Range, "weight of the KL divergence, first and last, geometric in between, as in PULSE"] = (
         0.01,
         0.001,
     )
-    change: Annotated[float, "weight of the change of latents over a tick; this is PULSE's"] = 0.005
+    change: Annotated[float, "weight of the change of latents over a tick, as in PULSE"] = 0.005
 
     def __post_init__(self) -> None:
         for part in (DataRun, LatentConfig, Optimiser):
@@ -155,14 +155,14 @@ class LatentTraining(Optimiser, LatentConfig, DataRun):
 
 
 @dataclass(frozen=True)
-class SampleRun(Run):
+class SampleRun(TrainingRun):
     """A run that is measured in ticks of experience."""
 
-    FREE: ClassVar[frozenset[str]] = Run.FREE | {"worlds"}
+    FREE: ClassVar[frozenset[str]] = TrainingRun.FREE | {"worlds"}
 
     minutes: float = 90.0
     evaluate_every: float = 2.0
-    samples: Annotated[float, "ticks of experience to train for; learning rate, noise and pushes change over them"] = (
+    samples: Annotated[float, "ticks of experience to train for, over which learning rate, noise and pushes change"] = (
         20e6
     )
     worlds: Annotated[int, "simulated robots side by side"] = 512
@@ -181,16 +181,16 @@ class SampleRun(Run):
 class Ppo(Layers, SampleRun):
     """PPO, whatever the environment."""
 
-    noise: Annotated[Range, "deviation of actions at the start and at the end: left to learn, it stayed high"] = (
+    noise: Annotated[Range, "standard deviation of actions, at the start and at the end; a learned one stayed high"] = (
         0.22,
         0.07,
     )
     learning_rate: Annotated[float, "learning rate at the start; it falls to 15 %"] = 4e-4
-    discount: Annotated[float, "discount of a tick"] = 0.99
-    horizon: Annotated[int, "ticks a world between updates"] = 24
-    epochs: Annotated[int, "times each sample is used"] = 3
-    mini_batches: Annotated[int, "updates an epoch"] = 6
-    mirror: Annotated[float, "weight of the squared difference between an action and its mirror image's"] = 1.0
+    discount: Annotated[float, "discount per tick"] = 0.99
+    horizon: Annotated[int, "ticks per world between updates"] = 24
+    epochs: Annotated[int, "passes over each batch of samples"] = 3
+    mini_batches: Annotated[int, "updates per epoch"] = 6
+    mirror: Annotated[float, "weight of the squared difference between an action and that of the mirrored state"] = 1.0
 
     def __post_init__(self) -> None:
         SampleRun.__post_init__(self)
@@ -209,15 +209,17 @@ class TrackingSettings:
     episode_seconds: Annotated[float, "longest episode [s]"] = 20.0
     randomised: Annotated[float, "share of episodes on a robot drawn at random; the others are nominal"] = 0.8
     hardest_push: Annotated[
-        float, "of the robot's top speed, grown to over the first fifth of the training; pushes are uniform from zero"
+        float, "hardest push, of the robot's top speed; pushes are uniform from zero and grow over the first fifth"
     ] = 0.9
     push_every: Annotated[Range, "time between pushes [s]"] = (0.6, 2.0)
     command_every: Annotated[Range, "time between commands [s]"] = (2.0, 5.0)
     stand: Annotated[float, "share of commands that are zero"] = 0.1
     forward: Annotated[float, "share of commands straight ahead, half of them in the upper third of the speeds"] = 0.2
-    single: Annotated[float, "share of commands that are backward, sideways or a turn alone"] = 0.2
-    backward: Annotated[float, "share of commands backward while turning and side-stepping: where it fell most"] = 0.25
-    rewards: Annotated[dict[str, float], "weights of reward terms (policy/tracker/rewards.py), a tick each"] = field(
+    single: Annotated[float, "share of commands that are only backward, sideways or a turn"] = 0.2
+    backward: Annotated[
+        float, "share of commands that walk backward while turning and side-stepping, where falls were most frequent"
+    ] = 0.25
+    rewards: Annotated[dict[str, float], "weights of reward terms, per tick (policy/tracker/rewards.py)"] = field(
         default_factory=lambda: {
             "velocity": 3.0,
             "progress": 0.6,
@@ -252,7 +254,7 @@ class TrackingSettings:
 class ExpertTraining(TrackingSettings, Ppo):
     """`servoid train expert`."""
 
-    plain_odometry: Annotated[bool, "no learned correction in the estimator"] = False
+    plain_odometry: Annotated[bool, "estimate without the learned correction of odometry"] = False
 
     def __post_init__(self) -> None:
         for part in (Ppo, TrackingSettings):
@@ -263,9 +265,9 @@ class ExpertTraining(TrackingSettings, Ppo):
 class OdometryWalks:
     """What walks, to learn from and to measure."""
 
-    policy: Annotated[tuple[str, ...], "policies or checkpoints that walk, beside the gait"] = ("expert", "diffusion")
-    worlds: Annotated[int, "simulated robots that walk, of all policies together"] = 192
-    seconds: Annotated[float, "seconds that each walks"] = 60.0
+    policy: Annotated[tuple[str, ...], "policies or checkpoints that walk, besides the gait"] = ("expert", "diffusion")
+    worlds: Annotated[int, "simulated robots that walk, over all policies"] = 192
+    seconds: Annotated[float, "seconds that each of them walks"] = 60.0
     walks: Annotated[int, "walks of each policy on which the drift is measured"] = 64
     walk_seconds: Annotated[float, "seconds of each of these walks"] = 30.0
 
@@ -286,8 +288,8 @@ class OdometryTraining(DecayedOptimiser, Layers, OdometryWalks, StepRun):
     hidden: tuple[int, ...] = (128, 64)
     batch: int = 48
     learning_rate: float = 2e-3
-    chunk: Annotated[int, "ticks whose mean error counts beside each tick's: the mean is what drifts"] = 50
-    mean_weight: Annotated[float, "weight of that mean's squared error"] = 20.0
+    chunk: Annotated[int, "ticks over which the mean error counts too, because the mean is what drifts"] = 50
+    mean_weight: Annotated[float, "weight of the squared mean error"] = 20.0
 
     def __post_init__(self) -> None:
         for part in (StepRun, OdometryWalks, Layers, Optimiser):
@@ -297,10 +299,10 @@ class OdometryTraining(DecayedOptimiser, Layers, OdometryWalks, StepRun):
 
 
 TITLES: Mapping[type, str] = {  # of the help, in its order
-    Run: "run", StepRun: "run", DataRun: "run", SampleRun: "run",
+    TrainingRun: "run", StepRun: "run", DataRun: "run", SampleRun: "run",
     OdometryWalks: "walks",
     DenoiserShape: "network", DiffusionNetwork: "network", LatentConfig: "network", Layers: "network",
-    Objective: "objective", LatentTraining: "objective", OdometryTraining: "objective", Ppo: "objective (PPO)",
+    TrainingObjective: "objective", LatentTraining: "objective", OdometryTraining: "objective", Ppo: "objective (PPO)",
     Optimiser: "optimiser", DecayedOptimiser: "optimiser", DiffusionTraining: "optimiser",
     TrackingSettings: "episodes and rewards", ExpertTraining: "episodes and rewards",
 }  # fmt: skip

@@ -25,7 +25,7 @@ _SPEED = 32  # plays a page as its times say
 
 
 @dataclass(frozen=True)
-class Step:
+class PageStep:
     goals: Mapping[int, int]  # servo ID -> encoder ticks
     time: int  # units
     pause: int  # units, after it
@@ -40,7 +40,7 @@ class Page:
     repeat: int
     acceleration: int  # units that speeding up and slowing down take
     next: int  # page, or 0
-    steps: tuple[Step, ...]
+    steps: tuple[PageStep, ...]
 
 
 def read_pages(path: Path) -> dict[int, Page]:
@@ -51,7 +51,7 @@ def read_pages(path: Path) -> dict[int, Page]:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     if len(content) != PAGES * PAGE_BYTES:
         whole = PAGES * PAGE_BYTES
-        raise ConfigError(f"{path}: has {len(content)} bytes, and an action file {whole}: it is cut off, or none")
+        raise ConfigError(f"{path}: has {len(content)} bytes instead of {whole}: cut off, or not an action file")
     pages = {}
     for number in range(PAGES):
         raw = content[number * PAGE_BYTES : (number + 1) * PAGE_BYTES]
@@ -68,10 +68,10 @@ def read_pages(path: Path) -> dict[int, Page]:
 def _page(path: Path, number: int, raw: bytes) -> Page:
     count, schedule, speed = raw[20], raw[16], raw[22]
     if count > STEPS:
-        raise ConfigError(f"{path}: page {number}: {count} steps, where {STEPS} fit")
+        raise ConfigError(f"{path}: page {number}: has {count} steps, but only {STEPS} fit")
     if schedule != _TIME_SCHEDULE:
         raise ConfigError(
-            f"{path}: page {number}: its steps are timed by speed, which is not read yet: save it by time"
+            f"{path}: page {number}: its steps are timed by speed, which is not supported yet: save it timed by time"
         )
     if speed == 0:
         raise ConfigError(f"{path}: page {number}: its play speed is 0")
@@ -80,7 +80,7 @@ def _page(path: Path, number: int, raw: bytes) -> Page:
         step = raw[64 + i * STEP_BYTES : 64 + (i + 1) * STEP_BYTES]
         words = np.frombuffer(step[:62], "<u2")
         goals = {id: int(word) for id, word in enumerate(words) if not word & (_NO_GOAL | _NO_TORQUE)}
-        steps.append(Step(goals, time=(step[63] * speed) // _SPEED, pause=(step[62] * _SPEED) // speed))
+        steps.append(PageStep(goals, time=(step[63] * speed) // _SPEED, pause=(step[62] * _SPEED) // speed))
     name = raw[:14].split(b"\0")[0].decode("ascii", "replace").strip()
     return Page(number, name, max(raw[15], 1), raw[24], raw[25], tuple(steps))
 
@@ -94,7 +94,7 @@ def chain(pages: Mapping[int, Page], first: int, path: Path) -> list[Page]:
             asked = f"page {number}" + (f", which page {followed[-1].number} goes on with," if followed else "")
             raise ConfigError(f"{path}: {asked} is empty; pages with a motion: {', '.join(map(str, pages))}")
         if any(page.number == number for page in followed):
-            raise ConfigError(f"{path}: the pages from {first} on loop at page {number}: such a motion has no end")
+            raise ConfigError(f"{path}: the pages from {first} on loop at page {number}, so the motion never ends")
         followed.append(pages[number])
         number = pages[number].next
     return followed

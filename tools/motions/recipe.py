@@ -57,7 +57,7 @@ def make_clips(file: Path, recipe: Recipe, robot: Robot) -> Iterator[Clip]:
     pages, made = read_pages(file), dict[str, Clip]()
     for wanted in recipe.clips:
         if wanted.after is not None and wanted.after not in made:
-            raise ConfigError(f"clip '{wanted.name}': after: '{wanted.after}' is no clip before it")
+            raise ConfigError(f"clip '{wanted.name}': after: '{wanted.after}' is not an earlier clip")
         start = robot.home if wanted.after is None else made[wanted.after].joints[-1]
         made[wanted.name] = _clip(file, wanted, chain(pages, wanted.page, file), recipe.licence, robot, start)
         yield made[wanted.name]

@@ -29,7 +29,7 @@ _RUNS_ON = b"\xff\xff\xfd"
 STUFFED = b"\xff\xff\xfd\xfd"
 
 
-class Instruction(IntEnum):
+class InstructionCode(IntEnum):
     PING = 0x01
     READ = 0x02
     WRITE = 0x03
@@ -114,41 +114,41 @@ def packet(id: int, instruction: int, params: bytes = b"") -> bytes:
 
 
 def ping(id: int = BROADCAST) -> bytes:
-    return packet(id, Instruction.PING)
+    return packet(id, InstructionCode.PING)
 
 
 def read(id: int, address: int, length: int) -> bytes:
-    return packet(id, Instruction.READ, struct.pack("<HH", address, length))
+    return packet(id, InstructionCode.READ, struct.pack("<HH", address, length))
 
 
 def write(id: int, address: int, data: bytes) -> bytes:
-    return packet(id, Instruction.WRITE, struct.pack("<H", address) + data)
+    return packet(id, InstructionCode.WRITE, struct.pack("<H", address) + data)
 
 
 def reg_write(id: int, address: int, data: bytes) -> bytes:
-    return packet(id, Instruction.REG_WRITE, struct.pack("<H", address) + data)
+    return packet(id, InstructionCode.REG_WRITE, struct.pack("<H", address) + data)
 
 
 def action(id: int = BROADCAST) -> bytes:
-    return packet(id, Instruction.ACTION)
+    return packet(id, InstructionCode.ACTION)
 
 
 def reboot(id: int) -> bytes:
-    return packet(id, Instruction.REBOOT)
+    return packet(id, InstructionCode.REBOOT)
 
 
 def clear(id: int) -> bytes:
     """Forget whole turns: the present position becomes that within a turn."""
-    return packet(id, Instruction.CLEAR, CLEAR_REVOLUTIONS)
+    return packet(id, InstructionCode.CLEAR, CLEAR_REVOLUTIONS)
 
 
 def factory_reset(id: int, spare: Reset) -> bytes:
-    return packet(id, Instruction.FACTORY_RESET, bytes([spare]))
+    return packet(id, InstructionCode.FACTORY_RESET, bytes([spare]))
 
 
 def sync_read(ids: Sequence[int], address: int, length: int, *, fast: bool = False) -> bytes:
     """Read the same registers of many: each answers with a status packet, in the order of `ids`; or all in a frame."""
-    instruction = Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ
+    instruction = InstructionCode.FAST_SYNC_READ if fast else InstructionCode.SYNC_READ
     return packet(BROADCAST, instruction, struct.pack("<HH", address, length) + bytes(_unique(ids)))
 
 
@@ -160,13 +160,13 @@ def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
             raise ValueError(f"servo {id}: {len(value)} bytes to write, expected {length}")
         body.append(id)
         body += value
-    return packet(BROADCAST, Instruction.SYNC_WRITE, bytes(body))
+    return packet(BROADCAST, InstructionCode.SYNC_WRITE, bytes(body))
 
 
 def bulk_read(parts: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
     """Read (ID, address, length) of many, whose registers may differ."""
     _unique([id for id, _, _ in parts])
-    instruction = Instruction.FAST_BULK_READ if fast else Instruction.BULK_READ
+    instruction = InstructionCode.FAST_BULK_READ if fast else InstructionCode.BULK_READ
     return packet(BROADCAST, instruction, b"".join(struct.pack("<BHH", *part) for part in parts))
 
 
@@ -174,7 +174,7 @@ def bulk_write(parts: Sequence[tuple[int, int, bytes]]) -> bytes:
     """Write (ID, address, data) of many, whose registers may differ. Nobody answers."""
     _unique([id for id, _, _ in parts])
     body = b"".join(struct.pack("<BHH", id, address, len(data)) + data for id, address, data in parts)
-    return packet(BROADCAST, Instruction.BULK_WRITE, body)
+    return packet(BROADCAST, InstructionCode.BULK_WRITE, body)
 
 
 class SyncWriter:
@@ -194,7 +194,7 @@ class SyncWriter:
             body = self._body.pack(*fields)
         except struct.error as error:
             raise ValueError(f"sync write of {list(values)}: {error}") from None
-        return packet(BROADCAST, Instruction.SYNC_WRITE, self._start + body)
+        return packet(BROADCAST, InstructionCode.SYNC_WRITE, self._start + body)
 
 
 # Answers -------------------------------------------------------------------------------------------------------------
@@ -202,7 +202,7 @@ class SyncWriter:
 
 def status(id: int, error: int = 0, data: bytes = b"") -> bytes:
     """The answer of a servo; `error` with the alert bit."""
-    return packet(id, Instruction.STATUS, bytes([error]) + data)
+    return packet(id, InstructionCode.STATUS, bytes([error]) + data)
 
 
 def fast_status(blocks: Sequence[tuple[int, int, bytes]]) -> bytes:
@@ -216,7 +216,7 @@ def fast_status(blocks: Sequence[tuple[int, int, bytes]]) -> bytes:
 
 def as_status(received: Packet) -> Status | None:
     """The status that a packet is, or None: an instruction (an echo, another master) or an empty one."""
-    if received.instruction != Instruction.STATUS or not received.params or received.id == BROADCAST:
+    if received.instruction != InstructionCode.STATUS or not received.params or received.id == BROADCAST:
         return None
     error = received.params[0]
     return Status(received.id, error & ~ALERT, bool(error & ALERT), received.params[1:])
@@ -224,7 +224,7 @@ def as_status(received: Packet) -> Status | None:
 
 def fast_head(lengths: Sequence[int]) -> bytes:
     """How the answer to a fast read of `lengths` bytes begins."""
-    return _HEAD.pack(HEADER, BROADCAST, 1 + FAST_BLOCK * len(lengths) + sum(lengths), Instruction.STATUS)
+    return _HEAD.pack(HEADER, BROADCAST, 1 + FAST_BLOCK * len(lengths) + sum(lengths), InstructionCode.STATUS)
 
 
 def parse_fast(stream: bytes, ids: Sequence[int], lengths: Sequence[int]) -> list[Status | None]:
@@ -287,10 +287,10 @@ def whole_sync(stream: bytes, heads: Sequence[bytes], length: int) -> list[bytes
 
 def status_head(id: int, length: int) -> bytes:
     """How the answer of a servo begins that has no error, no alert, and `length` bytes of data without stuffing."""
-    return _HEAD.pack(HEADER, id, length + 4, Instruction.STATUS) + b"\0"
+    return _HEAD.pack(HEADER, id, length + 4, InstructionCode.STATUS) + b"\0"
 
 
-class Parser:
+class PacketParser:
     """Finds packets in a stream that comes in pieces, among any garbage. It never raises and never grows without bound.
 
     Whatever does not turn out to be a packet with a good CRC is passed over byte by byte, so that a false header cannot
@@ -362,7 +362,7 @@ class Parser:
         if crc16(frame[:-2]) != frame[-2] | frame[-1] << 8:
             return None, end
         params = frame[8:-2]
-        if STUFFED in params and not (id == BROADCAST and frame[7] == Instruction.STATUS):
+        if STUFFED in params and not (id == BROADCAST and frame[7] == InstructionCode.STATUS):
             params = unstuff(params)
         return Packet(id, frame[7], params), end
 

@@ -15,7 +15,17 @@ from typing import NamedTuple
 from servoid.hw.clock import WallClock
 from servoid.hw.contracts.body import Clock
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import MAX_ID, OVERHEAD, Packet, Parser, Reset, Status, as_status, parse_fast
+from servoid.hw.dynamixel.protocol.codec import (
+    FRAME_BITS,
+    MAX_ID,
+    OVERHEAD,
+    Packet,
+    PacketParser,
+    Reset,
+    Status,
+    as_status,
+    parse_fast,
+)
 from servoid.hw.dynamixel.protocol.tables import Item
 from servoid.hw.dynamixel.transport.group_read import GroupRead, Request
 from servoid.hw.dynamixel.transport.port import Port, SerialPort, drain
@@ -23,7 +33,6 @@ from servoid.hw.dynamixel.transport.port import Port, SerialPort, drain
 MARGIN = 0.0035  # s after the predicted end: a USB adapter's latency timer of 1 ms, and what may hold up host or servo
 LONGEST_RETURN_DELAY = 254 * 2e-6  # s that a servo may be set to wait before it answers
 GAP_NS = 2_000  # before an answer, at return delay 0
-BITS = 10  # of a byte on the wire
 PING_DATA = 3  # bytes: model number, firmware
 PING_GAP_NS = 3_000_000  # that a servo may take to its turn in a broadcast ping
 EEPROM_SECONDS = 0.02  # that a servo may take to write its EEPROM before it answers
@@ -75,7 +84,7 @@ class Bus:
         self.margin = margin
         # In real time the line itself says when something comes; by a simulated clock it has to be asked.
         self._wakes = port if isinstance(port, SerialPort) and isinstance(clock, WallClock) else None
-        self._parser = Parser()
+        self._parser = PacketParser()
         self._dirty = True  # something may still come that must not be taken for an answer
         self._busy_until = 0
         self._quiet_ns = _QUIET_NS
@@ -366,7 +375,7 @@ class Bus:
         return [status for packet in packets if (status := as_status(packet)) is not None]
 
     def _byte_ns(self) -> int:
-        return round(BITS * 1e9 / self.port.baud)
+        return round(FRAME_BITS * 1e9 / self.port.baud)
 
     def _wire_ns(self, size: int, answers: int, gaps: int) -> int:
         """How long so many bytes of so many answers take; a fast frame has one gap for all."""

@@ -53,12 +53,12 @@ ENGINES: dict[str, EngineKind] = {
 def check_engine(name: str) -> None:
     """Raise ConfigError, with the remedy, where there is no such engine or it is not installed. Imports nothing."""
     if name not in ENGINES:
-        raise ConfigError(f"no engine is called '{name}': {nearest(name, ENGINES)}; there are {', '.join(ENGINES)}")
+        raise ConfigError(f"unknown engine '{name}': {nearest(name, ENGINES)}")
     kind = ENGINES[name]
     missing = [package for package in kind.packages if find_spec(package) is None]
     if missing:
         raise ConfigError(
-            f"the engine '{name}' needs {' and '.join(missing)}, which this Python does not have: "
+            f"the engine '{name}' needs {' and '.join(missing)}, which are not installed: "
             f"pip install 'servoid[{kind.extra}]', or set engine: {REFERENCE}"
         )
 
@@ -82,8 +82,8 @@ def load_engine(name: str, denoiser: Denoiser) -> Engine:
     error = deviation(engine, denoiser)
     if not error <= ENGINES[name].tolerance:
         raise ConfigError(
-            f"the engine '{name}' differs from torch by {error:.2g} of its output on this network, and "
-            f"{ENGINES[name].tolerance:g} is allowed: set another engine ({', '.join(ENGINES)})"
+            f"the engine '{name}' differs from torch by {error:.2g} of its output on this network, more than the "
+            f"{ENGINES[name].tolerance:g} allowed: set another engine ({', '.join(ENGINES)})"
         )
     return engine
 

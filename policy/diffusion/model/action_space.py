@@ -45,11 +45,11 @@ def latents_in(path: Path, head: Mapping[str, Any], tensors: Mapping[str, Array]
     n, planned = len(robot.joints), head["config"]["action_size"]
     if PREFIX not in head:
         if planned != n:
-            raise CheckpointError(f"{path}: plans {planned} numbers a tick, and {robot.name} has {n} joints")
+            raise CheckpointError(f"{path}: plans {planned} numbers a tick, but {robot.name} has {n} joints")
         return None
     made = LatentActions.from_tensors(path, head[PREFIX], checkpoint.part(tensors, PREFIX), n)
     if made.size != planned:
-        raise CheckpointError(f"{path}: plans {planned} numbers a tick, and its latents have {made.size}")
+        raise CheckpointError(f"{path}: plans {planned} numbers a tick, but its latents have {made.size}")
     return made
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.policy import checkpoint
-from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.checkpoint import CheckpointError, Origin
 from servoid.policy.diffusion.model.action_space import JOINT_TARGETS, PREFIX, ActionSpace, latents_in
 from servoid.policy.diffusion.model.config import KIND, DenoiserConfig, check_fit
 from servoid.policy.diffusion.model.denoiser import Denoiser
@@ -41,41 +41,34 @@ class Model:
         return self.space if isinstance(self.space, LatentActions) else None
 
 
-def save(
-    path: Path,
-    weights: Mapping[str, Tensor],
-    config: DenoiserConfig,
-    states: Normaliser,
-    actions: Normaliser,
-    robot: Robot,
-    *,
-    data: str,
-    licence: str,
-    results: Mapping[str, Any],
-    training: Mapping[str, Any],
-    latents: LatentActions | None = None,
-) -> None:
-    """Write `weights` (a denoiser's state_dict) and all that is needed to run them. Raises CheckpointError.
+@dataclass(frozen=True)
+class Trained:
+    """What training made: a denoiser's weights (a state_dict), what turns features into its inputs, and what its
+    actions are where they are no joint targets."""
 
-    `latents` are what its actions are where they are no joint targets.
-    """
-    n = len(robot.joints)
+    weights: Mapping[str, Tensor]
+    config: DenoiserConfig
+    states: Normaliser
+    actions: Normaliser
+    latents: LatentActions | None = None
+
+
+def save(path: Path, trained: Trained, robot: Robot, origin: Origin) -> None:
+    """Write all that is needed to run a trained network. Raises CheckpointError."""
+    n, latents = len(robot.joints), trained.latents
     head = checkpoint.header(
         KIND,
         robot,
-        config=asdict(config),
-        data=data,
-        licence=licence,
-        results=results,
-        training=dict(training),
+        config=asdict(trained.config),
+        **vars(origin),
         raw_layout=raw_layout(n).to_header(),
         token_layout=token_layout(n).to_header(),
-        **({} if latents is None else {PREFIX: latents.describe(n)}),
     )
-    tensors: dict[str, Array] = {f"denoiser.{k}": v.detach().float().cpu().numpy() for k, v in weights.items()}
-    for name, normaliser in (("states", states), ("actions", actions)):
+    tensors: dict[str, Array] = {f"denoiser.{k}": v.detach().float().cpu().numpy() for k, v in trained.weights.items()}
+    for name, normaliser in (("states", trained.states), ("actions", trained.actions)):
         tensors |= {f"{name}.{key}": value for key, value in normaliser.to_numpy().items()}
     if latents is not None:
+        head[PREFIX] = latents.describe(n)
         tensors |= {f"{PREFIX}.{key}": value for key, value in latents.to_tensors().items()}
     checkpoint.write(path, tensors, head)
 

@@ -29,13 +29,13 @@ class DenoiserShape:
     """What may be chosen of a denoiser's shape, whatever the robot."""
 
     layers: Annotated[int, "layers of the transformer"] = 2
-    width: Annotated[int, "numbers of a token inside it"] = 192
-    heads: Annotated[int, "attention heads; they divide the width"] = 4
+    width: Annotated[int, "numbers in a token"] = 192
+    heads: Annotated[int, "attention heads; the width is a multiple of them"] = 4
     history: Annotated[int, "ticks of past and present states"] = 4
     horizon: Annotated[int, "ticks to come"] = 16
     levels: Annotated[int, "noise levels"] = 20
     mask: Annotated[str, "attention mask (docs/diffusion.md)"] = "state_full_action_causal"
-    actions: Annotated[int, "ticks to come with actions; 0: the whole horizon"] = 0
+    actions: Annotated[int, "ticks to come that have actions; 0: the whole horizon"] = 0
 
     def __post_init__(self) -> None:
         for name in ("layers", "width", "heads", "history", "horizon", "levels"):
@@ -54,14 +54,16 @@ class DenoiserShape:
 
 
 @dataclass(frozen=True)
-class Objective:
+class TrainingObjective:
     """What a denoiser is trained for, beside the plain squared error."""
 
-    inference_delay: Annotated[int, "longest delay of a plan to train for, in ticks, whose actions are given"] = 2
+    inference_delay: Annotated[
+        int, "longest delay of a plan to train for, in ticks; the actions within it are given"
+    ] = 2
     near_actions: Annotated[int, "ticks to come whose actions count in full"] = 8
     far_actions: Annotated[float, "weight of the actions beyond; 0 cuts them, as Diffuse-CLoC does"] = 0.2
-    min_snr: Annotated[float, "clip of the signal-to-noise ratio that weights tokens, 5 for one; 0: no weights"] = 0.0
-    action_rate: Annotated[float, "weight of the error of the change from one action to the next"] = 0.0
+    min_snr: Annotated[float, "clip of the signal-to-noise ratio that weights tokens, such as 5; 0: no weights"] = 0.0
+    action_rate: Annotated[float, "weight of the error in the change from one action to the next"] = 0.0
     monotone: Annotated[
         float, "share of windows whose noise rises along the window, at most two thirds of what --forcing leaves"
     ] = 0.25
@@ -138,7 +140,7 @@ def check_fit(path: Path, head: Mapping[str, Any], robot: Robot) -> DenoiserConf
         raise CheckpointError(f"{path}: the network's config in its header cannot be used: {error}") from error
     if config.text_size != size:
         raise CheckpointError(
-            f"{path}: reads instructions as {config.text_size} numbers, and the encoder '{config.text}' gives {size}: "
+            f"{path}: reads instructions as {config.text_size} numbers, but the encoder '{config.text}' gives {size}: "
             f"use the program that trained it, of commit {head['git_commit']}, or train it again"
         )
     return config

@@ -62,7 +62,7 @@ def check_mask(name: str) -> None:
     """Raise ConfigError with the nearest name where no mask is called `name`."""
     if name not in MASKS:
         near = get_close_matches(name, MASKS, n=1, cutoff=0.0)[0]
-        raise ConfigError(f"no attention mask is called '{name}': did you mean '{near}'? There are {', '.join(MASKS)}.")
+        raise ConfigError(f"unknown attention mask '{name}': did you mean '{near}'? Known: {', '.join(MASKS)}")
 
 
 def attention_mask(name: str, state_ticks: Array, action_ticks: Array) -> Array:

@@ -56,7 +56,7 @@ class VirtualBackend:
         Raises BackendError when the rig does not start or is not as the robot's file says; nothing is left behind.
         """
         if self._rig is not None:
-            raise BackendError("the virtual rig is connected already")
+            raise BackendError("the virtual rig is already connected")
         try:
             rig = self._rig = RigProcess(on_the_board(self._robot), seed=self._seed, randomise=self._randomise)
             if self.stage is not None:

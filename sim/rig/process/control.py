@@ -19,7 +19,7 @@ from servoid.hw.robot.description import Robot, load_robot, save_robot
 from servoid.sim.model import build
 from servoid.sim.rig.servo.factory_state import FactoryState
 from servoid.sim.scene import plain, scene_sensors
-from servoid.sim.truth import Truth
+from servoid.sim.truth import SimulatedTruth
 
 _START_SECONDS = 60.0
 _ANSWER_SECONDS = 60.0
@@ -148,9 +148,9 @@ class RigTruth:
         }
         self._recent, self._scene = np.zeros((1, 1, model.nsensordata)), scene_sensors(model)
         qpos, qvel, sensors = self._arrays.values()
-        self._truth = Truth(model, robot, qpos, qvel, sensors, self._recent)
+        self._truth = SimulatedTruth(model, robot, qpos, qvel, sensors, self._recent)
 
-    def fetch(self) -> Truth:
+    def fetch(self) -> SimulatedTruth:
         """The truth of now; a later call changes what this one returned."""
         answer = self._control.call("truth")
         for name, array in self._arrays.items():

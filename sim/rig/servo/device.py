@@ -7,7 +7,14 @@ from __future__ import annotations
 
 import struct
 
-from servoid.hw.dynamixel.protocol.codec import BROADCAST, CLEAR_REVOLUTIONS, Instruction, Reset, Status, StatusError
+from servoid.hw.dynamixel.protocol.codec import (
+    BROADCAST,
+    CLEAR_REVOLUTIONS,
+    InstructionCode,
+    Reset,
+    Status,
+    StatusError,
+)
 from servoid.hw.dynamixel.protocol.tables import ControlTable, Item
 from servoid.sim.rig.servo.registers import Registers
 
@@ -22,7 +29,8 @@ _RAM_RESTORE = 2  # bit of the startup configuration
 _SAFE_RESET_FIRMWARE = 42  # from which a factory reset of everything to everybody is not executed
 _KEPT = {Reset.ALL: (), Reset.EXCEPT_ID: ("id",), Reset.EXCEPT_ID_AND_BAUD: ("id", "baud_rate")}
 _FOR_SHADOWS = (
-    Instruction.WRITE, Instruction.REG_WRITE, Instruction.ACTION, Instruction.REBOOT, Instruction.CLEAR,
+    InstructionCode.WRITE, InstructionCode.REG_WRITE, InstructionCode.ACTION, InstructionCode.REBOOT,
+    InstructionCode.CLEAR,
 )  # fmt: skip
 LAST_SHADOW = 252  # above it the secondary ID is none
 PROTOCOL_1 = 1  # value of the register
@@ -120,9 +128,9 @@ class VirtualDevice(Registers):
         wants one. It carries the ID that was asked, whatever the instruction made of it."""
         id, level = self.id, self._level
         error, data = self._execute(instruction, params, now_ns, id if to is None else to)
-        if instruction == Instruction.PING:
+        if instruction == InstructionCode.PING:
             wanted = 0
-        elif instruction == Instruction.READ:
+        elif instruction == InstructionCode.READ:
             wanted = 1
         else:
             wanted = 2
@@ -130,12 +138,12 @@ class VirtualDevice(Registers):
 
     def execute_as_shadow(self, instruction: int, params: bytes, now_ns: int) -> None:
         """Execute what was sent to the secondary ID: nobody answers, and EEPROM cannot be written that way."""
-        if instruction in (Instruction.WRITE, Instruction.REG_WRITE):
+        if instruction in (InstructionCode.WRITE, InstructionCode.REG_WRITE):
             self.write_as_shadow(int.from_bytes(params[:2], "little"), params[2:], now_ns, instruction)
         elif instruction in _FOR_SHADOWS:
             self._execute(instruction, params, now_ns, self.id)
 
-    def write_as_shadow(self, address: int, data: bytes, now_ns: int, instruction: int = Instruction.WRITE) -> None:
+    def write_as_shadow(self, address: int, data: bytes, now_ns: int, instruction: int = InstructionCode.WRITE) -> None:
         writes = self.resolve(address, data)
         if not isinstance(writes, StatusError) and not any(item.eeprom for item, _ in writes):
             self._execute(instruction, struct.pack("<H", address) + data, now_ns, self.id)
@@ -151,30 +159,30 @@ class VirtualDevice(Registers):
 
     def _execute(self, instruction: int, params: bytes, now_ns: int, to: int) -> tuple[StatusError, bytes]:
         word = int.from_bytes(params[:2], "little")
-        if instruction == Instruction.PING:
+        if instruction == InstructionCode.PING:
             return StatusError.NONE, struct.pack("<HB", self.get("model_number"), self.get("firmware_version"))
-        if instruction == Instruction.READ:
+        if instruction == InstructionCode.READ:
             if len(params) != 4:
                 return StatusError.DATA_LENGTH, b""
             return self.read(word, int.from_bytes(params[2:4], "little"), now_ns)
-        if instruction in (Instruction.WRITE, Instruction.REG_WRITE):
+        if instruction in (InstructionCode.WRITE, InstructionCode.REG_WRITE):
             if len(params) < 3:
                 return StatusError.DATA_LENGTH, b""
-            if instruction == Instruction.WRITE:
+            if instruction == InstructionCode.WRITE:
                 return self.write(word, params[2:], now_ns), b""
             error = self._check(self.resolve(word, params[2:]))
             if error is StatusError.NONE:
                 self._registered = word, params[2:]
                 self._mark_registered()
             return error, b""
-        if instruction == Instruction.ACTION:
+        if instruction == InstructionCode.ACTION:
             return self._action(now_ns), b""
-        if instruction == Instruction.REBOOT:
+        if instruction == InstructionCode.REBOOT:
             self.reboot(now_ns)
             return StatusError.NONE, b""
-        if instruction == Instruction.FACTORY_RESET:
+        if instruction == InstructionCode.FACTORY_RESET:
             return self._factory_reset(params, now_ns, to), b""
-        if instruction == Instruction.CLEAR:
+        if instruction == InstructionCode.CLEAR:
             if params != CLEAR_REVOLUTIONS:
                 return StatusError.DATA_RANGE, b""
             return self.clear(now_ns), b""

@@ -19,7 +19,7 @@ from servoid.hw.seeds import Stream, generator
 from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.randomise import Body, draw
 from servoid.sim.scene import robot_bodies, scene_sensors
-from servoid.sim.truth import Truth
+from servoid.sim.truth import SimulatedTruth
 from servoid.sim.worlds import NOISE_ROWS, VELOCITY_NOISE, with_errors
 
 CLEARANCE = 0.05  # m between the soles and the floor while the robot is held
@@ -58,7 +58,7 @@ class Plant:
         self._noise = np.zeros((NOISE_ROWS, 6 + len(joints)))
         self._recent = np.zeros((max(round(robot.dt / TIMESTEP), 1), self.model.nsensordata))  # of the last tick
         views = (view[None] for view in (self.data.qpos, self.data.qvel, self.data.sensordata, self._recent))
-        self.truth = Truth(self.model, robot, *views)
+        self.truth = SimulatedTruth(self.model, robot, *views)
         self.reset(0)
 
     def reset(self, seed: int, *, randomise: bool = False) -> None:

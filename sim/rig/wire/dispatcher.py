@@ -11,7 +11,15 @@ import struct
 from collections.abc import Iterable, Iterator, Sequence
 
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import FRAME_BITS, HEADER, Instruction, Packet, Parser, Status, StatusError
+from servoid.hw.dynamixel.protocol.codec import (
+    FRAME_BITS,
+    HEADER,
+    InstructionCode,
+    Packet,
+    PacketParser,
+    Status,
+    StatusError,
+)
 from servoid.hw.dynamixel.protocol.crc import crc16
 from servoid.sim.rig.servo.device import VirtualDevice
 from servoid.sim.rig.wire import protocol1
@@ -35,7 +43,7 @@ class Dispatcher:
         self.wire, self.injector = wire, injector
         self.devices: list[VirtualDevice] = []
         self.instructions = 0
-        self._parser, self._old_parser = Parser(), protocol1.Protocol1Parser()
+        self._parser, self._old_parser = PacketParser(), protocol1.Protocol1Parser()
         self._heard_ns = 0
 
     def receive(self, data: bytes, baud: int, now_ns: int) -> None:
@@ -47,7 +55,7 @@ class Dispatcher:
         spoiled = self._parser.bad_crc
         packets = self._parser.feed(data)
         for packet in packets:
-            if packet.instruction != Instruction.STATUS:
+            if packet.instruction != InstructionCode.STATUS:
                 self._dispatch(packet, self._listening(baud, now_ns), now_ns)
         if not packets and self._parser.bad_crc > spoiled:
             self._refuse(data, self._listening(baud, now_ns), now_ns)
@@ -74,16 +82,16 @@ class Dispatcher:
         for device in listening:
             device.heard(now_ns)
         instruction, params = packet.instruction, packet.params
-        if instruction in (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ):
+        if instruction in (InstructionCode.SYNC_READ, InstructionCode.FAST_SYNC_READ):
             if len(params) > 4:
                 address, length = struct.unpack_from("<HH", params)
                 parts = [(id, address, length) for id in params[4:]]
-                self._read_group(parts, listening, instruction == Instruction.FAST_SYNC_READ, now_ns)
-        elif instruction in (Instruction.BULK_READ, Instruction.FAST_BULK_READ):
+                self._read_group(parts, listening, instruction == InstructionCode.FAST_SYNC_READ, now_ns)
+        elif instruction in (InstructionCode.BULK_READ, InstructionCode.FAST_BULK_READ):
             parts = list(struct.iter_unpack("<BHH", params[: len(params) // 5 * 5]))
-            self._read_group(parts, listening, instruction == Instruction.FAST_BULK_READ, now_ns)
-        elif instruction in (Instruction.SYNC_WRITE, Instruction.BULK_WRITE):
-            writes = _sync_writes(params) if instruction == Instruction.SYNC_WRITE else _bulk_writes(params)
+            self._read_group(parts, listening, instruction == InstructionCode.FAST_BULK_READ, now_ns)
+        elif instruction in (InstructionCode.SYNC_WRITE, InstructionCode.BULK_WRITE):
+            writes = _sync_writes(params) if instruction == InstructionCode.SYNC_WRITE else _bulk_writes(params)
             _write_all(writes, listening, now_ns)
         elif packet.id == codec.BROADCAST:
             self._broadcast(packet, listening, now_ns)
@@ -102,7 +110,7 @@ class Dispatcher:
         self.instructions += 1
         for device in listening:
             device.heard(now_ns)
-        if packet.instruction == Instruction.SYNC_WRITE:
+        if packet.instruction == InstructionCode.SYNC_WRITE:
             _write_all(_sync_writes(packet.params), listening, now_ns)
             return
         for device in listening:
@@ -111,7 +119,7 @@ class Dispatcher:
             baud, pause, hardware = device.baud, _pause(device), device.get("hardware_error_status")
             status = device.execute(packet.instruction, packet.params, now_ns, to=packet.id)
             if status is not None and packet.id != codec.BROADCAST:
-                data = b"" if packet.instruction == Instruction.PING else status.data
+                data = b"" if packet.instruction == InstructionCode.PING else status.data
                 frame = protocol1.status(status.id, StatusError(status.error), hardware, data)
                 self._put([Chunk(frame)], now_ns + pause, baud, now_ns)
 
@@ -122,7 +130,7 @@ class Dispatcher:
         for device in sorted(listening, key=lambda device: device.id):
             baud, pause, id = device.baud, _pause(device), device.id
             status = device.execute(packet.instruction, packet.params, now_ns, to=codec.BROADCAST)
-            if status is not None and packet.instruction == Instruction.PING:
+            if status is not None and packet.instruction == InstructionCode.PING:
                 start = now_ns + pause + id * (_wire_ns(_PING_BYTES, baud) + TURNAROUND_NS)
                 if id != last:  # two with one ID talk at once
                     start, last = max(start, free_ns + TURNAROUND_NS), id

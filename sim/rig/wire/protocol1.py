@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 
-from servoid.hw.dynamixel.protocol.codec import MAX_ID, Instruction, Packet, Reset, StatusError
+from servoid.hw.dynamixel.protocol.codec import MAX_ID, InstructionCode, Packet, Reset, StatusError
 
 _HEADER = b"\xff\xff"
 _BROADCAST = 0xFE
@@ -70,12 +70,12 @@ def checksum(body: bytes | bytearray) -> int:
 
 def _params(instruction: int, params: bytes) -> bytes:
     """Parameters as protocol 2.0 has them. Those of an instruction that it does not know stay as they are."""
-    if instruction == Instruction.READ and len(params) == 2:
+    if instruction == InstructionCode.READ and len(params) == 2:
         return struct.pack("<HH", *params)
-    if instruction in (Instruction.WRITE, Instruction.REG_WRITE) and params:
+    if instruction in (InstructionCode.WRITE, InstructionCode.REG_WRITE) and params:
         return struct.pack("<H", params[0]) + params[1:]
-    if instruction == Instruction.SYNC_WRITE and len(params) >= 2:
+    if instruction == InstructionCode.SYNC_WRITE and len(params) >= 2:
         return struct.pack("<HH", *params[:2]) + params[2:]
-    if instruction == Instruction.FACTORY_RESET:
+    if instruction == InstructionCode.FACTORY_RESET:
         return bytes([Reset.ALL])
     return params

@@ -6,13 +6,14 @@ Works on torch tensors through their own methods, so that tasks load without tor
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction
 from servoid.hw.setting import Setting, check
+from servoid.policy.features import Trajectory
 
 _STANDING = 1e-3  # m/s and rad/s: an instructed twist below it means to stand
 _SLOW = 0.05  # m/s below which the direction of a motion says little
@@ -47,18 +48,6 @@ class Weights:
     def twist(self) -> bool:
         """Whether any term counts that is about the velocity, which every instruction holds."""
         return any((self.velocity, self.yaw_rate, self.displacement, self.yaw, self.stand))
-
-
-class Trajectory(Protocol):
-    """A batch of predicted motions, torch tensors. Frame `i` lies `(i + 1) * dt` ahead of now."""
-
-    displacement: Any  # (batch, horizon, 2) m from now, heading frame of now
-    yaw: Any  # (batch, horizon) rad from now
-    velocity: Any  # (batch, horizon, 2) m/s, each frame's own heading frame, like `State.velocity`
-    yaw_rate: Any  # (batch, horizon) rad/s
-    height: Any  # (batch, horizon) m of the base above the ground
-    joints: Any  # (batch, horizon, n_joints) rad
-    dt: float  # s between frames
 
 
 def total_cost(trajectory: Trajectory, instruction: Instruction, weights: Weights) -> Any:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import BROADCAST, Instruction, Packet, Parser
+from servoid.hw.dynamixel.protocol.codec import BROADCAST, InstructionCode, Packet, PacketParser
 from servoid.hw.dynamixel.protocol.tables import ControlTable, table
 
 BYTE_NS = 5000  # at 2 Mbit/s
@@ -84,7 +84,7 @@ class ScriptedBus:
         self.gone = False
         self.echo = False
         self._due: list[tuple[int, bytes]] = []
-        self._parser = Parser()
+        self._parser = PacketParser()
         self.collisions = 0
         self._quiet_at = 0  # when the last answer on its way ends
 
@@ -143,21 +143,21 @@ class ScriptedBus:
     def _answer(self, packet: Packet, at: int) -> None:
         p = packet.params
         word = int.from_bytes(p[:2], "little")
-        if packet.instruction in (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ):
+        if packet.instruction in (InstructionCode.SYNC_READ, InstructionCode.FAST_SYNC_READ):
             parts = [(id, word, int.from_bytes(p[2:4], "little")) for id in p[4:]]
-            self._group(packet.instruction == Instruction.FAST_SYNC_READ, parts, at)
-        elif packet.instruction in (Instruction.BULK_READ, Instruction.FAST_BULK_READ):
+            self._group(packet.instruction == InstructionCode.FAST_SYNC_READ, parts, at)
+        elif packet.instruction in (InstructionCode.BULK_READ, InstructionCode.FAST_BULK_READ):
             parts = [
                 (p[i], int.from_bytes(p[i + 1 : i + 3], "little"), int.from_bytes(p[i + 3 : i + 5], "little"))
                 for i in range(0, len(p), 5)
             ]
-            self._group(packet.instruction == Instruction.FAST_BULK_READ, parts, at)
-        elif packet.instruction == Instruction.SYNC_WRITE:
+            self._group(packet.instruction == InstructionCode.FAST_BULK_READ, parts, at)
+        elif packet.instruction == InstructionCode.SYNC_WRITE:
             width = int.from_bytes(p[2:4], "little")
             for i in range(4, len(p), 1 + width):
                 if (servo := self.servos.get(p[i])) and servo.answers:
                     servo.write(word, p[i + 1 : i + 1 + width])
-        elif packet.id == BROADCAST and packet.instruction == Instruction.PING:
+        elif packet.id == BROADCAST and packet.instruction == InstructionCode.PING:
             for servo in self.servos.values():
                 at = self._emit(servo.get("id"), self._single(servo, packet), at + 1_000_000)
         elif (servo := self.servos.get(packet.id)) and servo.answers:
@@ -166,13 +166,13 @@ class ScriptedBus:
     def _single(self, servo: Memory, packet: Packet) -> bytes:
         p, error, data = packet.params, 0, b""
         word = int.from_bytes(p[:2], "little")
-        if packet.instruction == Instruction.PING:
+        if packet.instruction == InstructionCode.PING:
             data = servo.bytes[0:2] + servo.bytes[6:7]
-        elif packet.instruction == Instruction.READ:
+        elif packet.instruction == InstructionCode.READ:
             data = bytes(servo.bytes[word : word + int.from_bytes(p[2:4], "little")])
-        elif packet.instruction == Instruction.WRITE:
+        elif packet.instruction == InstructionCode.WRITE:
             error = servo.write(word, p[2:])
-        elif packet.instruction == Instruction.REBOOT:
+        elif packet.instruction == InstructionCode.REBOOT:
             servo.reboot()
         return codec.status(servo.get("id"), error | servo.alert, bytes(data))
 

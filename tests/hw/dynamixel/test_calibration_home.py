@@ -51,7 +51,7 @@ root = pytest.mark.skipif(os.getuid() != 0, reason="only root can be another use
 @root
 def test_a_user_without_home_and_name_can_drive_and_is_told_where_to_calibrate(monkeypatch: pytest.MonkeyPatch) -> None:
     def check() -> None:
-        with pytest.raises(ConfigError, match="you have no home folder: set XDG_CONFIG_HOME"):
+        with pytest.raises(ConfigError, match="no home folder: set XDG_CONFIG_HOME"):
             calibration_path(ROBOT)
         robot, text = calibrated(ROBOT)
         assert robot == ROBOT
@@ -68,7 +68,7 @@ def test_a_home_that_cannot_be_written_is_found_before_the_work(
     tmp_path.chmod(0o755)
 
     def check() -> None:
-        with pytest.raises(ConfigError, match=r"cannot be written: .*: set XDG_CONFIG_HOME to a folder of yours"):
+        with pytest.raises(ConfigError, match=r"cannot be written: .*: set XDG_CONFIG_HOME to your own folder"):
             check_writable(tmp_path / "calibration" / "op3.yaml")
 
     as_nobody(monkeypatch, check)

@@ -179,11 +179,11 @@ def test_all_of_eeprom_is_tried_below() -> None:
 @pytest.mark.parametrize("register", EEPROM)
 def test_what_another_program_left_in_eeprom_is_found_refused_and_put_right(found: Found, register: str) -> None:
     found.write(14, **{register: EEPROM[register]})
-    with pytest.raises(BackendError, match=r"registers are not as op3 needs them, the first of l_knee") as error:
+    with pytest.raises(BackendError, match=r"registers differ from what op3 needs, the first on l_knee") as error:
         found.backend(exact=True).connect()
     assert register in error.value.__notes__[0]
     if register in GRAVE:
-        with pytest.raises(BackendError, match="registers are not as op3 needs them"):
+        with pytest.raises(BackendError, match="registers differ from what op3 needs"):
             found.backend().connect()
     servos = find_servos(found.bus, ROBOT)
     correct(found.bus, servos, compare(ROBOT, servos))

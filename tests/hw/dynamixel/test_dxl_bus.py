@@ -9,7 +9,7 @@ from scripted import BYTE_NS, Memory, ScriptedBus
 
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import Instruction
+from servoid.hw.dynamixel.protocol.codec import InstructionCode
 from servoid.hw.dynamixel.transport.bus import GAP_NS, Bus
 from servoid.hw.dynamixel.transport.group_read import GroupRead
 
@@ -43,8 +43,8 @@ def test_a_cycle_is_one_write_and_ends_on_time(fast: bool) -> None:
     request, answer = 14 + len(IDS), 8 + 14 * 20 if fast else 21 * 20
     assert line.time - began == (len(before) + request + answer) * BYTE_NS + GAP_NS * (1 if fast else 20)
     assert [p.instruction for p in line.sent] == [
-        Instruction.SYNC_WRITE,
-        Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ,
+        InstructionCode.SYNC_WRITE,
+        InstructionCode.FAST_SYNC_READ if fast else InstructionCode.SYNC_READ,
     ]
     assert bus.counters.lost == bus.counters.stray == 0
 
@@ -73,7 +73,7 @@ def test_groups_follow_each_other_without_a_pause() -> None:
     line.sent.clear()
     assert bus.sync_read(*groups) == 0
     asked = [p.instruction for p in line.sent]
-    assert asked == [Instruction.FAST_SYNC_READ, Instruction.READ, Instruction.SYNC_READ]
+    assert asked == [InstructionCode.FAST_SYNC_READ, InstructionCode.READ, InstructionCode.SYNC_READ]
     assert line.collisions == 0
 
 
@@ -90,7 +90,7 @@ def test_who_was_lost_in_a_fast_read_is_asked_again_in_the_same_tick() -> None:
     line.fault = corrupt
     assert bus.sync_read(group) == 0
     assert positions(group) == [1000 + id for id in IDS]
-    assert [p.instruction for p in line.sent] == [Instruction.FAST_SYNC_READ, Instruction.READ]
+    assert [p.instruction for p in line.sent] == [InstructionCode.FAST_SYNC_READ, InstructionCode.READ]
     assert line.sent[1].id == 5
     assert (bus.counters.lost, bus.counters.recovered) == (1, 1)
     assert line.collisions == 0
@@ -109,7 +109,7 @@ def test_a_dead_servo_costs_only_its_own_values() -> None:
         line.sleep_until(began + 20_000_000)
     assert group.misses[2] == 8
     assert group.time_ns[2] is None
-    last = [p for p in line.sent if p.instruction == Instruction.FAST_SYNC_READ][-1]
+    last = [p for p in line.sent if p.instruction == InstructionCode.FAST_SYNC_READ][-1]
     assert last.params[4:][-1] == 3, "it is asked last, so that nobody waits for it"
     assert line.sent[-1] is last, "and no longer asked twice"
     line.servos[3].answers = True
@@ -249,7 +249,7 @@ def test_mixed_models_are_read_in_bulk() -> None:
         assert bus.sync_read(group) == 0
         assert len(group.data[0] or b"") == 10
         assert struct.unpack_from("<h", group.data[1] or b"", 6) == (-77,)
-    assert {p.instruction for p in line.sent} == {Instruction.BULK_READ, Instruction.FAST_BULK_READ}
+    assert {p.instruction for p in line.sent} == {InstructionCode.BULK_READ, InstructionCode.FAST_BULK_READ}
 
 
 def test_single_instructions() -> None:

@@ -16,12 +16,13 @@ from pathlib import Path
 
 import pytest
 from scripted import Memory
+from waiting import until
 
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.dynamixel import guardian
 from servoid.hw.dynamixel.guardian_client import Lifeline
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import Instruction, Packet, Parser
+from servoid.hw.dynamixel.protocol.codec import InstructionCode, Packet, PacketParser
 from servoid.hw.dynamixel.protocol.tables import table
 from servoid.hw.dynamixel.transport.port import SerialPort
 
@@ -50,7 +51,7 @@ class Servos(threading.Thread):
         self.start()
 
     def run(self) -> None:
-        parser = Parser()
+        parser = PacketParser()
         while not self.over:
             if self.babble:
                 os.write(self.master, self.babble)
@@ -63,14 +64,14 @@ class Servos(threading.Thread):
         p = packet.params
         word = int.from_bytes(p[:2], "little")
         length = int.from_bytes(p[2:4], "little")
-        if packet.instruction == Instruction.SYNC_WRITE:
+        if packet.instruction == InstructionCode.SYNC_WRITE:
             if word == TORQUE and self.deaf:
                 self.deaf -= 1
                 return
             for at in range(4, len(p), 1 + length):
                 self.memory[p[at]].write(word, p[at + 1 : at + 1 + length])
-        elif packet.instruction in (Instruction.SYNC_READ, Instruction.READ):
-            for id in p[4:] if packet.instruction == Instruction.SYNC_READ else (packet.id,):
+        elif packet.instruction in (InstructionCode.SYNC_READ, InstructionCode.READ):
+            for id in p[4:] if packet.instruction == InstructionCode.SYNC_READ else (packet.id,):
                 servo = self.memory[id]
                 status = codec.status(id, servo.alert, bytes(servo.bytes[word : word + length]))
                 time.sleep(self.delay)
@@ -145,9 +146,8 @@ def test_while_the_controller_lives_nothing_is_sent_whatever_signals_come(servos
 def test_a_clean_end_sends_nothing_and_leaves_nothing(servos: Servos, line: Lifeline, tmp_path: Path) -> None:
     line.hold()
     line.let_go()
-    pid, began = line.pid, time.monotonic()
+    pid = line.pid
     assert not line.close()
-    assert time.monotonic() - began < 1.0
     assert not Path(f"/proc/{pid}").exists()
     assert servos.packets == []
     assert not (tmp_path / "servoid").exists()
@@ -197,6 +197,7 @@ def test_an_alert_and_a_lit_led_do_not_hide_an_acknowledgement(servos: Servos, l
     assert "4 of 4" in told(tmp_path)
 
 
+@pytest.mark.slow
 def test_only_the_answer_about_torque_counts(servos: Servos, line: Lifeline, tmp_path: Path) -> None:
     """A servo that keeps its torque on, or whose late answer to another question comes by, has not let go."""
     line.hold()
@@ -211,9 +212,7 @@ def test_only_the_answer_about_torque_counts(servos: Servos, line: Lifeline, tmp
 def test_a_port_that_is_gone_too_is_said(servos: Servos, line: Lifeline, tmp_path: Path) -> None:
     line.hold()
     servos.end()
-    began = time.monotonic()
     assert not line.close()
-    assert time.monotonic() - began < 1.0
     assert "cannot be reached either" in told(tmp_path)
 
 
@@ -221,11 +220,7 @@ def test_a_guardian_that_is_killed_is_replaced_and_told_again(servos: Servos, li
     line.hold()
     first = line.pid
     os.kill(first, signal.SIGKILL)
-    deadline = time.monotonic() + 5.0
-    while line.pid == first and time.monotonic() < deadline:
-        line.check()
-        time.sleep(0.02)
-    assert line.pid != first
+    until(lambda: line.check() or line.pid != first)  # type: ignore[func-returns-value]
     line.close()
     assert servos.torque() == [0] * len(IDS)
 
@@ -284,10 +279,7 @@ def test_the_controllers_death_is_seen_even_if_a_child_of_it_keeps_the_pipe_open
     try:
         assert process.stdout is not None
         os.kill(int(process.stdout.readline()), signal.SIGKILL)
-        deadline = time.monotonic() + 10.0
-        while any(servos.torque()) and time.monotonic() < deadline:
-            time.sleep(0.005)
-        assert servos.torque() == [0] * len(IDS)
+        until(lambda: servos.torque() == [0] * len(IDS))
     finally:
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()

@@ -149,7 +149,7 @@ def test_joints_in_another_order_are_refused_by_name(copy: Path) -> None:
     """As many joints, of the same robot: only their names tell."""
     swapped = replace(ROBOT, joints=(ROBOT.joints[1], ROBOT.joints[0], *ROBOT.joints[2:]))
     first, second = ROBOT.names[:2]
-    what = rf"entry 13 is position\.{first}, and position\.{second} is needed"
+    what = rf"entry 13 is position\.{first}, but position\.{second} is needed"
     with pytest.raises(DatasetError, match=rf"info\.json: 'observation\.state' is not that of op3: {what}"):
         read_recording(copy, swapped)
     path = copy / "meta" / "info.json"

@@ -51,11 +51,11 @@ def test_numbers_that_make_no_sense_are_refused(tmp_path: Path) -> None:
 
 
 def test_what_a_checkpoint_does_not_have_is_refused_with_the_remedy() -> None:
-    with pytest.raises(ConfigError, match=r"horizon 32 is asked for, and this checkpoint has 1 to 16 .* --horizon 32"):
+    with pytest.raises(ConfigError, match=r"horizon is 32, but this checkpoint takes 1 to 16 .* --horizon 32"):
         DiffusionSettings(horizon=32).check(NETWORK)
-    with pytest.raises(ConfigError, match="history 6 is asked for, and this checkpoint has 1 to 4"):
+    with pytest.raises(ConfigError, match="history is 6, but this checkpoint takes 1 to 4"):
         DiffusionSettings(history=6).check(NETWORK)
-    with pytest.raises(ConfigError, match=r"execution_horizon .* delay = 6 ticks, and this one has actions for 5"):
+    with pytest.raises(ConfigError, match=r"execution_horizon .* delay = 6 ticks, but this one has actions for 5"):
         DiffusionSettings(horizon=5, execution_horizon=4, delay=2).check(NETWORK)
     with pytest.raises(ConfigError, match="level of 1 to 20, not 30"):
         DiffusionSettings(schedule="rolling", rolling=Rolling(state_level=30)).check(NETWORK)

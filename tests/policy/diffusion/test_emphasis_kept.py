@@ -10,7 +10,7 @@ import torch
 from test_runtime import ROBOT, model
 
 from servoid.hw.contracts.body import Array
-from servoid.policy.checkpoint import resolve
+from servoid.policy.checkpoint import Origin, resolve
 from servoid.policy.diffusion.model import checkpoint
 from servoid.policy.features import Emphasis, Normaliser, token_layout
 
@@ -29,7 +29,8 @@ def saved(path: Path, states: Normaliser, **shape: Any) -> checkpoint.Model:
     """What comes back of a model with these states, from a file."""
     made = model(**shape)
     facts: dict[str, Any] = {"data": "made up", "licence": "Apache-2.0", "results": {}, "training": {}}
-    checkpoint.save(path, made.denoiser.state_dict(), made.config, states, made.actions, ROBOT, **facts)
+    trained = checkpoint.Trained(made.denoiser.state_dict(), made.config, states, made.actions)
+    checkpoint.save(path, trained, ROBOT, Origin(**facts))
     return checkpoint.load(path, ROBOT)
 
 
@@ -71,7 +72,8 @@ def test_the_shipped_model_has_one_which_is_kept_when_it_is_saved_again(tmp_path
     head = shipped.header
     facts = {key: head[key] for key in ("data", "licence", "results", "training")}
     weights = shipped.denoiser.state_dict()
-    checkpoint.save(path, weights, shipped.config, shipped.states, shipped.actions, ROBOT, **facts)
+    trained = checkpoint.Trained(weights, shipped.config, shipped.states, shipped.actions)
+    checkpoint.save(path, trained, ROBOT, Origin(**facts))
     again = checkpoint.load(path, ROBOT)
     assert bits(again.states) == bits(shipped.states)
     assert bits(again.actions) == bits(shipped.actions)

@@ -13,7 +13,7 @@ from servoid.policy.diffusion.guidance import Diverged
 from servoid.policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise, seeded
 from servoid.policy.diffusion.runtime import Runtime
 from servoid.policy.diffusion.sampler import Known, Sampler
-from servoid.policy.diffusion.schedule import cosine_signal, rolling
+from servoid.policy.diffusion.schedule import Rolling, cosine_signal, rolling
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 from servoid.policy.features import Emphasis, Normaliser, raw_layout
 
@@ -87,7 +87,7 @@ def test_what_goes_on_from_a_low_level_stays_near_the_plan_that_runs() -> None:
     sampler = Sampler(lambda s, a, ks, ka: (s * keep[ks][:, None], a * keep[ka][:, None]), signal)
 
     def found(state_level: int, action_level: int) -> tuple[float, float]:
-        matrix = rolling(20, 4, frames, frames, state_level, action_level, fresh=1)
+        matrix = rolling(20, 4, frames, frames, Rolling(state_level, action_level, ramp=1), fresh=1)
         plan = torch.full((200, 8, 1), 2.0)
         start = renoise((plan, plan), noise, matrix, signal)
         states, actions = sampler.sample(matrix, known, seeds, start=start)
@@ -223,6 +223,6 @@ def test_guidance_that_drives_a_plan_out_of_all_bounds_gives_no_plan() -> None:
 
 def test_a_checkpoint_that_never_learned_far_actions_does_not_execute_them() -> None:
     made = replace(model(), header={"training": {"far_actions": 0.0, "near_actions": 4}})
-    with pytest.raises(ConfigError, match="learned the actions of the next 4 only"):
+    with pytest.raises(ConfigError, match="learned only the actions of the next 4"):
         Runtime(made, DiffusionSettings(steps=4, execution_horizon=4, delay=2), ROBOT)
     Runtime(made, DiffusionSettings(steps=4, execution_horizon=3, delay=1), ROBOT)

@@ -13,7 +13,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, PlanRequest
 from servoid.hw.robot.description import load_robot
-from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.checkpoint import CheckpointError, Origin
 from servoid.policy.diffusion.model import checkpoint
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.denoiser import Denoiser
@@ -96,6 +96,7 @@ def test_each_of_a_batch_is_told_the_name_of_its_own_motion() -> None:
     assert not np.allclose(both[0], both[1], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_sentence_is_read_as_the_nearest_that_was_trained_with_unless_told_otherwise() -> None:
     pytest.importorskip("wordllama")
     told = "head straight on"  # held out
@@ -199,7 +200,8 @@ def test_a_checkpoint_plans_as_what_was_saved(tmp_path: Path) -> None:
     made, path = model(), tmp_path / "net.safetensors"
     facts: dict[str, Any] = {"data": "made up", "licence": "Apache-2.0", "results": {}, "training": {}}
     weights = made.denoiser.state_dict()
-    checkpoint.save(path, weights, made.config, made.states, made.actions, ROBOT, **facts)
+    trained = checkpoint.Trained(weights, made.config, made.states, made.actions)
+    checkpoint.save(path, trained, ROBOT, Origin(**facts))
     loaded = checkpoint.load(path, ROBOT)
     assert loaded.config == made.config
     a, b = (Runtime(m, SETTINGS, ROBOT).plan(request()) for m in (made, loaded))
@@ -207,7 +209,8 @@ def test_a_checkpoint_plans_as_what_was_saved(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="joints do not fit"):
         checkpoint.load(path, replace(ROBOT, joints=ROBOT.joints[1:]))
     del weights["norm.weight"]
-    checkpoint.save(path, weights, made.config, made.states, made.actions, ROBOT, **facts)
+    trained = checkpoint.Trained(weights, made.config, made.states, made.actions)
+    checkpoint.save(path, trained, ROBOT, Origin(**facts))
     with pytest.raises(CheckpointError, match="do not fit its own header"):
         checkpoint.load(path, ROBOT)
 
@@ -218,7 +221,8 @@ def test_a_checkpoint_whose_encoder_gives_other_codes_now_is_refused(tmp_path: P
 
     def load(text: str, text_size: int) -> checkpoint.Model:
         made = model(text=text, text_size=text_size)
-        checkpoint.save(path, made.denoiser.state_dict(), made.config, made.states, made.actions, ROBOT, **facts)
+        trained = checkpoint.Trained(made.denoiser.state_dict(), made.config, made.states, made.actions)
+        checkpoint.save(path, trained, ROBOT, Origin(**facts))
         return checkpoint.load(path, ROBOT)
 
     assert load("words", size).config.text_size == size

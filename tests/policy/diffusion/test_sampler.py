@@ -7,11 +7,11 @@ from torch import Tensor
 
 from servoid.hw.config import ConfigError
 from servoid.policy.diffusion.guidance import Diverged, Guidance, classifier_free
-from servoid.policy.diffusion.model.config import DenoiserConfig, Objective
+from servoid.policy.diffusion.model.config import DenoiserConfig, TrainingObjective
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.objective import losses
 from servoid.policy.diffusion.sampler import Known, Sampler
-from servoid.policy.diffusion.schedule import autoregressive, cosine_signal, full_sequence, rolling
+from servoid.policy.diffusion.schedule import Rolling, autoregressive, cosine_signal, full_sequence, rolling
 
 LEVELS = 100
 SIGNAL = torch.as_tensor(cosine_signal(LEVELS), dtype=torch.float32)
@@ -45,6 +45,7 @@ def mixture(weights: Tensor, means: Tensor, deviation: float) -> object:
 
 
 # DDPM leaves out how uncertain each prediction is: its samples are narrower the fewer the levels.
+@pytest.mark.slow
 @pytest.mark.parametrize(("eta", "steps", "count", "narrow"), [(0.0, 50, 4000, 0.05), (1.0, LEVELS, 1500, 0.08)])
 def test_samples_have_the_mean_and_spread_of_the_distribution(
     eta: float, steps: int, count: int, narrow: float
@@ -139,7 +140,7 @@ def test_sampling_can_go_on_from_a_noisy_start() -> None:
         return s, a
 
     start = torch.full((1, 2, 1), 5.0), torch.full((1, 2, 1), 6.0)
-    matrix = rolling(20, 2, np.arange(2), np.arange(2), 14, 4)
+    matrix = rolling(20, 2, np.arange(2), np.arange(2), Rolling(14, 4, ramp=1))
     Sampler(predict, cosine_signal(20)).sample(matrix, unknown(1, tokens=2), generators(1), start=start)
     assert seen[0][0].eq(5.0).all()
     assert seen[0][1:] == ([14, 20], [4, 20])
@@ -232,7 +233,13 @@ def planner() -> tuple[Denoiser, Sampler]:
         states[:, 0] = 0.0  # the present says nothing
         loss = sum(
             losses(
-                denoiser, states, z.repeat(1, 4, 1), None, signal, generator, Objective(inference_delay=0, monotone=0.0)
+                denoiser,
+                states,
+                z.repeat(1, 4, 1),
+                None,
+                signal,
+                generator,
+                TrainingObjective(inference_delay=0, monotone=0.0),
             )
         )
         optimiser.zero_grad()

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from servoid.policy.diffusion.schedule import (
     DenoisingMatrix,
+    Rolling,
     autoregressive,
     cosine_signal,
     ddim_levels,
@@ -82,7 +83,7 @@ def matrices(draw: st.DrawFn) -> tuple[DenoisingMatrix, int]:
         shape, spread = draw(st.sampled_from(["pyramid", "trapezoid"])), draw(st.integers(0, 20))
         return pyramid(levels, steps, *frames, spread=spread, shape=shape, lead=lead), levels
     start, fresh = (draw(level), draw(level)), draw(st.integers(0, horizon))
-    return rolling(levels, steps, *frames, *start, fresh=fresh, ramp=draw(count), lead=lead), levels
+    return rolling(levels, steps, *frames, Rolling(*start, ramp=draw(count)), fresh=fresh, lead=lead), levels
 
 
 @settings(max_examples=150, deadline=None)
@@ -126,12 +127,12 @@ def test_a_pyramid_rises_along_the_window_and_a_trapezoid_to_its_middle() -> Non
 
 
 def test_rolling_goes_on_from_its_own_levels_and_begins_fresh_frames_as_noise() -> None:
-    matrix = rolling(20, 4, STATES, ACTIONS, 14, 4, fresh=2)
+    matrix = rolling(20, 4, STATES, ACTIONS, Rolling(14, 4, ramp=1), fresh=2)
     assert matrix.calls == 4
     assert set(matrix.states[0, STATES < 14]) == {14}
     assert set(matrix.actions[0, ACTIONS < 14]) == {4}
     assert set(matrix.states[0, STATES >= 14]) == set(matrix.actions[0, ACTIONS >= 14]) == {20}
-    ramp = rolling(20, 4, STATES, ACTIONS, 14, 4, fresh=1, ramp=8).actions[0, 3:]
+    ramp = rolling(20, 4, STATES, ACTIONS, Rolling(14, 4, ramp=8), fresh=1).actions[0, 3:]
     assert ramp.tolist() == [4] * 8 + [6, 8, 10, 12, 14, 16, 18, 20]
 
 
@@ -143,9 +144,9 @@ def test_schedules_that_make_no_sense_are_refused() -> None:
     with pytest.raises(ValueError, match="must not be negative"):
         pyramid(20, 5, STATES, ACTIONS, spread=-1)
     with pytest.raises(ValueError, match="rolling states must go on from a level of 1 to 20, not 21"):
-        rolling(20, 5, STATES, ACTIONS, 21, 4)
+        rolling(20, 5, STATES, ACTIONS, Rolling(21, 4))
     with pytest.raises(ValueError, match="ramp"):
-        rolling(20, 5, STATES, ACTIONS, 14, 4, ramp=0)
+        rolling(20, 5, STATES, ACTIONS, Rolling(14, 4, ramp=0))
 
 
 def test_ignored_tokens_stay_noise_and_cost_no_calls() -> None:

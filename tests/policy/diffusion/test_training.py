@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from servoid.policy.diffusion.model.config import DenoiserConfig, Objective
+from servoid.policy.diffusion.model.config import DenoiserConfig, TrainingObjective
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.objective import UNTOLD, losses
 from servoid.policy.diffusion.schedule import cosine_signal
 
 WINDOWS, WORDS = 2000, 5
 CONFIG = DenoiserConfig(3, 2, width=16, heads=2, history=2, horizon=4, text="words", text_size=WORDS)
-OBJECTIVE = Objective(inference_delay=0, monotone=0.0)
+OBJECTIVE = TrainingObjective(inference_delay=0, monotone=0.0)
 SIGNAL = torch.as_tensor(cosine_signal(CONFIG.levels), dtype=torch.float32)
 
 

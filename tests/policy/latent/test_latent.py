@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,17 +12,24 @@ from synthetic_recording import write_dataset
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
-from servoid.policy.checkpoint import CheckpointError, read_header
+from servoid.policy.checkpoint import CheckpointError, Origin, read_header
 from servoid.policy.features import Normaliser, raw_layout
-from servoid.policy.latent.actions import LatentActions, LatentConfig, load_latents, same_latents, save_latents
+from servoid.policy.latent.actions import (
+    LatentActions,
+    LatentConfig,
+    load_latents,
+    proprioception,
+    proprioception_layout,
+    same_latents,
+    save_latents,
+)
 from servoid.policy.latent.dataset import Demonstrations
 from servoid.policy.latent.network import Gaussian, LatentNetwork
-from servoid.policy.latent.proprioception import proprioception, proprioception_layout
 from servoid.policy.recording import DatasetError, Recording, read_recording
 
 ROBOT = load_robot()
 N = len(ROBOT.joints)
-FACTS: dict[str, Any] = {"data": "made up", "licence": "Apache-2.0", "results": {}, "training": {}}
+ORIGIN = Origin("made up", "Apache-2.0", results={}, training={})
 
 
 def latents(size: int = 6, seed: int = 0) -> LatentActions:
@@ -109,6 +115,7 @@ def trained(recording: Recording, size: int, steps: int = 250) -> float:
     return float(np.sqrt(np.square(made.decode(raw, made.encode(raw, target)) - target).mean()))
 
 
+@pytest.mark.slow
 def test_a_few_latents_are_enough_because_the_decoder_knows_the_state() -> None:
     """Four numbers cannot hold twenty joints, unless the state tells the rest."""
     recording = state_dependent(3000, seed=0)
@@ -137,7 +144,7 @@ def test_pairs_follow_each_other_in_one_episode_and_half_of_them_ran(tmp_path: P
 
 def test_a_file_gives_the_same_space_back(tmp_path: Path) -> None:
     made, path = latents(), tmp_path / "latent.safetensors"
-    save_latents(path, made, ROBOT, **FACTS)
+    save_latents(path, made, ROBOT, ORIGIN)
     loaded = load_latents(path, ROBOT)
     assert same_latents(made, loaded)
     assert not same_latents(made, latents(seed=1))
@@ -149,20 +156,20 @@ def test_a_file_gives_the_same_space_back(tmp_path: Path) -> None:
 
 def test_what_does_not_fit_is_refused_with_the_reason(tmp_path: Path) -> None:
     path = tmp_path / "latent.safetensors"
-    save_latents(path, latents(), ROBOT, **FACTS)
+    save_latents(path, latents(), ROBOT, ORIGIN)
     with pytest.raises(CheckpointError, match="joints do not fit"):
         load_latents(path, replace(ROBOT, joints=ROBOT.joints[1:]))
     with pytest.raises(CheckpointError, match="runs at 100"):
         load_latents(path, replace(ROBOT, rate=100))
     short = latents()
-    save_latents(path, replace(short, decoder=short.prior), ROBOT, **FACTS)
+    save_latents(path, replace(short, decoder=short.prior), ROBOT, ORIGIN)
     with pytest.raises(CheckpointError, match="do not fit its own header"):
         load_latents(path, ROBOT)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(CheckpointError, match="truncated"):
         load_latents(path, ROBOT)
     shipped = Path(__file__).resolve().parents[3] / "policy" / "checkpoints" / "expert.safetensors"
-    with pytest.raises(CheckpointError, match="holds a tracker network, and a latent network is needed"):
+    with pytest.raises(CheckpointError, match="holds a tracker network, but a latent network is needed"):
         load_latents(shipped, ROBOT)
     with pytest.raises(ValueError, match="size must be at least 1"):
         LatentConfig(size=0)

@@ -38,8 +38,8 @@ def test_a_file_holds_the_clip_and_says_what_it_is(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("robot", "said"),
     [
-        (replace(ROBOT, rate=100), "made for 50 ticks a second, and op3 runs at 100"),
-        (replace(ROBOT, joints=ROBOT.joints[1:] + ROBOT.joints[:1]), "entry 0 is head_pan, and head_tilt is needed"),
+        (replace(ROBOT, rate=100), "made for 50 ticks a second, but op3 runs at 100"),
+        (replace(ROBOT, joints=ROBOT.joints[1:] + ROBOT.joints[:1]), "entry 0 is head_pan, but head_tilt is needed"),
         (replace(ROBOT, joints=ROBOT.joints[:-1]), "20 entries, 19 needed; not known here: r_ank_roll"),
         (replace(ROBOT, feet=dict(reversed(ROBOT.feet.items()))), r"its feet are \['left', 'right'\]"),
     ],
@@ -52,7 +52,7 @@ def test_a_clip_of_another_robot_or_rate_is_refused(tmp_path: Path, robot: objec
 
 
 def test_another_kind_of_file_or_a_cut_one_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="holds a tracker network, and a clip network is needed"):
+    with pytest.raises(ConfigError, match="holds a tracker network, but a clip network is needed"):
         load(checkpoint.resolve("expert"), ROBOT)
     path = tmp_path / "circle.safetensors"
     save(CLIP, path, ROBOT)
@@ -141,7 +141,7 @@ def test_a_library_is_a_folder(tmp_path: Path) -> None:
     library = Library(ROBOT, tmp_path)
     assert library.names == ()
     path = library.add(CLIP)
-    with pytest.raises(ConfigError, match="exists already: give another name"):
+    with pytest.raises(ConfigError, match="already exists: choose another name"):
         library.add(CLIP)
     library.add(replace(CLIP, about=About(("turn",), "a formula", "MIT")), replace=True)
     assert Library(ROBOT, tmp_path).names == ("circle",)
@@ -149,7 +149,7 @@ def test_a_library_is_a_folder(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"unknown clip 'cirkle' in .*: did you mean 'circle'"):
         library["cirkle"]
     (tmp_path / "copy.safetensors").write_bytes(path.read_bytes())
-    with pytest.raises(ConfigError, match=r"holds a clip called 'circle', as circle\.safetensors does"):
+    with pytest.raises(ConfigError, match=r"holds a clip called 'circle', and so does circle\.safetensors"):
         Library(ROBOT, tmp_path)
     with pytest.raises(ConfigError, match="no such folder of clips"):
         Library(ROBOT, tmp_path / "none")

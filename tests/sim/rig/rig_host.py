@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import Instruction, Parser, Status, StatusError
+from servoid.hw.dynamixel.protocol.codec import PacketParser, Status, StatusError
 from servoid.hw.dynamixel.protocol.tables import table
 from servoid.hw.robot.description import Robot
 from servoid.sim.rig.rig import Rig
@@ -20,7 +20,7 @@ class Host:
     def __init__(self, rig: Rig, robot: Robot) -> None:
         self.rig, self.robot = rig, robot
         self.ids = [joint.id for joint in robot.joints]
-        self.parser = Parser()
+        self.parser = PacketParser()
         rig.wire.host_baud = robot.bus.baud
 
     def start(self) -> None:
@@ -64,4 +64,4 @@ class Host:
             assert self.write(id, "torque_enable", 1) == 0
 
 
-__all__ = ["BOARD", "XM430", "Host", "Instruction"]
+__all__ = ["BOARD", "XM430", "Host"]

@@ -67,7 +67,7 @@ def test_every_writable_register_keeps_what_is_written(host: Host) -> None:
         (codec.read(1, 40, 4), StatusError.ACCESS),  # a register that only other models have
         (codec.action(1), StatusError.INSTRUCTION),  # nothing was registered
         (codec.packet(1, 0x21, b"\1CTRL"), StatusError.INSTRUCTION),
-        (codec.packet(1, codec.Instruction.READ, b"\0"), StatusError.DATA_LENGTH),
+        (codec.packet(1, codec.InstructionCode.READ, b"\0"), StatusError.DATA_LENGTH),
         (codec.packet(1, 0x20, b"\1CTRM"), StatusError.DATA_RANGE),  # another key
     ],
 )
@@ -282,7 +282,12 @@ def test_what_was_forgotten_is_told_once(host: Host, monkeypatch: pytest.MonkeyP
 def test_every_model_is_emulated_with_its_own_registers(rig: Rig, model: str) -> None:
     servo = VirtualServo(rig.motors, 0, model, {"id": 42})
     known = servo.table
-    assert servo.execute(codec.Instruction.PING, b"", 0) == (42, 0, False, known.number.to_bytes(2, "little") + b"\x34")
+    assert servo.execute(codec.InstructionCode.PING, b"", 0) == (
+        42,
+        0,
+        False,
+        known.number.to_bytes(2, "little") + b"\x34",
+    )
     position = known.item("present_position")
     error, data = servo.read(position.address, position.width, 0)
     assert (error, position.decode(data)) == (StatusError.NONE, 2048)

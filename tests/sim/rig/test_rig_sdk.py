@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 from rig_host import BOARD, XM430
+from waiting import until
 
 from servoid.sim.rig.process.control import RigProcess
 
 sdk = pytest.importorskip("dynamixel_sdk")
 OK = sdk.COMM_SUCCESS
 PATIENCE = 300  # ms: the SDK's share of a busy machine, not a matter of the bus
-
-
-def eventually(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
-    """Whether `condition` comes true in time."""
-    deadline = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 class Client:
@@ -40,7 +30,7 @@ class Client:
 
     def boot(self) -> None:
         """Wait until every servo has started."""
-        assert eventually(lambda: all(servo["online"] for servo in self.rig.control.servos()))
+        until(lambda: all(servo["online"] for servo in self.rig.control.servos()))
 
     def read(self, id: int, register: str) -> int:
         item = XM430.item(register)
@@ -116,7 +106,7 @@ def test_a_goal_in_bytes_moves_the_joint_in_the_physics(client: Client) -> None:
     assert group.addParam(1, list((start + 300).to_bytes(4, "little")))
     assert group.txPacket() == OK
     goal = before + 300 * XM430.item("goal_position").scale
-    assert eventually(lambda: abs(float(truth.fetch().joints[0, joint]) - goal) < 0.03)
+    until(lambda: abs(float(truth.fetch().joints[0, joint]) - goal) < 0.03)
     goals = [entry for entry in client.rig.control.accepted() if entry["register"] == "goal_position"]
     assert [entry["value"] for entry in goals] == [start, start + 300]
     assert goals[1]["position"] == pytest.approx(before + 0.46, abs=0.02)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import serial
 from rig_host import BOARD, XM430
+from waiting import until
 
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.dynamixel.protocol import codec
@@ -64,6 +65,7 @@ def walk_about(rig: RigProcess) -> tuple[list[bytes], list[dict[str, object]], l
     return heard, rig.control.accepted(), [*truth.qpos[0], *truth.angular_velocity[0]]
 
 
+@pytest.mark.slow
 def test_two_locked_runs_are_the_same_bit_for_bit() -> None:
     runs = []
     for _ in range(2):
@@ -116,10 +118,7 @@ def test_servos_go_on_living_when_the_controller_dies() -> None:
         observer = Control(rig.control_path)
         assert not any(servo["tripped"] for servo in observer.servos())
         rig.control.close()  # what a killed process leaves
-        deadline = time.monotonic() + 10.0
-        while not all(servo["tripped"] and servo["torque"] for servo in observer.servos()):
-            assert time.monotonic() < deadline, observer.servos()
-            time.sleep(0.02)
+        until(lambda: all(servo["tripped"] and servo["torque"] for servo in observer.servos()))
         assert observer.call("hello")["now"] > host.clock.now_ns() + 100 * MS
         rig.control = observer
         host.port.close()
@@ -165,10 +164,11 @@ class FreeRig:
 
     def heard(self) -> list[int]:
         """Who answered."""
-        deadline, data = time.monotonic() + 0.2, b""
-        while time.monotonic() < deadline:  # the kernel may take a moment to hand the bytes over
+        data = b""
+        for _ in range(20):  # the kernel may take a moment to hand the bytes over
             data += self.port.read(4096)
-        return [packet.id for packet in codec.Parser().feed(data)]
+            time.sleep(0.01)
+        return [packet.id for packet in codec.PacketParser().feed(data)]
 
 
 def test_reads_that_a_late_rig_finds_together_were_not_sent_into_answers(rig: Rig, robot: Robot) -> None:
@@ -215,7 +215,7 @@ def test_an_unused_rig_ends_by_itself(tmp_path: Path) -> None:
     process = subprocess.Popen(command, stdout=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stdout.readline()
-    assert process.wait(10) == 0
+    assert process.wait(120) == 0
     assert not control.exists()
     process.stdout.close()
 
@@ -230,6 +230,7 @@ time.sleep(60)
 """
 
 
+@pytest.mark.slow
 def test_a_rig_whose_controller_was_killed_lives_on_and_then_leaves_nothing_behind() -> None:
     """As long as somebody talks to its servos, and no longer: a guardian does for a moment."""
     parent = subprocess.Popen([sys.executable, "-c", _STARTED, "2"], stdout=subprocess.PIPE, text=True)
@@ -240,17 +241,14 @@ def test_a_rig_whose_controller_was_killed_lives_on_and_then_leaves_nothing_behi
     parent.stdout.close()
     assert Path(folder).is_dir()
     with serial.Serial(port, 2_000_000, timeout=1.0) as line:
-        answers, began = 0, time.monotonic()
-        while time.monotonic() < began + 8.0:  # four times as long as it would linger without
+        answers = 0
+        for _ in range(10):  # more than twice as long as it would linger without
             line.write(codec.ping(BOARD))
             answers += len(line.read(14)) == 14  # on a busy machine it may take longer
             time.sleep(0.5)
         assert Path(f"/proc/{pid}").exists()
         assert answers > 2
-    deadline = time.monotonic() + 30.0
-    while Path(f"/proc/{pid}").exists():
-        assert time.monotonic() < deadline, "the rig is an orphan"
-        time.sleep(0.1)
+    until(lambda: not Path(f"/proc/{pid}").exists(), "the rig is an orphan")
     assert not Path(folder).exists()
 
 
@@ -275,7 +273,7 @@ def test_the_command_serves_a_linked_port_until_ctrl_c(tmp_path: Path) -> None:
         port.write(codec.ping(BOARD))
         assert port.read(14)[4] == BOARD
     process.send_signal(signal.SIGINT)
-    assert process.wait(10) == 0
+    assert process.wait(120) == 0
     assert not os.path.lexists(link)
     process.stdout.close()
 

@@ -13,15 +13,14 @@ from test_diffusion_policy import INSTRUCTION, ROBOT, Spy, state
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Plan, PlanRequest
-from servoid.policy.checkpoint import CheckpointError, read, read_header, write
+from servoid.policy.checkpoint import CheckpointError, Origin, read, read_header, write
 from servoid.policy.diffusion.model import checkpoint
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.settings import DiffusionSettings
 from servoid.policy.features import Normaliser, raw_layout, raw_row
-from servoid.policy.latent.actions import LatentActions, LatentConfig
+from servoid.policy.latent.actions import LatentActions, LatentConfig, proprioception_layout
 from servoid.policy.latent.network import LatentNetwork
-from servoid.policy.latent.proprioception import proprioception_layout
 from servoid.stack.control.diffusion import DiffusionPolicy, diffusion_policy
 from servoid.stack.control.plan_buffer import Pace
 
@@ -105,7 +104,8 @@ def settings(tmp_path: Path) -> DiffusionSettings:
     actions = Normaliser(torch.zeros(SIZE), torch.ones(SIZE))
     facts: dict[str, Any] = {"data": "none", "licence": "none", "results": {}, "training": {}}
     weights = Denoiser(config).state_dict()
-    checkpoint.save(path, weights, config, states, actions, ROBOT, **facts, latents=latents())
+    trained = checkpoint.Trained(weights, config, states, actions, latents())
+    checkpoint.save(path, trained, ROBOT, Origin(**facts))
     return DiffusionSettings(checkpoint=str(path), steps=5, execution_horizon=4, delay=2)
 
 
@@ -119,6 +119,7 @@ def trace(of: DiffusionPolicy) -> Array:
     return np.stack(out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("schedule", ["full_sequence", "rolling"])
 def test_a_checkpoint_with_latents_runs_by_itself(settings: DiffusionSettings, schedule: str) -> None:
     """In line and beside the loop, with nothing but its own file."""
@@ -148,6 +149,6 @@ def test_latents_that_do_not_fit_are_refused(settings: DiffusionSettings) -> Non
     with pytest.raises(CheckpointError, match="latent actions' state layout"):
         diffusion_policy(ROBOT, settings)
     write(path, tensors, {k: v for k, v in head.items() if k != "latent"})
-    with pytest.raises(CheckpointError, match="plans 3 numbers a tick, and op3 has 20 joints"):
+    with pytest.raises(CheckpointError, match="plans 3 numbers a tick, but op3 has 20 joints"):
         diffusion_policy(ROBOT, settings)
     assert read_header(path)["kind"] == "diffusion"

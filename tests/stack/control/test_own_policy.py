@@ -8,7 +8,7 @@ import pytest
 
 from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
-from servoid.stack.control.policies import check_policy, make_policy
+from servoid.stack.control.policies import check_policy, make_policy, names, policy_fingerprint
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.tasks import load_task
@@ -62,3 +62,17 @@ def test_what_cannot_be_made_is_refused(tmp_path: Path, content: str, words: str
 def test_an_unknown_policy_is_still_refused_with_the_nearest() -> None:
     with pytest.raises(ConfigError, match="unknown policy 'expret': did you mean 'expert'"):
         check_policy("expret")
+
+
+def test_a_file_that_is_no_policy_is_told_which_files_are(tmp_path: Path) -> None:
+    film = tmp_path / "walk.mp4"
+    for said in ("no such file", "no file of a policy"):
+        with pytest.raises(ConfigError, match=rf"walk\.mp4: {said}: .*\.safetensors.*\.yaml.*FILE\.py:Class.*uniphys"):
+            check_policy(str(film))
+        film.touch()
+
+
+def test_the_shipped_settings_of_the_planner_are_policies_by_name() -> None:
+    assert {"diffusion", "uniphys", "diffuse_cloc"} <= {*names()}
+    assert policy_fingerprint("uniphys")["planner"]["steps"] == 5
+    assert policy_fingerprint("gait")["planner"] is None, "whose file has another form"

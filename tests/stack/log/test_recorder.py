@@ -8,12 +8,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
+import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from fake_body import StillEstimator, observation
+from waiting import until
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Command, Mode
@@ -29,7 +30,11 @@ from servoid.stack.safety.guard import Phase
 
 ROBOT = load_robot("op3")
 N = len(ROBOT.names)
-HEADER = {"format": FORMAT, "seed": 3, "robot": {"joints": [{"name": name} for name in ROBOT.names]}}
+CHOSEN = {"task": "walk", "backend": "sim", "robot": "op3", "policy": "gait", "seed": 3}
+HEADER = {
+    "format": FORMAT, "seed": 3, "settings": CHOSEN, "task": {}, "backend": "sim", "policy": {"name": "gait"},
+    "robot": {"joints": [{"name": name} for name in ROBOT.names], "rate": ROBOT.rate, "feet": []},
+}  # fmt: skip
 
 
 def tick_record(tick: int, rng: np.random.Generator) -> TickRecord:
@@ -125,7 +130,7 @@ def test_a_missing_log_is_refused(tmp_path):
 
 def test_a_log_is_never_overwritten(tmp_path):
     (tmp_path / "a.mcap").write_text("precious")
-    with pytest.raises(ConfigError, match="exists already"):
+    with pytest.raises(ConfigError, match="already exists"):
         Recorder.create(tmp_path / "a.mcap", HEADER)
     assert (tmp_path / "a.mcap").read_text() == "precious"
 
@@ -146,15 +151,14 @@ class FullDisk(io.BytesIO):
 
 
 @pytest.mark.parametrize("room", [10, 60_000])
-def test_a_full_disk_is_one_error_with_the_remedy_and_holds_nobody_up(tmp_path, room):
+def test_a_full_disk_is_one_error_with_the_remedy_and_holds_nobody_up(tmp_path, monkeypatch, room):
+    monkeypatch.setattr("servoid.stack.log.recorder.PATIENCE", None)  # who waits, waits for ever
     disk = FullDisk(room)
     recorder = Recorder(disk, HEADER, wait=True, name="run.mcap")
     rng = np.random.default_rng(0)
-    began = time.monotonic()
     for i in range(2000):  # more than the backlog holds
         recorder(tick_record(i, rng) if i < 50 else tick_record(0, rng))
     recorder.close({"outcome": "stopped"})
-    assert time.monotonic() - began < 20
     assert recorder.error is not None
     assert "No space left on device" in recorder.error
     assert "run.mcap" in recorder.error
@@ -164,17 +168,15 @@ def test_a_full_disk_is_one_error_with_the_remedy_and_holds_nobody_up(tmp_path, 
         assert len(read_log(tmp_path / "a.mcap").ticks("/observation")) > 5
 
 
-def test_a_disk_that_fills_at_the_very_end_holds_nobody_up():
+def test_a_disk_that_fills_at_the_very_end_holds_nobody_up(monkeypatch):
     """The last chunk is written when the recording is closed: nobody is to wait for items after that."""
+    monkeypatch.setattr("servoid.stack.log.recorder.PATIENCE", None)
     disk = FullDisk(10**9)
     recorder = Recorder(disk, HEADER, name="run.mcap")
     recorder(tick_record(0, np.random.default_rng(0)))
-    deadline = time.monotonic() + 10
-    while not recorder._items.empty() and time.monotonic() < deadline:  # then the header is written
-        time.sleep(0.01)
-    disk.room, began = 0, time.monotonic()
+    until(recorder._items.empty)  # then the header is written
+    disk.room = 0
     recorder.close({})
-    assert time.monotonic() - began < 1.0
     assert "No space left on device" in recorder.error
 
 
@@ -182,19 +184,20 @@ def test_a_disk_that_hangs_does_not_hold_up_a_real_loop(monkeypatch):
     monkeypatch.setattr("servoid.stack.log.recorder.PATIENCE", 0.2)
     monkeypatch.setattr("servoid.stack.log.recorder.BACKLOG", 5)
 
+    answers = threading.Event()
+
     class Hung(io.BytesIO):
         def write(self, data) -> int:
-            time.sleep(2.0)
+            answers.wait()
             return len(data)
 
     recorder = Recorder(Hung(), HEADER, wait=False)
     rng = np.random.default_rng(0)
-    began = time.monotonic()
     for i in range(10):
         recorder(tick_record(i, rng))
-    recorder.close({})
-    assert time.monotonic() - began < 1.5
+    recorder.close({})  # whoever waits for the disk does so for ever
     assert "slower than the run" in recorder.error
+    answers.set()
 
 
 KILLED = """
@@ -212,6 +215,7 @@ for i in range(10_000):
 """
 
 
+@pytest.mark.slow
 def test_a_killed_recording_loses_less_than_a_second(tmp_path):
     path = tmp_path / "a.mcap"
     here = os.pathsep.join(sys.path)

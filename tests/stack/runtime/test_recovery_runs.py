@@ -21,8 +21,8 @@ from servoid.stack.runtime.run import Result, RunSettings, Script, run
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import DOWN, Phase
 from servoid.tools.commands.replay import changes, replay
-from servoid.tools.common.flightpath import plans
 from servoid.tools.common.ground_truth import GroundTruth
+from servoid.tools.common.pictures.flightpath import plans
 
 ROBOT = load_robot()
 LOW, HIGH = ROBOT.lower + ROBOT.limits.margin, ROBOT.upper - ROBOT.limits.margin

@@ -14,7 +14,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
-from servoid.stack.navigation.collision_avoidance import AvoidanceSettings, Motion, bearing_past
+from servoid.stack.navigation.collision_avoidance import AvoidanceSettings, MeanVelocity, bearing_past
 from servoid.stack.tasks import load_settings, load_task
 
 DT = 0.02
@@ -53,7 +53,7 @@ def test_a_way_once_chosen_is_kept() -> None:
 
 
 def test_velocity_is_the_mean_over_the_window() -> None:
-    motion = Motion(window=0.2, dt=DT)
+    motion = MeanVelocity(window=0.2, dt=DT)
     assert not motion.update(np.zeros((2, 2))).any()
     for tick in range(1, 40):
         sway = 0.02 * math.sin(2.0 * math.pi * tick / 10)  # as fast as the window is long

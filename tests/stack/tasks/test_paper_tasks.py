@@ -230,11 +230,11 @@ def test_a_closed_path_is_not_followed_by_standing_where_it_ends(settings: dict[
 
 def test_path_shapes() -> None:
     s, circle = Drawn(load_task("path", {}, DT)), Drawn(load_task("path", {"shape": "circle"}, DT))
-    points = s.episode.points
+    points = s.episode.path
     np.testing.assert_allclose(points[-1], [0.0, 1.6], atol=0.01)
     assert points[:, 0].max() == pytest.approx(0.4, abs=0.01)
     assert points[:, 0].min() == pytest.approx(-0.4, abs=0.01)
-    np.testing.assert_allclose(circle.episode.points[-1], [0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(circle.episode.path[-1], [0.0, 0.0], atol=1e-9)
     told = s.instruct(0, state(), s.percept(state()))
     np.testing.assert_allclose(np.linalg.norm(told.path[49]), 0.15, atol=0.011)  # 1 s at 0.15 m/s
     with pytest.raises(ConfigError, match="waypoints: give one or more"):

@@ -19,6 +19,7 @@ def options(*words: str) -> argparse.Namespace:
     return parser.parse_args(["--checkpoint", "random", "--width", "32", "--plans", "5", *words])
 
 
+@pytest.mark.slow
 def test_it_prints_one_row_for_each_network_runtime_and_kind_of_guidance(capfd: pytest.CaptureFixture[str]) -> None:
     assert policy.main(options("--engine", "torch", "--shape", "2,12,6", "--json")) == 0
     (line,) = capfd.readouterr().out.splitlines()
@@ -40,9 +41,7 @@ def test_it_prints_one_row_for_each_network_runtime_and_kind_of_guidance(capfd: 
         assert row["tokens"] == (39 if row["network"] == "random" else 2 + 12 + 1 + 6)
         assert row["calls_per_plan"] == settings.steps + settings.lead
         assert 0 < row["call_median_ms"] <= row["call_p99_ms"]
-        # A plan is at least its network calls.
-        assert row["plan_median_ms"] > 2 * row["call_median_ms"]
-        assert row["plan_p99_ms"] >= row["plan_median_ms"]
+        assert row["plan_p99_ms"] >= row["plan_median_ms"] > 0
         assert row["plans_per_s"] == pytest.approx(1000 / row["plan_median_ms"])
         assert row["plan_cpu_ms"] > 0
         assert row["gflops"] > 0
@@ -79,6 +78,7 @@ def test_an_engine_that_is_not_installed_is_skipped_and_named(
         policy.main(options(*words, "--engine", "onnx"))
 
 
+@pytest.mark.slow
 def test_another_engine_is_timed_beside_torch(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -97,7 +97,7 @@ def test_wrong_words(bringup: Any, words: tuple[str, ...], said: str) -> None:
 
 
 def test_beyond_the_range_is_refused_before_torque(rig: RigProcess, bringup: Any) -> None:
-    rig.control.move({"l_knee": 2.1})
+    rig.control.move({"l_knee": float(ROBOT.upper[ROBOT.names.index("l_knee")]) - 0.1})
     code, answer, _ = bringup("jog", "l_knee", "--by", "0.2", *VIRTUAL, "--start")
     assert code == 2
     assert "l_knee can go from -0.350 to +0.0" in answer["error"]
@@ -330,3 +330,31 @@ def test_watching_leaves_torque_as_it_is(rig: RigProcess, bringup: Any) -> None:
     write(rig, 14, torque_enable=1)
     assert bringup("watch", "--seconds", "1", *VIRTUAL)[0] == 0
     assert torque(rig) == 1
+
+
+def test_a_table_fits_the_window_and_shows_first_what_is_wrong() -> None:
+    """In 24 rows the heading scrolled away, and each picture left one more behind."""
+    rows, wrong = [f"servo {i}" for i in range(20)], [i in (3, 19) for i in range(20)]
+    assert watch.fitted(rows, wrong, 20) == rows
+    shown = watch.fitted(rows, wrong, 6)
+    assert shown == ["servo 0", "servo 1", "servo 2", "servo 3", "servo 19", "... 15 more, all ok: enlarge the window"]
+    assert watch.fitted(rows, [True] * 20, 6)[-1] == "... 15 more, 15 of them not ok: enlarge the window"
+    assert watch.fitted(rows, wrong, 1) == ["... 20 more, 2 of them not ok: enlarge the window"]
+
+
+@pytest.mark.parametrize("size", [(24, 80), (12, 60), (50, 120)])
+def test_each_picture_of_watch_replaces_the_one_before_in_any_window(
+    rig: RigProcess, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], size: tuple[int, int]
+) -> None:
+    rows, columns = size
+    monkeypatch.setenv("LINES", str(rows))
+    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    assert main(["bringup", "watch", "--seconds", "1.6", *VIRTUAL]) == 0
+    first, *others = capfd.readouterr().out.split("\x1b[")
+    lines = first.splitlines()
+    assert len(lines) < rows
+    assert max(map(len, lines)) < columns
+    assert lines[0].startswith("joint")
+    assert others[0] == f"{len(lines)}F", "up to the heading of the one before"
+    assert others[1].startswith("J" + lines[0])

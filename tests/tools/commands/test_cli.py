@@ -39,15 +39,15 @@ def test_help_loads_nothing_that_is_slow_to_load() -> None:
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
-        (["tsaks"], "servoid: unknown verb 'tsaks'; did you mean 'tasks'?"),
-        (["xyzzy"], "servoid: unknown verb 'xyzzy'; known: tasks, doctor, run"),
-        (["train", "expret"], "servoid train: unknown verb 'expret'; did you mean 'expert'?"),
+        (["tsaks"], "servoid: unknown command 'tsaks'; did you mean 'tasks'?"),
+        (["xyzzy"], "servoid: unknown command 'xyzzy'; known: tasks, doctor, run"),
+        (["train", "expret"], "servoid train: unknown command 'expret'; did you mean 'expert'?"),
         (["tasks", "--jsno"], "servoid tasks: unknown option '--jsno'; did you mean '--json'?"),
         (["tasks", "goal", "walk"], "servoid tasks: unknown argument 'walk'"),
         (["tasks", "gaol"], "servoid: unknown task 'gaol': did you mean 'goal'?"),
         (["--jason"], "servoid: unknown option '--jason'"),
-        (["bench"], "servoid bench: say what to do: sim, policy, loop"),
-        ([], "servoid: say what to do: tasks"),
+        (["bench"], "servoid bench: command missing; known: sim, policy, loop"),
+        ([], "servoid: command missing; known: tasks"),
     ],
 )
 def test_usage_errors_are_one_line_and_code_2(argv: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -178,6 +178,7 @@ def test_json_is_standard_json() -> None:
     assert json.loads(to_json(values)) == {"nan": None, "array": [1.0, None], "count": 3, "flag": True}
 
 
+@pytest.mark.slow
 def test_tasks_lists_every_setting() -> None:
     result = servoid("tasks", "--json", check=True)
     assert result.stdout.count("\n") == 1

@@ -59,7 +59,7 @@ def test_tables_that_are_there_are_kept(log: FlightLog, tmp_path: Path, capsys: 
     assert export(log, capsys, "--csv", "--out", tmp_path)[0] == 0
     code, answer = export(log, capsys, "--csv", "--out", tmp_path)
     assert code == 2
-    assert "stand-ticks.csv: exists already: give --replace" in answer["error"]
+    assert "stand-ticks.csv: already exists: use --replace" in answer["error"]
     assert export(log, capsys, "--csv", "--out", tmp_path, "--replace")[0] == 0
 
 

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,9 +23,10 @@ from servoid.sim.backend import SimBackend
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.safety.guard import Phase
-from servoid.tools.cli import main
 from servoid.tools.commands import rollout
+from servoid.tools.common.compare import summarise
 from servoid.tools.common.ground_truth import GroundTruth
+from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult
 from servoid.tools.evaluate.judge import judge
 
 WORDS = ["walk", "--policy", "gait", "--seconds", "3", "--episodes", "2", "--seed", "3"]
@@ -35,10 +37,14 @@ KEYS = {
 }  # fmt: skip
 
 
-def options(*words: str) -> argparse.Namespace:
+def parsed(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     rollout.add_arguments(parser)
-    return parser.parse_args([*WORDS, *words])
+    return parser.parse_args(words)
+
+
+def options(*words: str) -> argparse.Namespace:
+    return parsed(*WORDS, *words)
 
 
 def rolled(capfd: pytest.CaptureFixture[str], *words: str) -> dict:
@@ -47,6 +53,7 @@ def rolled(capfd: pytest.CaptureFixture[str], *words: str) -> dict:
     return json.loads(line)
 
 
+@pytest.mark.slow
 def test_one_and_two_workers_give_the_same_and_all_that_was_promised(capfd: pytest.CaptureFixture[str]) -> None:
     one = rolled(capfd, "--workers", "1")
     two = rolled(capfd, "--workers", "2")
@@ -61,6 +68,13 @@ def test_one_and_two_workers_give_the_same_and_all_that_was_promised(capfd: pyte
     assert {"velocity_error_mps", "top_speed_mps", "odometry_error_m"} <= set(one["metrics"])
 
 
+def test_what_the_robot_cannot_do_is_said_before_it_tries(capfd: pytest.CaptureFixture[str]) -> None:
+    words = ["--seconds", "0.2", "--episodes", "1", "--workers", "1", "--set", "vx=9"]
+    assert rollout.main(options(*words)) == 0
+    assert capfd.readouterr().out.startswith("vx=9 is more than op3 can: 0.5 m/s at most that way")
+
+
+@pytest.mark.slow
 def test_an_episode_can_be_run_again_by_its_seed() -> None:
     seed = episode_seed(3, 1)
     assert seed == episode_seed(3, 1) != episode_seed(3, 0)
@@ -76,41 +90,48 @@ def test_an_episode_can_be_run_again_by_its_seed() -> None:
     np.testing.assert_array_equal(plain.trace.displacement, again.trace.displacement)
 
 
+class Episodes:
+    """Stands in for the episodes: `seconds` by policy and number, and an error after so many of them."""
+
+    def __init__(self, error: BaseException | None = None, after: int = 0, gain: float = 0.0) -> None:
+        self.done: list[tuple[str, int]] = []
+        self._error, self._after, self._gain = error, after, gain
+
+    def __call__(self, job: EpisodeJob) -> EpisodeResult:
+        if self._error is not None and len(self.done) >= self._after:
+            raise self._error
+        self.done.append((job.settings.policy, job.episode))
+        row = {
+            "seed": job.settings.seed, "success": True, "fell": False, "aborted": False, "fell_ending": False,
+            "seconds": 3.0 + job.episode + job.experiment * (0.5 + self._gain * job.episode),
+            "metrics": {}, "odometry_error_m": 0.01,
+        }  # fmt: skip
+        return EpisodeResult(job, row, wall_seconds=0.1)
+
+
 def trace(fallen: bool) -> Trace:
     rows = np.zeros((200, 3))
     return Trace(0.02, rows, np.zeros(200), rows, np.zeros(200), rows, fallen)
 
 
 def test_an_episode_that_cannot_be_done_does_not_take_the_others_with_it(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    done = []
-
-    def episode(job: RunSettings) -> SimpleNamespace:
-        if len(done) == 2:
-            raise BackendError("the rig did not answer")
-        done.append(job.seed)
-        row = {
-            "seed": job.seed, "success": True, "fell": False, "aborted": False, "fell_ending": False, "seconds": 3.0,
-            "metrics": {},
-            "odometry_error_m": 0.01,
-        }  # fmt: skip
-        return SimpleNamespace(row=row)
-
-    monkeypatch.setattr("servoid.tools.evaluate.judge.judge", episode)
-    words = [*WORDS, "--json", "--workers", "1", "--episodes"]
-    assert main(["rollout", *words, "5"]) == 3
-    out, err = capfd.readouterr()
-    (line,) = out.splitlines()
+    work = Episodes(BackendError("the rig did not answer"), after=2)
+    words = ["--json", "--workers", "1", "--episodes", "5"]
+    with pytest.raises(BackendError):
+        rollout.main(options(*words), work)
+    (line,) = capfd.readouterr().out.splitlines()
     result = json.loads(line)
     assert (result["episodes"], result["success_rate"]) == (2, 1.0)
     assert (result["error"], result["exit_code"]) == ("the rig did not answer", 3)
-    assert "the rig did not answer" in err
-    assert main(["rollout", *words, "5"]) == 3  # and where none was done, the error alone
+    with pytest.raises(BackendError):
+        rollout.main(options(*words), work)  # and where none was done, the error alone
     (line,) = capfd.readouterr().out.splitlines()
     assert json.loads(line) == {"error": "the rig did not answer", "exit_code": 3}
 
 
+@pytest.mark.slow
 def test_many_episodes_take_no_more_memory_than_one() -> None:
     """In a process of its own: what else was freed in this one would be used again, and hide it."""
     code = """
@@ -148,6 +169,7 @@ def test_success_is_by_the_truth_and_only_of_whole_runs(
     assert (row["success"], row["fell"], row["aborted"]) == (success, fell, outcome == "stopped")
 
 
+@pytest.mark.slow
 def test_a_run_that_is_told_to_end_is_no_episode_even_where_its_task_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
     """The signal comes while the robot is being lowered: the run has a result, and nothing else would know of it."""
     lowering = []
@@ -180,7 +202,7 @@ def test_a_run_that_never_began_is_counted_and_not_a_crash(monkeypatch: pytest.M
             "odometry_error_m": 0.02,
             "seconds": 4.0,
         }
-        summary = rollout.summarise(options(), [row, good], 1.0)
+        summary = summarise([row, good])
         assert summary["metrics"] == {**row["metrics"], "distance_m": 2.0, "odometry_error_m": 0.02}
         assert (summary["success_rate"], summary["aborted_rate"]) == (0.5, 0.5)
         assert summary["failed_seeds"] == [row["seed"]]
@@ -236,6 +258,8 @@ def test_a_fall_after_the_task_is_one_while_ending(phase: Phase, kinds: tuple[st
         (["--episodes", "0"], "--episodes"),
         (["--workers", "-1"], "--workers"),
         (["--policy", "gate"], "gait"),
+        (["--policy", "gait", "--policy", "gate"], "gait"),
+        (["--fresh"], "--out"),
         (["--set", "vz=1"], "vz"),
         (["--robot", "op4"], "op4"),
     ],
@@ -250,3 +274,87 @@ def test_a_task_that_a_person_steers_is_no_rollout() -> None:
     arguments.task = "steer"
     with pytest.raises(ConfigError, match="servoid run steer"):
         rollout.main(arguments)
+
+
+def test_policies_are_compared_on_the_same_seeds(capfd: pytest.CaptureFixture[str]) -> None:
+    """A walk's length depends on its seed far more than on the policy: the difference is that of the pairs."""
+    words = ["walk", "--policy", "gait,expert", "--episodes", "8", "--workers", "1", "--seconds", "9", "--json"]
+    work = Episodes(gain=0.01)
+    assert rollout.main(parsed(*words), work) == 0
+    out, err = capfd.readouterr()
+    result = json.loads(out)
+    assert work.done[:4] == [("gait", 0), ("expert", 0), ("gait", 1), ("expert", 1)]
+    gait, expert = result["policies"]["gait"], result["policies"]["expert"]
+    assert gait["sd"]["mean_seconds"] == pytest.approx(np.std(np.arange(8), ddof=1))
+    assert expert["mean_seconds"] == pytest.approx(6.5 + 0.5 + 0.035)
+    (difference,) = result["differences"]
+    assert (difference["policy"], difference["minus"]) == ("expert", "gait")
+    longer = difference["figures"]["mean_seconds"]
+    assert (longer["mean"], longer["pairs"]) == (pytest.approx(0.535), 8)
+    assert 0.5 < longer["ci95"][0] < 0.535 < longer["ci95"][1] < 0.6
+    assert difference["figures"]["success_rate"] == {"mean": 0.0, "ci95": None, "pairs": 8}
+    assert "expert minus gait, by seed:" in err
+    assert "± standard deviation" in err
+
+
+@pytest.mark.parametrize(
+    ("given", "named"), [(["gait,gait"], "twice"), (["gait", "gait"], "twice"), (["gait,"], "''"), ([""], "''")]
+)
+def test_a_policy_is_compared_with_another_one(given: list[str], named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        rollout.policies(given)
+
+
+@pytest.mark.slow
+def test_a_rollout_with_out_goes_on_where_it_was(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """After Ctrl-C, the figures of what was done; the same command does the others, and another one is refused."""
+    words = [*WORDS[:3], "--workers", "1", "--out", str(tmp_path / "out"), "--json", "--episodes", "4"]
+    with pytest.raises(KeyboardInterrupt, match="the same command goes on"):
+        rollout.main(parsed(*words), Episodes(KeyboardInterrupt(), after=2))
+    result = json.loads(capfd.readouterr().out)
+    assert (result["episodes"], result["exit_code"]) == (2, 130)
+    work = Episodes()
+    assert rollout.main(parsed(*words), work) == 0
+    assert work.done == [("gait", 2), ("gait", 3)]
+    assert json.loads(capfd.readouterr().out)["episodes"] == 4
+    _, *lines = (tmp_path / "out" / "gait.jsonl").read_text().splitlines()
+    assert [json.loads(line)["episode"] for line in lines] == [0, 1, 2, 3]
+    assert {"seed", "success", "metrics"} <= json.loads(lines[0]).keys()
+    more = Episodes()
+    assert rollout.main(parsed(*words, "--policy", "expert"), more) == 0  # its own episodes are all that is lacking
+    assert more.done == [("expert", i) for i in range(4)]
+    for other, named in (
+        (["--set", "tolerance=0.2"], r"settings\.tolerance"),
+        (["--seed", "1"], "seed"),
+        (["--gain", "0.9"], "gain"),
+        (["--randomise"], "randomise"),
+    ):
+        with pytest.raises(ConfigError, match=rf"gait\.jsonl: .* of these: {named}; .*--fresh"):
+            rollout.main(parsed(*words, *other), Episodes())
+    fresh = Episodes()
+    assert rollout.main(parsed(*words, "--seed", "1", "--fresh"), fresh) == 0
+    assert len(fresh.done) == 4
+
+
+def test_a_policy_that_changes_meanwhile_ends_the_rollout(tmp_path: Path) -> None:
+    """What was kept would be two policies' under one name."""
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("steps: 2\n")
+    done = Episodes()
+
+    def work(job: EpisodeJob) -> EpisodeResult:
+        mine.write_text(f"steps: {2 + job.episode}\n")
+        return done(job)
+
+    words = ["walk", "--policy", str(mine), "--workers", "1", "--out", str(tmp_path / "out")]
+    with pytest.raises(ConfigError, match="changed while episodes ran"):
+        rollout.main(parsed(*words), work)
+    (kept,) = (tmp_path / "out").glob("mine-*.jsonl")
+    assert len(kept.read_text().splitlines()) == 2
+
+
+def test_a_file_that_holds_no_episodes_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "gait.jsonl").write_text("my notes\n")
+    with pytest.raises(ConfigError, match="no file of episodes"):
+        rollout.main(parsed(*WORDS, "--out", str(tmp_path)), Episodes())
+    assert (tmp_path / "gait.jsonl").read_text() == "my notes\n"

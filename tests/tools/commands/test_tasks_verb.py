@@ -75,7 +75,7 @@ def test_a_task_that_cannot_be_loaded_does_not_hide_the_others(
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("class Mine(BaseTask):\n    pass\n", r"mine\.py:2: Mine: say what it is: name = "),
+        ("class Mine(BaseTask):\n    pass\n", r"mine\.py:2: Mine: name or description missing: write name = "),
         ("class Mine:\n    pass\n", r"mine\.py:2: .*not a task: extend servoid\.stack\.tasks\.base\.BaseTask"),
         (
             "class S(Settings):\n    def __init__(self, distance): ...\n\n\nclass Mine(BaseTask):\n"

@@ -54,6 +54,6 @@ def test_changed_code_changes_what_episodes_and_clips_depend_on(
         return key(dependencies(near, policies, "op3", 0, None, None)), key(clips.recipe("op3"))
 
     before = keys()
-    monkeypatch.setattr("servoid.tools.evaluate.policies.code", lambda: "other")
+    monkeypatch.setattr("servoid.tools.evaluate.cache.code", lambda: "other")
     monkeypatch.setattr("servoid.tools.evaluate.clips.code", lambda: "other")
     assert not set(before) & set(keys())

@@ -79,7 +79,7 @@ def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path
     assert policies.training(experiment) is None
     assert str(path.resolve()) in Path(policies.name(experiment)).read_text()
     other = replace(experiment, network=OwnNetwork("full", "--width 128 --horizon 24 --near-actions 16"))
-    with pytest.raises(ConfigError, match="trained with --near-actions 8, and this row is of 16"):
+    with pytest.raises(ConfigError, match="trained with --near-actions 8, but this row needs 16"):
         policies.name(other)
 
 
@@ -92,15 +92,15 @@ def test_of_a_network_that_was_trained_by_steps_the_minutes_do_not_matter(tmp_pa
         training = {**head["training"], "steps": steps, "minutes": 5.0}
         write(folder / "best.safetensors", tensors, {**head, "training": training})
     assert Policies("diffusion", tmp_path / "9").name(experiment)
-    with pytest.raises(ConfigError, match="trained with --steps 8, and this row is of 9"):
+    with pytest.raises(ConfigError, match="trained with --steps 8, but this row needs 9"):
         Policies("diffusion", tmp_path / "8").name(experiment)
 
 
 @pytest.mark.parametrize(
     ("share", "told"),
     [
-        (0.42, r"last\.safetensors: 42\.0% of its training are done: go on: `servoid train .*--horizon 24`"),
-        (None, r"last\.safetensors does not say .* train anew: `servoid train .*--horizon 24 --no-resume`"),
+        (0.42, r"last\.safetensors: only 42\.0% of its training is done; continue it: `servoid train .*--horizon 24`"),
+        (None, r"last\.safetensors: does not record .* train it again: `servoid train .*--horizon 24 --no-resume`"),
     ],
 )
 def test_a_half_trained_network_fills_no_row(tmp_path: Path, share: float | None, told: str) -> None:

@@ -79,7 +79,7 @@ def test_an_experiment_like_another_differs_in_what_it_says(tmp_path: Path) -> N
         ("plan: {steps: 3}", "plan: {stpes: 3}", "14: rows.mine/own.experiment: plan: unknown setting 'stpes'"),
         ("best}", "best, guidance.x: 1}", "13: rows.mine/far.experiment: plan: unknown setting 'guidance.x'"),
         ("task: walk,", "", "15: rows.mine/way.experiment: names no task"),
-        ("episodes: 20", "episodes: 0", "13: rows.mine/far.experiment: episodes: 0 is not a number of episodes"),
+        ("episodes: 20", "episodes: 0", "13: rows.mine/far.experiment: episodes must be at least 1, not 0"),
         ("policy: gait", "backend: dynamixel", "15: rows.mine/way.experiment: backend 'dynamixel' has no truth"),
         ("rows:", "row:", "12: row: unknown key; did you mean 'rows'?"),
     ],

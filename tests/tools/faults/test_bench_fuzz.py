@@ -9,12 +9,13 @@ from collections.abc import Sequence
 import pytest
 
 from servoid.hw.dynamixel.protocol import codec
-from servoid.hw.dynamixel.protocol.codec import Parser
+from servoid.hw.dynamixel.protocol.codec import PacketParser
 from servoid.tools.cli import main
 from servoid.tools.faults import fuzz, targets
 from servoid.tools.faults.streams import IDS, WIDTH, stream
 
 
+@pytest.mark.slow
 def test_nothing_upsets_what_reads_bytes(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "fuzz", "--streams", "400", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
@@ -50,7 +51,7 @@ def test_failures_of_every_kind_are_counted_with_what_repeats_them(
 def test_streams_repeat_themselves_and_reach_the_parsers() -> None:
     """Noise alone would never pass a checksum."""
     assert stream(1, 2) == stream(1, 2) != stream(2, 2)
-    parser = Parser()
+    parser = PacketParser()
     whole = sum(len(parser.feed(b"".join(stream(0, number)))) for number in range(300))
     assert whole > 300
     assert parser.bad_crc > 10

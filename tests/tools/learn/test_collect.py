@@ -180,6 +180,7 @@ def test_command_and_task_go_together_and_last(table: pa.Table, robot: Robot) ->
     assert (gaps >= shortest[skill_of]).all()
 
 
+@pytest.mark.slow
 def test_same_options_same_files(collected: Path, tmp_path: Path) -> None:
     again, other, quiet = tmp_path / "again", tmp_path / "other", tmp_path / "quiet"
     assert cli.main([*COMMAND.split(), str(again)]) == 0
@@ -319,7 +320,7 @@ def test_a_dataset_is_replaced_only_when_told(tmp_path: Path, capsys: pytest.Cap
     assert "--force" in json.loads(capsys.readouterr().out)["error"]
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "1.jpg").touch()
-    with pytest.raises(ConfigError, match="something else"):
+    with pytest.raises(ConfigError, match="something other"):
         writer(tmp_path / "photos", force=True)
 
 
@@ -378,7 +379,7 @@ def test_files_are_split_by_size_and_found_again(tmp_path: Path, monkeypatch: py
     [
         ("--frames 0", "--frames"),
         ("--worlds 0", "--worlds"),
-        ("--randomise 25", "share between 0 and 1"),
+        ("--randomise 25", "must be between 0 and 1"),
         ("--noise 1.3 0.5", "the lower one first"),
         ("--seconds 2", "at least 3 s"),
         ("--policy exprt", "no such checkpoint"),

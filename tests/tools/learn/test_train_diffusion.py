@@ -15,7 +15,7 @@ from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import read_header
 from servoid.policy.diffusion.dataset import Windows
 from servoid.policy.diffusion.model.checkpoint import load
-from servoid.policy.diffusion.model.config import DenoiserConfig, Objective
+from servoid.policy.diffusion.model.config import DenoiserConfig, TrainingObjective
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.objective import (
     Average,
@@ -42,7 +42,7 @@ CONFIG = DenoiserConfig(54, 20, **SHAPE)
 QUICK = DiffusionTraining(minutes=1.0, steps=30, batch=16, evaluate_every=0.4, warmup_steps=5, text="", **SHAPE)
 
 
-PLAIN = Objective(monotone=0.0)
+PLAIN = TrainingObjective(monotone=0.0)
 
 
 class Measured:
@@ -260,12 +260,14 @@ def test_the_past_is_clean_in_three_quarters_of_the_windows_and_half_share_one_l
 
 
 def test_with_diffusion_forcing_alone_every_token_has_a_level_of_its_own() -> None:
-    states, actions = draw_levels(CONFIG, 400, torch.Generator().manual_seed(0), Objective(monotone=0.0, forcing=1.0))
+    states, actions = draw_levels(
+        CONFIG, 400, torch.Generator().manual_seed(0), TrainingObjective(monotone=0.0, forcing=1.0)
+    )
     levels = torch.cat([states, actions], 1).float()
     assert levels.mean(0).sub(10).abs().max() < 1.5  # past and future alike
     assert (states[:, :4] > 0).any(0).all()
     assert (actions[:, :3] > 0).any(0).all()
-    half = draw_levels(CONFIG, 400, torch.Generator().manual_seed(0), Objective(monotone=0.0, forcing=0.5))
+    half = draw_levels(CONFIG, 400, torch.Generator().manual_seed(0), TrainingObjective(monotone=0.0, forcing=0.5))
     assert not half[0][:200, :4].any()
     assert (half[0][200:, :4] > 0).any(1).all()
     assert abs(torch.corrcoef(levels.T)[0, 1:]).max() < 0.25
@@ -293,7 +295,7 @@ def test_some_windows_have_levels_that_rise_as_gradual_and_rolling_schedules_do(
     assert 0.3 < together < 0.9  # the others are ahead or behind
     # In a batch they take the place of windows that share one level; the rest is as it was.
     plain = draw_levels(CONFIG, 400, torch.Generator().manual_seed(0), PLAIN)
-    mixed = draw_levels(CONFIG, 400, torch.Generator().manual_seed(0), Objective(monotone=0.25))
+    mixed = draw_levels(CONFIG, 400, torch.Generator().manual_seed(0), TrainingObjective(monotone=0.25))
     assert (mixed[0][:100, 4:].diff(dim=1) > 0).any(1).float().mean() > 0.5
     assert not mixed[0][:300, :4].any()
     assert torch.equal(plain[0][100:], mixed[0][100:])
@@ -340,15 +342,15 @@ def test_objectives_change_the_loss_and_nothing_else() -> None:
 
 def test_objectives_that_make_no_sense_are_refused() -> None:
     with pytest.raises(ValueError, match=r"share of 0 to 0\.5, not 0\.8, with forcing 0\.25"):
-        Objective(monotone=0.8)
+        TrainingObjective(monotone=0.8)
     with pytest.raises(ValueError, match=r"monotone must be a share of 0 to 0, not 0\.25, with forcing 1"):
-        Objective(forcing=1.0)
+        TrainingObjective(forcing=1.0)
     with pytest.raises(ValueError, match=r"forcing must be a share of 0 to 1, not 1\.5"):
-        Objective(forcing=1.5)
+        TrainingObjective(forcing=1.5)
     with pytest.raises(ValueError, match="near_actions must be at least 1 tick"):
-        Objective(near_actions=0)
+        TrainingObjective(near_actions=0)
     with pytest.raises(ValueError, match="min_snr must not be negative"):
-        Objective(min_snr=-1.0)
+        TrainingObjective(min_snr=-1.0)
 
 
 def test_a_checkpoint_says_what_it_was_trained_for(windows: Windows, tmp_path: Path) -> None:

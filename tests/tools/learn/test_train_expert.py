@@ -148,7 +148,7 @@ def test_a_tracker_with_other_layers_is_not_trained_further(
 def test_a_folder_of_another_run_is_not_gone_on_with(trained: tuple[Path, ExpertTrainer], tmp_path: Path) -> None:
     """Neither for --init, which would be ignored, nor under other settings, nor where an older program began it."""
     out, _ = trained
-    with pytest.raises(ConfigError, match=r"did not begin with .*--no-resume"):
+    with pytest.raises(ConfigError, match=r"did not start from .*--no-resume"):
         trainer(out, init=out / "expert.safetensors")
     with pytest.raises(
         ConfigError, match=r"hidden was \(32, 16\), is \(16, 16\); hardest_push was 0.9, is 0.5.*--no-resume"
@@ -190,6 +190,7 @@ def test_commands_of_training_are_spread_over_what_is_asked() -> None:
     assert (commands[fast, 1:] == 0).all()  # no fast walking while turning or side-stepping
 
 
+@pytest.mark.slow
 def test_a_fresh_start_leaves_no_curve_of_the_old_run(tmp_path: Path) -> None:
     trainer(tmp_path, samples=48.0).run()
     assert rows(tmp_path)

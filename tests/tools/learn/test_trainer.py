@@ -88,7 +88,7 @@ def test_a_checkpoint_says_what_it_was_begun_with_also_after_going_on(windows: W
         begun = head["results"]["begun_with"]
         assert (begun["checkpoint"], begun["data"], begun["licence"]) == ("old.safetensors", "old walks", "CC-BY-4.0")
         assert begun["results"]["survival"] == 0.5
-    with pytest.raises(ConfigError, match=r"did not begin with .*new\.safetensors: give --no-resume"):
+    with pytest.raises(ConfigError, match=r"did not start from .*new\.safetensors: use --no-resume"):
         run().start(resume=True, init=tmp_path / "new.safetensors")
     assert "begun_with" not in header(run())["results"]
     with pytest.raises(ConfigError, match="trained on new walks, not on other walks"):

@@ -19,11 +19,11 @@ from servoid.tools.learn.settings import (
     ExpertTraining,
     LatentTraining,
     OdometryTraining,
-    Run,
+    TrainingRun,
 )
 from servoid.tools.learn.trainers import diffusion, expert, latent, odometry
 
-METHODS: list[tuple[ModuleType, Run]] = [
+METHODS: list[tuple[ModuleType, TrainingRun]] = [
     (expert, ExpertTraining()),
     (odometry, OdometryTraining()),
     (latent, LatentTraining()),
@@ -37,7 +37,7 @@ def parser_of(verb: ModuleType) -> argparse.ArgumentParser:
     return parser
 
 
-def read(base: Run, *words: str) -> Run:
+def read(base: TrainingRun, *words: str) -> TrainingRun:
     parser = Parser(prog="servoid train x")
     run = parser.add_argument_group("run")
     run.add_argument("--config")
@@ -46,7 +46,7 @@ def read(base: Run, *words: str) -> Run:
 
 
 @pytest.mark.parametrize(("verb", "base"), METHODS, ids=lambda value: getattr(value, "__name__", ""))
-def test_the_help_groups_every_setting_with_its_default(verb: ModuleType, base: Run) -> None:
+def test_the_help_groups_every_setting_with_its_default(verb: ModuleType, base: TrainingRun) -> None:
     text = parser_of(verb).format_help()
     titles = [line.removesuffix(":") for line in text.splitlines() if line.endswith(":") and not line.startswith(" ")]
     assert {"run", "network"} < set(titles)
@@ -59,7 +59,7 @@ def test_the_help_groups_every_setting_with_its_default(verb: ModuleType, base: 
 
 
 @pytest.mark.parametrize("base", [base for _, base in METHODS], ids=lambda base: type(base).__name__)
-def test_flags_that_are_not_given_change_nothing(base: Run) -> None:
+def test_flags_that_are_not_given_change_nothing(base: TrainingRun) -> None:
     assert read(base) == base
 
 
@@ -89,7 +89,7 @@ def test_minutes_that_are_typed_count_where_steps_are_the_default() -> None:
         ("minutes: 60\nwidth: wide\n", r"mine.yaml:2: width: expected a whole number"),
         ("minutes: 60\nmonotone: 0.8\n", r"mine.yaml:2: monotone must be a share of 0 to 0\.5, not 0\.8"),
         ("history: 1\n", r"mine.yaml:1: history must be at least 2"),
-        ("mask: casual\n", r"mine.yaml:1: mask: no attention mask is called 'casual'"),
+        ("mask: casual\n", r"mine.yaml:1: mask: unknown attention mask 'casual'"),
         ("precision: fp64\n", r"mine.yaml:1: precision: expected one of bf16, fp32"),
     ],
 )
@@ -132,7 +132,9 @@ def test_what_makes_no_sense_is_refused_by_its_flag(words: list[str], message: s
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_shipped_files_differ_from_the_defaults_where_they_say_so_alone(base: Run, changes: dict[str, float]) -> None:
+def test_shipped_files_differ_from_the_defaults_where_they_say_so_alone(
+    base: TrainingRun, changes: dict[str, float]
+) -> None:
     name = type(base).__name__.removesuffix("Training").lower()
     assert load_yaml(CONFIGS / "training" / f"{name}.yaml", type(base)) == replace(base, **changes)  # type: ignore[arg-type]
 

@@ -99,12 +99,12 @@ def test_a_page_repeats_and_goes_on_with_the_next(tmp_path: Path) -> None:
         ({7: page(({14: 2148}, 50, 0), next=8)}, "page 8, which page 7 goes on with, is empty; pages with a motion: 7"),
         (
             {7: page(({14: 1}, 5, 0), next=8), 8: page(({14: 1}, 5, 0), next=7)},
-            "the pages from 7 on loop at page 7: such a motion has no end",
+            "the pages from 7 on loop at page 7, so the motion never ends",
         ),
         ({7: page(({14: 1}, 5, 0))[:-1] + b"\x01"}, "page 7: its checksum is wrong"),
         ({7: page(({14: 1}, 5, 0), schedule=0)}, "page 7: its steps are timed by speed"),
         ({7: page(({14: 1}, 5, 0), speed=0)}, "page 7: its play speed is 0"),
-        ({7: page(*[({14: 1}, 5, 0)] * 8)}, "page 7: 8 steps, where 7 fit"),
+        ({7: page(*[({14: 1}, 5, 0)] * 8)}, "page 7: has 8 steps, but only 7 fit"),
         ({}, "none of its pages holds a motion"),
     ],
 )
@@ -117,7 +117,7 @@ def test_a_file_that_is_wrong_says_where(tmp_path: Path, pages: dict[int, bytes]
 def test_a_file_that_is_cut_or_missing_is_refused(tmp_path: Path) -> None:
     path = file(tmp_path, {7: page(({14: 1}, 5, 0))})
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(ConfigError, match="has 131071 bytes, and an action file 131072: it is cut off, or none"):
+    with pytest.raises(ConfigError, match="has 131071 bytes instead of 131072: cut off, or not an action file"):
         read_pages(path)
     with pytest.raises(ConfigError, match="cannot be read"):
         read_pages(tmp_path / "none.bin")

@@ -69,7 +69,7 @@ def test_clips_are_mirrored_and_blended_into_new_files(nod: Path, motions: Motio
     assert head.max() == pytest.approx(-head.min(), abs=0.02)
     code, answer, _ = motions(*both)
     assert code == 2
-    assert "exists already" in answer["error"]
+    assert "already exists" in answer["error"]
     assert motions(*both, "--replace")[0] == 0
 
 
@@ -98,14 +98,14 @@ def test_a_run_becomes_a_clip(tmp_path: Path, motions: Motions, monkeypatch: pyt
     ("words", "said"),
     [
         (("import", "{}/walk.c3d", "--name", "x"), "not an action file (.bin) or a flight log (.mcap)"),
-        (("import", "{}/motion.bin", "--name", "x"), "say which page with --page; it has 7 nod"),
+        (("import", "{}/motion.bin", "--name", "x"), "page missing; choose one with --page: 7 nod"),
         (("import", "{}/motion.bin", "--name", "x", "--page", 8), "page 8 is empty; pages with a motion: 7"),
-        (("import", "{}/motion.bin", "--name", "look-left", "--page", 7), "look-left.safetensors: exists already"),
+        (("import", "{}/motion.bin", "--name", "look-left", "--page", 7), "look-left.safetensors: already exists"),
         (("play", "look-lfet", "--library", "{}/clips"), "did you mean 'look-left'?"),
         (("play", "look-left", "--library", "{}/clips", "--rate", 0), "--rate 0: must be between 0.1 and 10"),
         (
             ("play", "look-left", "--library", "{}/clips", "--worlds", 5),
-            "--worlds 5: must be at least 1, and goes with --randomise",
+            "--worlds 5: must be at least 1, and needs --randomise",
         ),
         (("list", "--library", "{}/none"), "none: no such folder of clips"),
         (("play", "{}/motion.bin.safetensors"), "no such checkpoint"),
@@ -139,7 +139,7 @@ def test_a_recipe_makes_all_of_its_clips_one_after_the_other(tmp_path: Path, mot
     np.testing.assert_allclose(library["look"].joints[0], library["bend"].joints[-1], atol=1e-6)
     recipe.write_text(text + "  - {page: 8, name: look, captions: [look], after: bent}\n")
     code, answer, _ = motions("import", path, "--recipe", recipe, "--out", tmp_path / "clips", "--replace")
-    assert (code, "after: 'bent' is no clip before it" in answer["error"]) == (2, True)
+    assert (code, "after: 'bent' is not an earlier clip" in answer["error"]) == (2, True)
     recipe.write_text(text + "  - {pgae: 8, name: look, captions: [look]}\n")
     code, answer, _ = motions("import", path, "--recipe", recipe, "--out", tmp_path / "clips", "--replace")
     assert (code, "two.yaml:4: clips[1].pgae: unknown key" in answer["error"]) == (2, True)

@@ -1,8 +1,8 @@
 """Record demonstrations of the expert in simulation as a LeRobot v3.0 dataset.
 
-Every world walks and stands under commands that change every few seconds, with noise on its actions and pushes; the
-labels are the expert's actions without the noise. What a fall ends loses its last second. Mirrored copies are not
-stored: training mirrors each window when it reads it, which comes to the same data twice.
+Every world walks and stands under commands that change every few seconds, with pushes and with noise on its actions;
+the labels are the expert's actions without the noise. An episode that ends in a fall loses its last second. Mirrored
+copies are not stored, because training mirrors each window as it reads it: the same as twice the data.
 
 The same options and the same seed make the same files.
 """
@@ -34,12 +34,23 @@ MIRRORING = "applied when read (servoid.policy.diffusion.dataset): each window a
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the dataset, to be created")
-    parser.add_argument("--frames", type=int, default=500_000, help="ticks to keep, at least (default: %(default)s)")
-    parser.add_argument("--worlds", type=int, default=256, help="robots at a time (default: %(default)s)")
-    parser.add_argument("--policy", default="expert", help="expert, gait, or a tracker's checkpoint (default: expert)")
-    parser.add_argument("--robot", default="op3", help="name or file (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=15.0, help="of an episode (default: %(default)s)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the dataset")
+    parser.add_argument(
+        "--frames", type=int, default=500_000, metavar="N", help="least number of ticks to keep (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--worlds", type=int, default=256, metavar="N", help="robots side by side (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--policy",
+        default="expert",
+        metavar="NAME|FILE",
+        help="expert, gait or a tracker's checkpoint (default: expert)",
+    )
+    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
+    parser.add_argument(
+        "--seconds", type=float, default=15.0, metavar="S", help="length of an episode (default: %(default)g)"
+    )
     parser.add_argument(
         "--randomise",
         type=float,
@@ -53,12 +64,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs=2,
         default=[0.2, 0.6],
         metavar=("LOW", "HIGH"),
-        help="scale of an episode's action noise, drawn between these (default: 0.2 0.6)",
+        help="range of the scale of an episode's action noise (default: 0.2 0.6)",
     )
-    parser.add_argument("--plain-odometry", action="store_true", help="leg odometry without the learned correction")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--threads", type=int, default=0, help="of the simulation; 0: all cores (default)")
-    parser.add_argument("--force", action="store_true", help="replace a dataset that is there")
+    parser.add_argument(
+        "--plain-odometry", action="store_true", help="estimate without the learned correction of odometry"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument(
+        "--threads", type=int, default=0, metavar="N", help="threads of the simulation (default: all cores)"
+    )
+    parser.add_argument("--force", action="store_true", help="replace an existing dataset")
     add_json_argument(parser)
 
 
@@ -81,13 +96,13 @@ def main(args: argparse.Namespace) -> int:
 def _check(args: argparse.Namespace) -> None:
     for name in ("frames", "worlds"):
         if getattr(args, name) < 1:
-            raise ConfigError(f"--{name} {getattr(args, name)}: at least 1 is needed")
+            raise ConfigError(f"--{name} must be at least 1, not {getattr(args, name)}")
     if not 0.0 <= args.randomise <= 1.0:
-        raise ConfigError(f"--randomise {args.randomise:g}: a share between 0 and 1 is needed")
+        raise ConfigError(f"--randomise must be between 0 and 1, not {args.randomise:g}")
     if not 0.0 <= args.noise[0] <= args.noise[1] < math.inf:
-        raise ConfigError(f"--noise {args.noise[0]:g} {args.noise[1]:g}: 0 or more is needed, the lower one first")
+        raise ConfigError(f"--noise {args.noise[0]:g} {args.noise[1]:g}: must not be negative, the lower one first")
     if args.seed < 0:
-        raise ConfigError(f"--seed {args.seed}: 0 or more is needed")
+        raise ConfigError(f"--seed must not be negative, not {args.seed}")
 
 
 def collect(args: argparse.Namespace) -> dict[str, Any]:

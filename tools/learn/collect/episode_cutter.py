@@ -21,7 +21,7 @@ _HOPELESS = 20  # ticks walked for one that is kept: no dataset will come of it
 
 
 @dataclass(frozen=True)
-class Episode:
+class RecordedEpisode:
     """Rows of one episode by column `(ticks, size)` float32, and the number of each tick's skill `(ticks,)`."""
 
     columns: dict[str, Array]
@@ -55,7 +55,7 @@ class EpisodeCutter:
         self._length = np.zeros(fleet.n, int)
         self.begun, self.fell, self.walked = 0, 0, 0
 
-    def episodes(self, frames: int, progress: Callable[[int], None] | None = None) -> Iterator[Episode]:
+    def episodes(self, frames: int, progress: Callable[[int], None] | None = None) -> Iterator[RecordedEpisode]:
         """Episodes of at least `frames` ticks together, in the order in which they end.
 
         The last ones are cut short, and lose their last second like those that fell: it is not known whether they
@@ -117,9 +117,9 @@ class EpisodeCutter:
         self._length += 1
         self.walked += fleet.n
 
-    def _cut(self, lengths: Array) -> Iterator[Episode]:
+    def _cut(self, lengths: Array) -> Iterator[RecordedEpisode]:
         """The first `lengths` `(n,)` ticks of each world's episode; 0: none."""
         for world in np.flatnonzero(lengths):
             length = lengths[world]
             columns = {name: rows[world, :length].copy() for name, rows in self._rows.items()}
-            yield Episode(columns, self._skills[world, :length].copy())
+            yield RecordedEpisode(columns, self._skills[world, :length].copy())

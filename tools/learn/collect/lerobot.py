@@ -69,17 +69,17 @@ def check_target(out: Path, force: bool) -> None:
     `force` allows to replace a dataset; a folder with anything else in it is never replaced.
     """
     if out.name in ("", ".."):
-        raise ConfigError(f"{out}: not a name for a dataset; give a folder to create, such as runs/walks")
+        raise ConfigError(f"{out}: not a name for a dataset; name a folder to create, such as runs/walks")
     if out.is_dir() and any(out.iterdir()):
         if not (out / "meta" / "info.json").is_file():
-            raise ConfigError(f"{out}: a folder that holds something else than a dataset; choose another one")
+            raise ConfigError(f"{out}: holds something other than a dataset; choose another folder")
         if not force:
-            raise ConfigError(f"{out}: holds a dataset already; choose another folder, or --force to replace it")
+            raise ConfigError(f"{out}: already holds a dataset; choose another folder, or replace it with --force")
     elif out.exists() and not out.is_dir():
-        raise ConfigError(f"{out}: is a file; give a folder to create")
+        raise ConfigError(f"{out}: is a file; name a folder to create")
     part = _part(out)
     if part.exists() and not (part.is_dir() and {p.name for p in part.iterdir()} <= {"data", "meta"}):
-        raise ConfigError(f"{part}: in the way of the dataset while it grows; move it, or choose another folder")
+        raise ConfigError(f"{part}: is where the unfinished dataset would go; move it, or choose another folder")
 
 
 def _part(out: Path) -> Path:
@@ -152,7 +152,7 @@ class DatasetWriter:
     def finish(self, extra: Mapping[str, str] | None = None) -> None:
         """Write the metadata, with the text files `extra` beside it in meta/, and give the dataset its name."""
         if not self.episodes:
-            raise ConfigError(f"{self.out}: no episode was kept, so that there is no dataset to write")
+            raise ConfigError(f"{self.out}: no episode was kept, so there is no dataset to write")
         with self._writing():
             self._close()
             self._write_metadata(extra or {})

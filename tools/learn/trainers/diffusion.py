@@ -1,4 +1,7 @@
-"""Train the diffusion planner-controller on a recorded dataset."""
+"""Train the diffusion model, which plans and controls, on a recorded dataset.
+
+Ctrl-C saves, and the same command continues.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,8 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
-from servoid.policy.diffusion.model.config import DenoiserConfig, DenoiserShape, Objective
+from servoid.policy.checkpoint import Origin
+from servoid.policy.diffusion.model.config import DenoiserConfig, DenoiserShape, TrainingObjective
 from servoid.policy.features import token_layout
 from servoid.policy.text.encoder import load_encoder
 from servoid.tools.learn.flags import plain, read_settings
@@ -35,13 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid train diffusion`."""
     run = add_run_arguments(parser, DiffusionTraining(), data=True)
     run.add_argument(
-        "--init", type=Path, metavar="CHECKPOINT", help="begin with this diffusion model; its normalisation is kept"
+        "--init", type=Path, metavar="CHECKPOINT", help="start from this diffusion model, with its normalisation"
     )
     run.add_argument(
         "--latent",
         type=Path,
         metavar="CHECKPOINT",
-        help="plan latents of this file (`servoid train latent`), not joint targets",
+        help="plan in the latents of this file (`servoid train latent`) instead of joint targets",
     )
 
 
@@ -144,27 +148,24 @@ class DiffusionTrainer(Trainer):
 
         model = load(path, self.robot)
         if model.config != self.config:
-            raise ConfigError(f"{path}: another network than the options ask for: {model.config}")
+            raise ConfigError(f"{path}: not the network that the options ask for: {model.config}")
         if not same_latents(model.latents, self.windows.latents):
-            raise ConfigError(f"{path}: its actions are not those that --latent gives: use the same latents, or none")
+            raise ConfigError(f"{path}: its actions are not those of --latent: use the same latents, or none")
         self.network.load_state_dict(model.denoiser.state_dict())
         self.average.weights = {name: p.detach().clone() for name, p in self.network.named_parameters()}
         self.windows.states, self.windows.actions = model.states, model.actions
 
     @property
     def title(self) -> str:
-        """See `Trainer.title`."""
         size = f"{self.network.parameter_count:,} parameters, {self.config.tokens} tokens"
         actions = "latent actions" if self.windows.latents else "joint targets"
         return f"{size} on {len(self.windows.training):,} windows with {actions}"
 
     @property
     def following(self) -> str:
-        """See `Trainer.following`."""
         return f"servoid rollout walk --policy {self.best_path} --episodes 50"
 
     def learn(self) -> dict[str, float]:
-        """See `Trainer.learn`."""
         import torch
 
         from servoid.policy.diffusion.objective import losses
@@ -195,13 +196,11 @@ class DiffusionTrainer(Trainer):
         }
 
     def shown(self, means: Mapping[str, float], steps_per_s: float) -> tuple[dict[str, float], str]:
-        """See `Trainer.shown`."""
         speed = steps_per_s * self.settings.batch * self.config.tokens
         text = f"states {means['state_loss']:.3f}, actions {means['action_loss']:.3f}, {1000 / steps_per_s:.0f} ms/step"
         return {"tokens_per_s": speed}, f"{text}, {speed:,.0f} tokens/s"
 
     def held_out(self) -> dict[str, float]:
-        """See `Trainer.held_out`."""
         return {self.LOSS: self.validation_loss()}
 
     def validation_loss(self, count: int = 1024) -> float:
@@ -216,31 +215,19 @@ class DiffusionTrainer(Trainer):
         states, actions, text = self.windows.held_out(count)
         # The same measure whatever else is trained for, so that runs can be compared.
         same = self.settings
-        measure = Objective(same.inference_delay, same.near_actions, same.far_actions, monotone=0.0)
+        measure = TrainingObjective(same.inference_delay, same.near_actions, same.far_actions, monotone=0.0)
         with torch.inference_mode():
             given = states, actions, text, self.signal, torch.Generator().manual_seed(0)
             return losses(network, *given, measure)[1].item()
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
-        """See `Trainer.ship`."""
-        from servoid.policy.diffusion.model import checkpoint
+        from servoid.policy.diffusion.model.checkpoint import Trained, save
 
-        checkpoint.save(
-            path,
-            self.average.weights,
-            self.config,
-            self.windows.states,
-            self.windows.actions,
-            self.robot,
-            data=self.source,
-            licence=self.settings.licence,
-            results=results,
-            training=plain(self.settings),
-            latents=self.windows.latents,
-        )
+        windows = self.windows
+        trained = Trained(self.average.weights, self.config, windows.states, windows.actions, windows.latents)
+        save(path, trained, self.robot, Origin(self.source, self.settings.licence, results, plain(self.settings)))
 
     def state(self) -> dict[str, Any]:
-        """See `Trainer.state`."""
         return {
             "config": asdict(self.config),
             "network": self.network.state_dict(),
@@ -255,7 +242,6 @@ class DiffusionTrainer(Trainer):
         }
 
     def restore(self, path: Path, saved: Mapping[str, Any]) -> None:
-        """See `Trainer.restore`."""
         from servoid.policy.features import Normaliser
 
         latents = _arrays(saved["latents"])

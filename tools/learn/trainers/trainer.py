@@ -19,7 +19,7 @@ from servoid.hw.config import ConfigError
 from servoid.tools.common.folder_lock import locked
 from servoid.tools.learn.flags import add_setting_flags, plain
 from servoid.tools.learn.progress import ProgressLine
-from servoid.tools.learn.settings import Run
+from servoid.tools.learn.settings import TrainingRun
 
 if TYPE_CHECKING:
     from servoid.policy.recording import Recording
@@ -34,7 +34,7 @@ _CHUNK = 10.0  # seconds of training between two rows of the log, at most
 
 def add_run_arguments(
     parser: argparse.ArgumentParser,
-    base: Run,
+    base: TrainingRun,
     out: Path | None = None,
     what: str = "folder of the run: checkpoints, log, learning curve",
     *,
@@ -44,21 +44,23 @@ def add_run_arguments(
     """Add what every training takes, and a flag for each setting of `base`; returns the group of the run itself."""
     run = parser.add_argument_group("run")
     if data:
-        run.add_argument("--data", type=Path, required=True, help="dataset folder, as `servoid collect` writes it")
+        run.add_argument(
+            "--data", type=Path, required=True, metavar="DIR", help="dataset folder, written by `servoid collect`"
+        )
     shown = what + (f" (default: {out})" if out else "")
-    run.add_argument("--out", type=Path, default=out, required=out is None, help=shown)
-    run.add_argument("--robot", default="op3", help="robot, by name or file (default: op3)")
+    run.add_argument("--out", type=Path, default=out, required=out is None, metavar="PATH", help=shown)
+    run.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     run.add_argument(
-        "--config", metavar="FILE", help="settings, by file or by name in configs/training; flags change them"
+        "--config", metavar="NAME|FILE", help="settings file, or its name in configs/training; flags override it"
     )
     run.add_argument(
         "--resume",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="continue the run in --out, under the settings it began with; its length may change (default: yes)",
+        help="continue the run in --out with the settings it started with; its length may change (default: yes)",
     )
     shown = f"threads of torch (default: {threads or 'all cores'})"
-    run.add_argument("--threads", type=int, default=threads or os.cpu_count(), help=shown)
+    run.add_argument("--threads", type=int, default=threads or os.cpu_count(), metavar="N", help=shown)
     add_setting_flags(parser, base, run)
     return run
 
@@ -75,7 +77,7 @@ class Trainer(ABC):
     columns: Sequence[str]  # of the log, beside the minutes: what `learn`, `shown`, `held_out` and `judge` give
     panels: Sequence[Sequence[str]]  # columns that are drawn, by picture
 
-    def __init__(self, out: Path, settings: Run, source: str, judge: Judge | None = None) -> None:
+    def __init__(self, out: Path, settings: TrainingRun, source: str, judge: Judge | None = None) -> None:
         """`source` says what is learned from: a run goes on with the same. `judge` runs a checkpoint in closed loop."""
         self.out, self.settings, self.source, self.judge = out, settings, source, judge
         self.every = settings.evaluate_every / settings.minutes or math.inf  # share of the budget between evaluations
@@ -163,7 +165,7 @@ class Trainer(ABC):
         if resume and self.resume():
             if init is not None and self.begun_with.get("sha256") != sha256(init):
                 raise ConfigError(
-                    f"{self.out}: holds a run that did not begin with {init}: give --no-resume, or another --out"
+                    f"{self.out}: holds a run that did not start from {init}: use --no-resume or another --out"
                 )
         elif init is not None:
             self.adopt(init)

@@ -1,4 +1,4 @@
-"""Write a clip that is one clip and then another, blended into each other."""
+"""Join two clips into one, blended into each other."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from servoid.tools.motions.verbs.options import add_library_arguments, add_out_a
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("first", help="name in the library, or a file")
-    parser.add_argument("second", help="the clip that follows it")
-    parser.add_argument("--name", required=True, help="of the clip that is written")
-    parser.add_argument("--seconds", type=float, default=0.3, help="in which one becomes the other (default: 0.3)")
+    parser.add_argument("first", metavar="FIRST", help="clip: name in the library, or file")
+    parser.add_argument("second", metavar="SECOND", help="clip that follows it")
+    parser.add_argument("--name", required=True, help="name of the new clip")
+    parser.add_argument("--seconds", type=float, default=0.3, metavar="S", help="length of the blend (default: 0.3)")
     add_out_arguments(parser)
     add_library_arguments(parser)
 

@@ -1,4 +1,4 @@
-"""Check clips: joint ranges and speeds, and the feet that carry: whether they float, sink in or slide."""
+"""Check clips: joint ranges and speeds, and whether feet that carry the robot float, sink in or slide."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from servoid.tools.motions.verbs.options import add_library_arguments, clip_of, 
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("clips", nargs="*", help="names in the library, or files (default: the whole library)")
+    parser.add_argument(
+        "clips", nargs="*", metavar="CLIP", help="name in the library, or file (default: the whole library)"
+    )
     add_library_arguments(parser)
 
 

@@ -1,8 +1,8 @@
-"""Import motions from a file: an action file of ROBOTIS (.bin), or a flight log of this project (.mcap).
+"""Make clips from a file: an action file of ROBOTIS (.bin), or a flight log of this project (.mcap).
 
-Of an action file, the chain of pages that begins with --page is played as the firmware plays it, in physics, where the
-way of the base comes from; or all clips of a --recipe, a YAML file that lists pages, names and captions. Of a flight
-log, the goals that were sent are taken, and the way that the robot believed to have gone.
+From an action file it plays the chain of pages that starts with --page, as the firmware does, in physics, which gives
+the motion of the base; or it makes all clips of a --recipe, a YAML file that lists pages, names and captions. From a
+flight log it takes the goals that were sent and the motion of the base that the robot estimated.
 """
 
 from __future__ import annotations
@@ -24,16 +24,20 @@ from servoid.tools.motions.verbs.options import add_out_arguments, out_library
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, help="action file (.bin) or flight log (.mcap)")
-    parser.add_argument("--recipe", metavar="NAME|FILE", help="what to make of an action file, such as op3-action-file")
+    parser.add_argument("file", type=Path, metavar="FILE", help="action file (.bin) or flight log (.mcap)")
+    parser.add_argument(
+        "--recipe", metavar="NAME|FILE", help="clips to make of an action file, such as op3-action-file"
+    )
     one = parser.add_argument_group("one clip, instead of a recipe")
-    one.add_argument("--name", help="of the clip")
+    one.add_argument("--name", help="name of the clip")
     one.add_argument("--page", type=int, metavar="N", help="first page of an action file")
-    one.add_argument("--caption", action="append", default=[], metavar="TEXT", help="what it shows; repeatable")
-    one.add_argument("--licence", metavar="TEXT", help="who may use it, such as Apache-2.0")
+    one.add_argument(
+        "--caption", action="append", default=[], metavar="TEXT", help="what the clip shows; may be repeated"
+    )
+    one.add_argument("--licence", metavar="TEXT", help="licence of the clip, such as Apache-2.0")
     for end in ("begins", "ends"):
-        one.add_argument(f"--{end}", choices=POSES, default="upright", help=f"how it {end} (default: upright)")
-    one.add_argument("--loop", action="store_true", help="its last frame leads on to its first")
+        one.add_argument(f"--{end}", choices=POSES, default="upright", help=f"how the clip {end} (default: upright)")
+    one.add_argument("--loop", action="store_true", help="the last frame leads back to the first")
     add_out_arguments(parser)
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     add_json_argument(parser)
@@ -68,16 +72,16 @@ def _recipe(args: argparse.Namespace) -> Recipe:
     """What to make, by the recipe or by the options of one clip."""
     if args.recipe is not None:
         if args.name is not None or args.page is not None:
-            raise ConfigError("--recipe says all of its clips: leave out --name and --page")
+            raise ConfigError("--recipe names its clips itself: drop --name and --page")
         if args.file.suffix != ".bin":
-            raise ConfigError(f"--recipe {args.recipe}: is for action files; of a flight log give --name")
+            raise ConfigError(f"--recipe {args.recipe}: is for action files; for a flight log use --name")
         return load_recipe(args.recipe)
     for option in ("name", "caption", "licence"):
         if not vars(args)[option]:
             raise ConfigError(f"--{option}: missing; a clip needs --name, --caption and --licence, or give a --recipe")
     if args.page is None and args.file.suffix == ".bin":
         named = ", ".join(f"{page.number} {page.name}".strip() for page in read_pages(args.file).values())
-        raise ConfigError(f"{args.file}: say which page with --page; it has {named}")
+        raise ConfigError(f"{args.file}: page missing; choose one with --page: {named}")
     page = PageClip(args.page or 0, args.name, tuple(args.caption), args.begins, args.ends, args.loop)
     return Recipe(args.licence, (page,))
 
@@ -88,7 +92,7 @@ def _from_log(file: Path, wanted: PageClip, licence: str, robot: Robot) -> Clip:
     log = read_log(file)
     ticks = log.ticks("/instruction")
     if len(ticks) < 2:
-        raise ConfigError(f"{file}: its task never began: there is no motion in it")
+        raise ConfigError(f"{file}: holds no motion, because its task never started")
     states, commands = (np.isin(log.ticks(channel), ticks) for channel in ("/state", "/command"))
     goals = log.column("/command", "position")[commands]
     if goals.shape[1] != len(robot.joints):

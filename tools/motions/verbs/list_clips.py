@@ -1,4 +1,4 @@
-"""List the clips of a library: how long they are, how they begin and end, and who may use them."""
+"""List the clips of a library: length, first and last pose, and licence."""
 
 from __future__ import annotations
 

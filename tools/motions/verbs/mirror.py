@@ -1,4 +1,4 @@
-"""Write a clip with left and right swapped."""
+"""Swap left and right of a clip."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from servoid.tools.motions.verbs.options import add_library_arguments, add_out_a
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("clip", help="name in the library, or a file")
-    parser.add_argument("--name", help="of the mirrored clip (default: left and right in its name swapped)")
+    parser.add_argument("clip", metavar="CLIP", help="name in the library, or file")
+    parser.add_argument("--name", help="name of the mirrored clip (default: left and right swapped in the name)")
     add_out_arguments(parser)
     add_library_arguments(parser)
 

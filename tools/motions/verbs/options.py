@@ -13,7 +13,7 @@ from servoid.tools.common.output import add_json_argument
 
 def add_library_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--library", type=Path, default=SHIPPED, metavar="DIR", help="folder of clips (default: shipped)"
+        "--library", type=Path, default=SHIPPED, metavar="DIR", help="folder of clips (default: the shipped one)"
     )
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     add_json_argument(parser)
@@ -21,7 +21,7 @@ def add_library_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_out_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write the clip into")
-    parser.add_argument("--replace", action="store_true", help="overwrite a clip of that name")
+    parser.add_argument("--replace", action="store_true", help="overwrite a clip of the same name")
 
 
 def open_library(args: argparse.Namespace) -> Library:
@@ -42,5 +42,5 @@ def out_library(args: argparse.Namespace, robot: Robot) -> Library:
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"--out {args.out}: cannot be made ({error.strerror})") from None
+        raise ConfigError(f"--out {args.out}: cannot be created ({error.strerror})") from None
     return Library(robot, args.out)

@@ -1,6 +1,6 @@
-"""Play a clip open loop in physics: the goals alone, without a controller.
+"""Play a clip open loop in physics: only its goals, without a controller.
 
-The nominal robot does the same every time, so it plays once; --randomise draws --worlds robots.
+The nominal robot does the same every time, so it plays once; --randomise plays it on --worlds robots drawn at random.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ HOLD_SECONDS = 1.0  # of the last goal: a robot that is about to fall has fallen
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("clip", help="name in the library, or a file")
-    parser.add_argument("--randomise", action="store_true", help="draw each robot's mass, friction, delays ...")
-    parser.add_argument("--worlds", type=int, metavar="N", help="robots that are drawn (default: 40)")
-    parser.add_argument("--rate", type=float, default=1.0, help="times as fast (default: 1)")
+    parser.add_argument("clip", metavar="CLIP", help="name in the library, or file")
+    parser.add_argument("--randomise", action="store_true", help="draw each robot's mass, friction, delays and more")
+    parser.add_argument("--worlds", type=int, metavar="N", help="robots to draw (default: 40)")
+    parser.add_argument("--rate", type=float, default=1.0, metavar="X", help="factor on the clip's speed (default: 1)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
     add_library_arguments(parser)
 
@@ -32,7 +32,7 @@ def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         check_seed(args.seed)
         if args.worlds is not None and (args.worlds < 1 or not args.randomise):
-            raise ConfigError(f"--worlds {args.worlds}: must be at least 1, and goes with --randomise")
+            raise ConfigError(f"--worlds {args.worlds}: must be at least 1, and needs --randomise")
         worlds = (args.worlds or 40) if args.randomise else 1
         if not 0.1 <= args.rate <= 10.0:
             raise ConfigError(f"--rate {args.rate:g}: must be between 0.1 and 10")

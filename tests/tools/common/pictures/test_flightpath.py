@@ -8,7 +8,7 @@ import numpy as np
 
 from servoid.stack.log.flightlog import FlightLog
 from servoid.stack.log.format import SCHEMAS, pack
-from servoid.tools.common import flightpath
+from servoid.tools.common.pictures import flightpath
 
 
 def test_a_plan_starts_where_it_was_requested_and_points_along_the_heading():

@@ -1,0 +1,42 @@
+"""A clip as a controller: its goals alone, through the guard, on whatever body there is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.robot.description import Robot
+from servoid.policy.motion.clip import Clip
+from servoid.policy.references.clip import ClipReference
+from servoid.stack.control.base import BasePolicy
+
+_NOW = np.array([0])
+
+
+class ClipPolicy(BasePolicy):
+    """Plays a clip once, from the pose that the robot is in, and stays in its last pose; of one robot or of `shape`.
+
+    Nothing is balanced: what the robot does between its feet and the ground is left to the clip. Raises ConfigError for
+    a clip that does not begin upright: a run begins standing.
+    """
+
+    def __init__(self, robot: Robot, clip: Clip, shape: tuple[int, ...] = ()) -> None:
+        if clip.about.begins != "upright":
+            raise ConfigError(f"clip '{clip.name}' begins {clip.about.begins}, and a run begins standing")
+        self._reference = ClipReference(robot, [clip], shape)
+        self._entering = np.ones(shape, bool)
+
+    def reset(self, where: Array | None, seeds: Array) -> None:
+        everywhere = np.ones_like(self._entering)
+        self._entering = self._entering | (everywhere if where is None else where)
+
+    def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
+        if self._entering.any():
+            self._reference.play(0, where=self._entering)
+            self._reference.enter(np.asarray(applied, dtype=float), self._entering)
+            self._entering = np.zeros_like(self._entering)
+        target = self._reference.frames(_NOW).position[..., 0, :]
+        self._reference.advance()
+        return target
