@@ -70,7 +70,7 @@ def add_set_argument(parser: argparse.ArgumentParser) -> None:
 
 def add_recover_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--recover", action="store_true", help="when the robot falls, let it get up and go on (default: a fall ends it)"
+        "--recover", action="store_true", help="let a robot that falls get up and continue (default: a fall ends the run)"
     )
 
 
