@@ -70,7 +70,9 @@ def add_set_argument(parser: argparse.ArgumentParser) -> None:
 
 def add_recover_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--recover", action="store_true", help="let a robot that falls get up and continue (default: a fall ends the run)"
+        "--recover",
+        action="store_true",
+        help="let a robot that falls get up and continue (default: a fall ends the run)",
     )
 
 
