@@ -18,6 +18,7 @@ from servoid.sim.marks import Frame
 from servoid.sim.render import render
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["egl", "osmesa"])
 def test_marks_ghosts_and_shadows_are_drawn(way: str) -> None:
     """In a process of its own: MuJoCo chooses how to draw when it is first imported."""

@@ -132,6 +132,7 @@ def test_a_scene_survives_its_way_to_a_rig() -> None:
         plain(replace(scene, robots=np.zeros((1, 5))))
 
 
+@pytest.mark.slow
 def test_pillars_and_spheres_are_drawn() -> None:
     """In a process of its own: MuJoCo chooses how to draw when it is first imported."""
     here = Path(__file__)

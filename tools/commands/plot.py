@@ -17,7 +17,7 @@ from servoid.tools.common.output import Progress, add_json_argument, reporting
 from servoid.tools.common.pictures import panels
 from servoid.tools.common.pictures.caption import heading
 from servoid.tools.common.pictures.drawing import prepare
-from servoid.tools.common.pictures.panels import Panel, Shown
+from servoid.tools.common.pictures.panels import Panel, Shown, new_figure, save_figure
 from servoid.tools.common.summary import OUTCOMES
 
 COLOURS = ("#3459b8", "#d1495b", "#2e8b57", "#8a5fbf")  # of several logs
@@ -57,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _film(logs: Sequence[FlightLog], args: argparse.Namespace) -> Path:
     if len(logs) > 1:
-        raise ConfigError("--video: give one log: a film shows one run")
+        raise ConfigError("--video: a film shows one run: name one log")
     path: Path = args.video
     size = prepare(path, args.video_size)
     from servoid.tools.common.pictures.video import VideoError, make_video
@@ -72,10 +72,10 @@ def _film(logs: Sequence[FlightLog], args: argparse.Namespace) -> Path:
 
 def plot_path(log: FlightLog, out: Path) -> None:
     """The path from above alone, with goal and plans. Raises ModuleNotFoundError without matplotlib."""
-    figure, (axes,) = _figure(1, 1, (6.4, 6.0))
+    figure, (axes,) = new_figure(1, 1, (6.4, 6.0))
     panels.path(axes, Shown(log))
     axes.set_title(title(log), fontsize=10)
-    _save(figure, out)
+    save_figure(figure, out)
 
 
 def plot_runs(logs: Sequence[FlightLog], out: Path, joints: Sequence[str] | None = None) -> None:
@@ -98,32 +98,14 @@ def plot_runs(logs: Sequence[FlightLog], out: Path, joints: Sequence[str] | None
         drawn = [panels.joint(name) for name in joints]
     columns = 3 if joints is None else min(len(drawn), 2)
     rows = math.ceil(len(drawn) / columns)
-    figure, axes = _figure(rows, columns, (16.0, 12.0) if joints is None else (8.0 * columns, 3.6 * rows))
+    figure, axes = new_figure(rows, columns, (16.0, 12.0) if joints is None else (8.0 * columns, 3.6 * rows))
     figure.suptitle("\n".join((f"{one.label}: " if one.label else "") + title(one.log) for one in shown))
     for panel, place in zip(drawn, axes, strict=False):
         for one in shown:
             panel(place, one)
     for place in axes[len(drawn) :]:
         place.set_axis_off()
-    _save(figure, out)
-
-
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    """A figure, and its axes row by row."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, squeeze=False).ravel()
-
-
-def _save(figure: Any, out: Path) -> None:
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out, dpi=110, format="png")
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written ({error.strerror}): choose another place with --out") from None
+    save_figure(figure, out)
 
 
 def title(log: FlightLog) -> str:

@@ -1,7 +1,7 @@
 """Run a task on a robot.
 
-Writes a flight log, for `servoid plot` and `servoid replay`. Ctrl-C lowers the robot and turns torque off; a second one
-turns torque off at once. Exit code 0: the goal was met; 1: the task failed; 4: the guard stopped the run.
+Writes a flight log for `servoid plot` and `servoid replay`. Ctrl-C lowers the robot and turns torque off; a second
+Ctrl-C turns torque off at once. Exit code 0: the task succeeded; 1: it failed; 4: the guard stopped the run.
 """
 
 from __future__ import annotations
@@ -16,7 +16,15 @@ from typing import Any
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Progress, Report, add_json_argument, reporting
-from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, positive, settings
+from servoid.tools.common.parser import (
+    add_gain_argument,
+    add_recover_argument,
+    add_set_argument,
+    check_seed,
+    out_of_reach,
+    positive,
+    settings,
+)
 from servoid.tools.common.pictures.drawing import prepare
 from servoid.tools.common.prompt import confirm
 
@@ -31,29 +39,31 @@ EXIT_CODES = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("task", metavar="TASK", help="what to do: a name (servoid tasks), or FILE.py:Class")
-    parser.add_argument("--backend", default="sim", help="body to run on: sim (default), virtual or dynamixel")
+    parser.add_argument("task", metavar="TASK", help="task: a name (see servoid tasks) or FILE.py:Class")
+    parser.add_argument("--backend", default="sim", metavar="NAME", help="sim, virtual or dynamixel (default: sim)")
     parser.add_argument("--port", metavar="PATH", help="serial port of the robot (--backend dynamixel)")
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     parser.add_argument(
         "--policy",
         default="diffusion",
-        help="controller: diffusion (default), expert, gait, a checkpoint, diffusion settings, or FILE.py:Class",
+        metavar="NAME|FILE",
+        help="controller: expert, gait, a checkpoint, diffusion settings or FILE.py:Class (default: diffusion)",
     )
     parser.add_argument(
-        "--randomise", action="store_true", help="draw the simulated robot's mass, friction, delays ..."
+        "--randomise", action="store_true", help="draw the simulated robot's mass, friction, delays and more"
     )
-    parser.add_argument("--seconds", type=positive, metavar="S", help="length of the task instead of its own")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything that is random (default: 0)")
+    parser.add_argument("--seconds", type=positive, metavar="S", help="length of the task (default: the task's)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
     add_set_argument(parser)
     add_gain_argument(parser)
-    parser.add_argument("--start", action="store_true", help="move a real robot without asking")
+    add_recover_argument(parser)
+    parser.add_argument("--start", action="store_true", help="let a real robot move without asking")
     parser.add_argument("--record", type=Path, metavar="FILE", help="flight log (default: runs/DATE-TASK.mcap)")
     parser.add_argument("--video", type=Path, metavar="FILE", help="film the run afterwards: MP4, and its path as PNG")
     parser.add_argument(
         "--video-size", default="1280x720", metavar="WxH", help="size of the film (default: %(default)s)"
     )
-    parser.add_argument("--fast", action="store_true", help="do not keep a simulation to real time on a terminal")
+    parser.add_argument("--fast", action="store_true", help="simulate as fast as possible, also on a terminal")
     add_json_argument(parser)
 
 
@@ -62,10 +72,9 @@ def main(args: argparse.Namespace) -> int:
         check_seed(args.seed)
         if args.video is not None:
             size = prepare(args.video, args.video_size)
-        from servoid.hw.robot.description import load_robot
         from servoid.stack.runtime.backends import backend_kind
         from servoid.stack.runtime.run import RunSettings, run
-        from servoid.stack.tasks import beyond, find, load_settings
+        from servoid.stack.tasks import find
         from servoid.tools.common.live import LiveLine
         from servoid.tools.common.summary import summary
 
@@ -84,8 +93,9 @@ def main(args: argparse.Namespace) -> int:
             record=args.record or _default_log(find(args.task).name),
             realtime=(watched and not args.fast) if backend_kind(args.backend).simulated else None,
             port=args.port,
+            recover=args.recover,
         )
-        for text in beyond(load_settings(args.task, settings(args), robot := load_robot(args.robot)), robot):
+        for text in out_of_reach(args):
             report.line(text)
         live = LiveLine(sys.stderr if args.json else sys.stdout)
         try:

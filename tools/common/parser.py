@@ -68,6 +68,14 @@ def add_set_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_recover_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--recover",
+        action="store_true",
+        help="let a robot that falls get up and continue (default: a fall ends the run)",
+    )
+
+
 def add_gain_argument(parser: argparse.ArgumentParser) -> None:
     """`--gain G`, for `RunSettings.gain`."""
     parser.add_argument(
@@ -90,3 +98,12 @@ def settings(args: argparse.Namespace) -> dict[str, str]:
             raise ConfigError(f"--set {item}: {key} is set twice")
         result[key] = value
     return result
+
+
+def out_of_reach(args: argparse.Namespace) -> list[str]:
+    """A sentence about each speed that is asked of the chosen robot and is more than it can. Raises ConfigError."""
+    from servoid.hw.robot.description import load_robot
+    from servoid.stack.tasks import beyond, load_settings
+
+    robot = load_robot(args.robot)
+    return beyond(load_settings(args.task, settings(args), robot), robot)

@@ -171,6 +171,7 @@ def test_what_is_not_installed_is_named_with_the_remedy(monkeypatch: pytest.Monk
     Runtime(made, DiffusionSettings(), ROBOT)  # torch needs nothing
 
 
+@pytest.mark.slow
 def test_the_gradient_through_the_network_needs_torch() -> None:
     guidance = GuidanceSettings(gradient="network")
     with pytest.raises(ValueError, match="set engine: torch"):

@@ -14,10 +14,17 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import CheckpointError, Origin, read_header
 from servoid.policy.features import Normaliser, raw_layout
-from servoid.policy.latent.actions import LatentActions, LatentConfig, load_latents, same_latents, save_latents
+from servoid.policy.latent.actions import (
+    LatentActions,
+    LatentConfig,
+    load_latents,
+    proprioception,
+    proprioception_layout,
+    same_latents,
+    save_latents,
+)
 from servoid.policy.latent.dataset import Demonstrations
 from servoid.policy.latent.network import Gaussian, LatentNetwork
-from servoid.policy.latent.proprioception import proprioception, proprioception_layout
 from servoid.policy.recording import DatasetError, Recording, read_recording
 
 ROBOT = load_robot()

@@ -42,6 +42,7 @@ def never(*_: Any, **__: Any) -> Any:
     raise AssertionError("the robot is measured")
 
 
+@pytest.mark.slow
 def test_it_finds_the_assembly_of_a_rig_on_a_serial_port_and_check_then_uses_it(
     bringup: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -146,7 +147,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anybody_measures(
     monkeypatch.setenv("XDG_CONFIG_HOME", str(configuration / "file"))
     code, answer, _ = bringup("calibrate", "--port", "/dev/ttyUSB0")
     assert code == 2
-    assert "set XDG_CONFIG_HOME to a folder of yours" in answer["error"]
+    assert "set XDG_CONFIG_HOME to your own folder" in answer["error"]
 
 
 # What a person does --------------------------------------------------------------------------------------------------
@@ -256,7 +257,7 @@ def test_the_reference_pose_must_be_within_every_range() -> None:
     from servoid.tools.bringup.calibrate import _reference
 
     bent = replace(ROBOT, joints=(replace(ROBOT.joints[0], range=(0.2, 1.0)), *ROBOT.joints[1:]))
-    with pytest.raises(ConfigError, match="head_pan cannot be at 0: give --pose home"):
+    with pytest.raises(ConfigError, match="head_pan cannot be at 0: use --pose home"):
         _reference("zero", bent)
 
 

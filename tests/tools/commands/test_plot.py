@@ -31,6 +31,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.12])
 def test_logs_cut_anywhere_are_drawn(log: Path, share: float, tmp_path: Path) -> None:
     """Alone, over each other, and joint by joint."""
@@ -43,6 +44,7 @@ def test_logs_cut_anywhere_are_drawn(log: Path, share: float, tmp_path: Path) ->
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("one.png", "two.png", "joints.png"))
 
 
+@pytest.mark.slow
 def test_two_logs_have_a_file_of_their_own(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Beside the first, whose own plot is left alone."""
     assert main(["plot", str(log), str(log)]) == 0
@@ -58,7 +60,13 @@ def test_two_logs_have_a_file_of_their_own(log: Path, capsys: pytest.CaptureFixt
     ],
 )
 def test_what_cannot_be_drawn_is_refused(
-    log: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    log: Path,
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     assert main(["plot", str(log), *words]) == 2
     assert message in capsys.readouterr().err

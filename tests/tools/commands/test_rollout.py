@@ -68,6 +68,12 @@ def test_one_and_two_workers_give_the_same_and_all_that_was_promised(capfd: pyte
     assert {"velocity_error_mps", "top_speed_mps", "odometry_error_m"} <= set(one["metrics"])
 
 
+def test_what_the_robot_cannot_do_is_said_before_it_tries(capfd: pytest.CaptureFixture[str]) -> None:
+    words = ["--seconds", "0.2", "--episodes", "1", "--workers", "1", "--set", "vx=9"]
+    assert rollout.main(options(*words)) == 0
+    assert capfd.readouterr().out.startswith("vx=9 is more than op3 can: 0.5 m/s at most that way")
+
+
 @pytest.mark.slow
 def test_an_episode_can_be_run_again_by_its_seed() -> None:
     seed = episode_seed(3, 1)

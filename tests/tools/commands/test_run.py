@@ -233,6 +233,7 @@ def test_a_disk_that_fills_up_ends_the_run_safe(tmp_path):
     assert len(log.ticks("/observation")) > 10
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("drawn")
 @pytest.mark.parametrize(
     "error",
@@ -305,6 +306,7 @@ def test_a_goal_run_is_filmed_and_plotted(tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_bench_loop_measures_real_time(capsys):
     assert main(["bench", "loop", "--seconds", "1", "--json"]) == 0
     values = json.loads(capsys.readouterr().out)

@@ -57,6 +57,7 @@ def test_the_verb_serves_a_port_until_ctrl_c(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir()), "link and socket are taken away"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "silent_board", "says"),
     [
@@ -90,6 +91,7 @@ def test_what_a_client_must_do_is_said_and_is_all_that_it_must_do(
     assert "--move JOINT=RAD" in err
 
 
+@pytest.mark.slow
 def test_joints_of_a_limp_virtual_robot_are_moved_by_a_command(capsys: pytest.CaptureFixture[str]) -> None:
     """Another program records a range meanwhile: it sees the joint on its way, through the servo's own register."""
     process = start("virtual", "--link", "rig", "--powered", "--json")
@@ -137,9 +139,10 @@ def test_a_run_says_that_it_was_the_rig_that_was_late(tmp_path: Path, capsys: py
 
 def test_a_locked_rig_that_nobody_could_advance_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["virtual", "--clock", "locked"]) == 2
-    assert "give --link or --control" in capsys.readouterr().err
+    assert "use --link or --control" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_is_recorded_and_replays_bit_for_bit(capfd: pytest.CaptureFixture[str]) -> None:
     options = ["--seconds", "2", "--set", "push=0.05", "--randomise", "--seed", "3", "--set", "vx=0.1"]
     assert main([*RUN, *options, "--record", "a.mcap", "--json"]) == 0
@@ -151,6 +154,7 @@ def test_a_run_is_recorded_and_replays_bit_for_bit(capfd: pytest.CaptureFixture[
     assert main(["replay", "a.mcap"]) == 0, capfd.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_robot_of_ones_own_file_is_emulated(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """The servo's ID is another than the shipped robot's: the rig must be that of the file."""
     from servoid.hw.robot.description import load_robot, save_robot
@@ -162,6 +166,7 @@ def test_a_robot_of_ones_own_file_is_emulated(capfd: pytest.CaptureFixture[str],
     assert main([*RUN, "--robot", "mine.yaml", "--seconds", "0.5"]) == 0, capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_rollouts_are_the_same_on_one_and_two_workers(capfd: pytest.CaptureFixture[str]) -> None:
     words = ["rollout", "walk", "--policy", "expert", "--backend", "virtual", "--seconds", "2", "--episodes", "2"]
     figures = []

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.policy.references.gait import load_gait
 from servoid.stack.log.flightlog import FlightLog
@@ -16,9 +18,29 @@ from servoid.tools.common.summary import ABOUT, COURSE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 ROBOT, PLAN, GOAL, OBSTACLE, PUSH = "#3459b8", "#f28e1c", "#26a65b", "#8c6b51", "#c8202a"
 _PHASES = ("read", "estimate", "act", "guard", "write", "record")  # of a tick
+
+
+def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, Any]:
+    """A figure of that size [inches], and its axes row by row. Raises ModuleNotFoundError without matplotlib."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False).ravel()
+
+
+def save_figure(figure: Figure, out: Path, dpi: int = 110) -> None:
+    """Write a PNG. Raises ConfigError where it cannot be written."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(out, dpi=dpi, format="png")
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be written ({error.strerror}): choose another place with --out") from None
 
 
 @dataclass(frozen=True)
