@@ -51,6 +51,17 @@ def positive(text: str) -> float:
     return value
 
 
+def counted(text: str) -> int:
+    """An argument that is a number of things: 1 or more."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 1 on")
+    return value
+
+
 def check_seed(seed: int) -> None:
     """Raise ConfigError for a `--seed` that no generator takes."""
     if seed < 0:

@@ -87,6 +87,8 @@ def raises(error: BaseException) -> Callable[[Any], int]:
         (BackendError("/dev/ttyUSB0: no such port"), 3, "servoid: /dev/ttyUSB0: no such port"),
         (KeyboardInterrupt(), 130, "servoid: interrupted"),
         (ZeroDivisionError("a\nb"), 70, "servoid: internal error: ZeroDivisionError: a b (SERVOID_DEBUG=1"),
+        (OSError(36, "File name too long", "x" * 5000), 2, "servoid: xxx"),
+        (PermissionError(13, "Permission denied", "/root/a"), 2, "servoid: /root/a: Permission denied: choose another"),
         (BrokenPipeError("planner"), 70, "servoid: internal error: BrokenPipeError: planner"),
         (ModuleNotFoundError("No module named 'av'", name="av"), 2, "servoid: this needs the 'video' extra"),
         (ModuleNotFoundError("No module named 'hw.x'", name="hw.x"), 70, "servoid: internal error"),
