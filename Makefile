@@ -1,11 +1,12 @@
 # make demo: install, then walk to a goal.   make test: install what tests need, then run all of them.
-# make quick: the tests that take less than some seconds each.
+# make quick: the tests that take less than about a second each.
 # make clean: remove the environment and caches; what was recorded and trained under runs/ stays.   PYTHON=... chooses the interpreter (3.11 or newer).
 
 PYTHON ?= $(shell for p in python3.11 python3; do $$p -c '' 2>/dev/null && echo $$p && break; done)
 VENV ?= .venv
 BIN := $(VENV)/bin
-PARALLEL := --numprocesses 2 --dist loadgroup
+# Two processes of one thread each, whatever the machine has: threads that wait for each other are slower.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist worksteal
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 .PHONY: demo test quick clean
@@ -17,10 +18,10 @@ demo: $(VENV)/.installed-demo
 test: $(VENV)/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/pytest $(PARALLEL)
+	$(PYTEST)
 
 quick: $(VENV)/.installed-test
-	$(BIN)/pytest $(PARALLEL) -m "not slow"
+	$(PYTEST) -m "not slow"
 
 # A stamp is newer than pyproject.toml once its packages are installed, so that nothing is installed twice.
 $(VENV)/.installed-demo: pyproject.toml | $(BIN)/python

@@ -6,19 +6,21 @@ The range that is shown is the range that is checked. `overrides` changes settin
 from __future__ import annotations
 
 import typing
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, Literal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Literal, TypeVar
 
 Range = tuple[float, float]  # low, high
 Way = Literal["forward", "backward", "left", "turning"]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Setting:
     """What a field of a frozen dataclass is for. `above` is an open end of its range, `least` and `most` are closed.
 
-    `asks` says which way the robot is asked to go so fast: the robot's file says how fast it can at most.
+    `asks` says which way the robot is asked to go so fast: the robot's file says how fast it can at most. `of` says
+    what else of the robot it follows: a length its height, a time the cycle of its gait.
     """
 
     text: str
@@ -27,6 +29,12 @@ class Setting:
     least: float | None = None
     most: float | None = None
     asks: Way | None = None
+    of: Literal["height", "cycle"] | None = None
+
+    @property
+    def robots(self) -> bool:
+        """Whether it is another number for another robot."""
+        return self.asks is not None or self.of is not None
 
     @property
     def range(self) -> str:
@@ -78,6 +86,21 @@ def asks(settings: Any, prefix: str = "") -> Iterator[tuple[str, str, Way, tuple
     for f in fields(settings):
         if is_dataclass(part := getattr(settings, f.name)):
             yield from asks(part, f"{prefix}{f.name}.")
+
+
+def rescaled(settings: T, factor: Callable[[Setting, float], float]) -> T:
+    """The settings with each number that is the robot's times its factor, those of the dataclasses in it too."""
+
+    def times(value: Any, setting: Setting) -> Any:
+        if isinstance(value, tuple):
+            return tuple(times(item, setting) for item in value)
+        return None if value is None else value * factor(setting, value)
+
+    described = _described(type(settings))
+    values = {name: times(getattr(settings, name), setting) for name, setting, _ in described if setting.robots}
+    parts = {f.name: getattr(settings, f.name) for f in fields(settings)}  # type: ignore[arg-type]
+    values |= {name: rescaled(part, factor) for name, part in parts.items() if is_dataclass(part)}
+    return replace(settings, **values)  # type: ignore[type-var]
 
 
 def explain(settings: Any, prefix: str = "") -> Iterator[Explained]:

@@ -6,7 +6,7 @@ number of worlds or on the number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -36,6 +36,7 @@ class Worlds:
 
     `threads` 0 takes all cores; `randomise` is the share of episodes on a randomised robot. `together` puts all bodies
     into one world, whose `model` must hold them; its floor has the friction that was drawn with the last of them.
+    `drawn` draws a robot, as `randomise.draw` does.
     """
 
     def __init__(
@@ -47,8 +48,9 @@ class Worlds:
         randomise: float = 0.0,
         model: mujoco.MjModel | None = None,
         together: bool = False,
+        drawn: Callable[..., Body] = draw,
     ) -> None:
-        self.robot, self.n, self.randomise = robot, n, randomise
+        self.robot, self.n, self.randomise, self._drawn = robot, n, randomise, drawn
         self.model = build(robot) if model is None else model
         self.substeps = round(robot.dt / TIMESTEP)
         if abs(self.substeps * TIMESTEP - robot.dt) > 1e-9:
@@ -116,7 +118,7 @@ class Worlds:
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for i, rng in zip(ids, rngs, strict=True):
             self._rngs[i] = rng
-            self._place(i, draw(rng, self.robot, self._bodies, rng.random() < self.randomise))
+            self._place(i, self._drawn(rng, self.robot, self._bodies, rng.random() < self.randomise))
         self._state_qpos[ids] = 0.0
         self._state_qpos[ids[:, None], self._qpos] = pose - self._zero[ids]
         self._put(ids, pose - self._zero[ids], start)

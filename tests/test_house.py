@@ -7,11 +7,13 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+parse = cache(ast.parse)  # several checks read each file
 
 # Each package and those that it may import. policy and sim stand side by side.
 BELOW: dict[str, set[str]] = {
@@ -64,7 +66,7 @@ def upward(package: str, code: str) -> list[str]:
     allowed = BELOW[package] | {package}
     return [
         f"line {line} imports {module}"
-        for line, module in imports(ast.parse(code))
+        for line, module in imports(parse(code))
         if (found := folder(module)) is not None and found not in allowed
     ]
 
@@ -106,7 +108,7 @@ def test_heavy_libraries_are_imported_where_they_are_used(library: str) -> None:
     for path in (path for package in BELOW for path in sources(package)):
         if name(path).startswith(HEAVY[library]):
             continue
-        top = ast.Module(ast.parse(path.read_text()).body, [])
+        top = ast.Module(parse(path.read_text()).body, [])
         direct = [n for n in top.body if isinstance(n, ast.Import | ast.ImportFrom)]
         modules = {module.split(".")[0] for _, module in imports(ast.Module(list(direct), []))}
         assert library not in modules, f"{name(path)} imports {library} when it is imported"
@@ -136,7 +138,7 @@ def name(path: Path) -> str:
 
 def asked(code: str) -> Iterator[tuple[int, str]]:
     """Line and member of every question whether an object has a member that is named there."""
-    for node in ast.walk(ast.parse(code)):
+    for node in ast.walk(parse(code)):
         if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) > 1):
             continue
         member = node.args[1]
@@ -175,8 +177,10 @@ def timed(code: str) -> list[int]:
         of_one = isinstance(node, ast.Name) and node.id in names
         return of_one or any(reads(child, names) for child in ast.iter_child_nodes(node))
 
-    found = set()
-    for scope in (node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.FunctionDef)):
+    found: set[int] = set()
+    if not any(f"{clock}(" in code for clock in CLOCKS):
+        return []
+    for scope in (node for node in ast.walk(parse(code)) if isinstance(node, ast.FunctionDef)):
         names: set[str] = set()
         for node in ast.walk(scope):
             if isinstance(node, ast.Assign) and reads(node.value, names):
@@ -209,7 +213,7 @@ def rooms(package: str) -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
     for path in sources(package):
         here = found.setdefault(name(path.parent), set())
-        for _, module in imports(ast.parse(path.read_text())):
+        for _, module in imports(parse(path.read_text())):
             if module.startswith(f"servoid.{package}."):
                 here.add(room(module))
     return {at: others - {at} for at, others in found.items()}
@@ -246,7 +250,7 @@ def test_a_circle_is_seen() -> None:
 
 
 def classes(code: str) -> Iterator[str]:
-    return (node.name for node in ast.walk(ast.parse(code)) if isinstance(node, ast.ClassDef))
+    return (node.name for node in ast.walk(parse(code)) if isinstance(node, ast.ClassDef))
 
 
 def test_a_class_name_stands_for_one_thing() -> None:
@@ -260,7 +264,7 @@ def test_a_class_name_stands_for_one_thing() -> None:
 
 def crowds(code: str) -> Iterator[tuple[str, int]]:
     """Name and number of the arguments of every function that takes more than `MOST_ARGUMENTS`."""
-    for node in ast.walk(ast.parse(code)):
+    for node in ast.walk(parse(code)):
         if isinstance(node, ast.FunctionDef):
             taken = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
             count = len(taken) - (taken[:1] in (["self"], ["cls"]))

@@ -125,6 +125,7 @@ def test_every_make_target_exists(page: str) -> None:
     assert shown <= set(targets)
 
 
+@pytest.mark.slow
 def test_the_python_of_the_readme_is_the_run_of_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

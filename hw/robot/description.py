@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -151,6 +151,12 @@ class Walking:
         """Top speed in any direction, and of turning `(3,)`: by shares of it robots of any size are asked alike."""
         return np.array([self.forward, self.forward, self.turning])
 
+    @property
+    def relative(self) -> Array:
+        """Top speeds as multiples of the shipped robot's, forward, to the sides and turning `(3,)`."""
+        result: Array = self.upper / shipped_robot().walking.upper
+        return result
+
     def derived(self, standing_height: float) -> Walking:
         """With what is NaN derived from the standing height [m], as alike robots of any size walk alike.
 
@@ -196,6 +202,7 @@ class Robot:
     joints: tuple[Joint, ...]
     walking: Walking = Walking()
     weight: float | None = None  # N; None: the file does not say it
+    gait: str = "gait"  # settings of its gait: a name in configs/policies/, or a .yaml file beside the robot's
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -254,9 +261,16 @@ def load_robot(name: str | Path = "op3") -> Robot:
         for joint in robot.joints
     )
     walking = robot.walking.derived(robot.standing_height)
-    robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints, walking=walking)
+    gait = str(folder / robot.gait) if robot.gait.endswith((".yaml", ".yml")) else robot.gait
+    robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints, walking=walking, gait=gait)
     check_plausible(robot, marks)  # loads the servos' files: one that cannot be used is found now
     return robot
+
+
+@cache
+def shipped_robot() -> Robot:
+    """The robot that numbers of a task or a policy hold for, where they hold for one."""
+    return load_robot()
 
 
 def save_robot(robot: Robot, path: Path) -> None:
@@ -264,4 +278,4 @@ def save_robot(robot: Robot, path: Path) -> None:
     path.write_text(yaml.safe_dump(asdict(robot), sort_keys=False))
 
 
-__all__ = ["ConfigError", "Joint", "Robot", "Servo", "load_robot", "load_servo", "save_robot"]
+__all__ = ["ConfigError", "Joint", "Robot", "Servo", "load_robot", "load_servo", "save_robot", "shipped_robot"]

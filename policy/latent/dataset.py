@@ -10,7 +10,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.features import Normaliser, raw_mirror
-from servoid.policy.latent.proprioception import proprioception
+from servoid.policy.latent.actions import proprioception
 from servoid.policy.recording import DatasetError, Recording
 
 

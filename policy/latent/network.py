@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from servoid.hw.contracts.body import Array
 from servoid.policy.features import Normaliser
-from servoid.policy.latent.actions import LatentActions, LatentConfig
-from servoid.policy.latent.proprioception import proprioception
+from servoid.policy.latent.actions import LatentActions, LatentConfig, proprioception
 from servoid.policy.mlp import Mlp
 
 _LOG_VARIANCE = 10.0  # at most this far from 0: exp() of more than that is nothing to learn from

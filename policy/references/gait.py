@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from servoid.hw.config import CONFIGS, load_yaml
+from servoid.hw.config import load_yaml, resolve
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Reference, ReferenceFrames
 from servoid.hw.geometry import headed, joined, turned
@@ -49,8 +49,8 @@ class GaitSettings:
 
 @cache
 def load_gait(name: str = "gait") -> GaitSettings:
-    """Load `configs/policies/<name>.yaml`. Raises ConfigError."""
-    return load_yaml(CONFIGS / "policies" / f"{name}.yaml", GaitSettings)
+    """By a name in configs/policies/, or by file: `Robot.gait` says which. Raises ConfigError."""
+    return load_yaml(resolve("policies", name), GaitSettings)
 
 
 class Gait(Reference):
@@ -60,11 +60,11 @@ class Gait(Reference):
     """
 
     def __init__(self, robot: Robot, shape: tuple[int, ...] = (), settings: GaitSettings | None = None) -> None:
-        """`shape` are the leading dimensions; `settings` are by default those of configs/policies/gait.yaml.
+        """`shape` are the leading dimensions; `settings` are by default those of the robot's file.
 
         Raises ConfigError for legs of another build than `LegInverse` can bend.
         """
-        self.robot, self.settings = robot, settings or load_gait()
+        self.robot, self.settings = robot, settings or load_gait(robot.gait)
         settings = self.settings
         legs = Legs(robot)
         self._inverse, self._index = LegInverse(legs, robot.name), legs.index
@@ -198,7 +198,7 @@ class GyroFeedback:
     """Adds to the ankles what the gyro says: the baseline's only balance."""
 
     def __init__(self, robot: Robot, settings: GaitSettings | None = None) -> None:
-        settings = settings or load_gait()
+        settings = settings or load_gait(robot.gait)
         inverse = LegInverse(Legs(robot), robot.name)
         index = Legs(robot).index
         self._pitch, self._pitch_sign = index[:, 4], inverse.sign[:, 4]

@@ -170,7 +170,7 @@ def diffusion_policy(
         planner = ProcessPlanner(partial(_build, robot, settings, cost))
     else:
         planner = InlinePlanner(_build(robot, settings, cost))
-    trim = Trim(robot.dt, settings.trim, shape) if settings.trim else None
+    trim = Trim(robot, settings.trim, shape) if settings.trim else None
     pace = Pace(config.history, settings.execution_horizon, settings.delay, wait=not process)
 
     def stand(pose: Array) -> MinJerk:

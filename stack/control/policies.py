@@ -118,9 +118,11 @@ def make_policy(
     return _maker(name)(name, robot, task, realtime, shape)
 
 
-def policy_fingerprint(name: str) -> dict[str, Any]:
+def policy_fingerprint(name: str, gait: str = "gait") -> dict[str, Any]:
     """Name of a policy and what it is made of, for the flight log: its checkpoint and that of odometry by their hashes,
-    settings of the planner or of the gait, and the file of a user's own. None for what it has not. Raises ConfigError.
+    settings of the planner or of the robot's `gait`, and the file of a user's own. None for what it has not.
+
+    Raises ConfigError.
     """
     from servoid.policy.checkpoint import resolve
     from servoid.policy.references.gait import load_gait
@@ -136,7 +138,7 @@ def policy_fingerprint(name: str) -> dict[str, Any]:
         "checkpoint_sha256": None if checkpoint is None else sha256(checkpoint),
         "odometry_sha256": sha256(resolve("odometry")),
         "planner": None if planner is None else described(planner),
-        "gait": described(load_gait()) if maker in (_gait, _expert) else None,
+        "gait": described(load_gait(gait)) if maker in (_gait, _expert) else None,
         "source": None if own is None else own.source(),
     }
 

@@ -19,6 +19,7 @@ from servoid.stack.safety.event import Event
 WORLD, BASE = "odometry", "base"  # frames
 _LEVELS = {"fall": 4, "servo": 4, "stale": 4, "overload": 4, "temperature": 3, "voltage": 3, "derated": 3, "plan": 3}
 _INFO = 2  # level of other events
+_DIGITS = 5  # after the point: exact values are in the log's own channels, and these are twice as short
 _SECOND = 1_000_000_000
 
 _TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
@@ -119,7 +120,7 @@ def _stamp(wall_ns: int) -> dict[str, int]:
 
 
 def _joints(names: Sequence[str], fields: dict[str, Array]) -> list[dict[str, Any]]:
-    columns = {field: values.tolist() for field, values in fields.items()}
+    columns = {field: np.round(values, _DIGITS).tolist() for field, values in fields.items()}
     return [
         {"name": name} | {field: values[i] for field, values in columns.items() if np.isfinite(values[i])}
         for i, name in enumerate(names)
@@ -131,7 +132,7 @@ def _by_name(names: Sequence[str], values: Array) -> dict[str, float]:
 
 
 def _named(keys: Sequence[str], values: Array) -> dict[str, float]:
-    return dict(zip(keys, np.asarray(values, dtype=float).tolist(), strict=True))
+    return dict(zip(keys, np.round(np.asarray(values, dtype=float), _DIGITS).tolist(), strict=True))
 
 
 def _mean(values: Array) -> float:

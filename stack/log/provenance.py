@@ -40,6 +40,7 @@ def header(
         "task_files": files(assignment.task.settings),
         "task_source": source,
         "scene": described(assignment.episode.scene) or None,
+        "episode": {name: value for name, value in described(assignment.episode).items() if name != "scene"},
         **fingerprint(robot),
         "backend": body,
         "policy": policy,

@@ -17,12 +17,16 @@ _WAYS = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 25)  # rad to the left of the goa
 
 @dataclass(frozen=True)
 class AvoidanceSettings:
-    apart: Annotated[float, Setting("distance between the middles of two robots that pass", "m", above=0)] = 0.42
-    fade: Annotated[float, Setting("nearer than that which is as bad as a detour of 90 degrees", "m", above=0)] = 0.04
+    apart: Annotated[
+        float, Setting("distance between the middles of two robots that pass", "m", above=0, of="height")
+    ] = 0.42
+    fade: Annotated[
+        float, Setting("nearer than that which is as bad as a detour of 90 degrees", "m", above=0, of="height")
+    ] = 0.04
     horizon: Annotated[float, Setting("how far ahead the robot looks", "s", above=0)] = 4.0
     # Two cycles of the gait, which sways.
-    window: Annotated[float, Setting("time over which the others' velocity is measured", "s", above=0)] = field(
-        default_factory=lambda: 2 * load_gait().cycle
+    window: Annotated[float, Setting("time over which the others' velocity is measured", "s", above=0, of="cycle")] = (
+        field(default_factory=lambda: 2 * load_gait().cycle)
     )
     # Two who meet head-on must not choose alike.
     right: Annotated[float, Setting("how much worse it is to pass on the left", least=0)] = 0.1

@@ -15,7 +15,9 @@ from servoid.hw.setting import Setting, check
 @dataclass(frozen=True)
 class SpeedProfile:
     speed: Annotated[float, Setting("forward speed far from the goal", "m/s", above=0, asks="forward")] = 0.25
-    creep: Annotated[float, Setting("slowest walk before the stop: slower steps hardly move it", "m/s", above=0)] = 0.12
+    creep: Annotated[
+        float, Setting("slowest walk before the stop: slower steps hardly move it", "m/s", above=0, asks="forward")
+    ] = 0.12
     reverse: Annotated[float, Setting("fastest step backward, near the goal", "m/s", least=0, asks="backward")] = 0.08
     lateral: Annotated[float, Setting("fastest step to either side, near the goal", "m/s", least=0, asks="left")] = 0.08
     yaw_rate: Annotated[float, Setting("fastest turn", "rad/s", above=0, asks="turning")] = 0.8

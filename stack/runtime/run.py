@@ -238,7 +238,9 @@ class Run:
     def _record(self) -> Recorder:
         settings, own = self.settings, self._policy
         assert settings.record is not None
-        policy = policy_fingerprint(settings.policy) if own is None else {"name": type(own).__qualname__}
+        policy = (
+            policy_fingerprint(settings.policy, self.robot.gait) if own is None else {"name": type(own).__qualname__}
+        )
         facts = header(settings, self.robot, self.assignment, source(settings.task), self.body.name, policy)
         wait = self.body.simulation is not None and not self.realtime
         self._recorder = Recorder.create(settings.record, facts, wait=wait)

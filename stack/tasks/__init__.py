@@ -13,7 +13,7 @@ from servoid.hw.contracts.task import Task
 from servoid.hw.overrides import override
 from servoid.hw.plugins import Plugin, installed, load_plugin
 from servoid.hw.robot.description import Robot
-from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings, beyond
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings, beyond, fitted
 from servoid.stack.tasks.cross import Cross
 from servoid.stack.tasks.forest import Forest
 from servoid.stack.tasks.goal import Goal
@@ -80,15 +80,16 @@ def source(name: str) -> dict[str, Any] | None:
     return None if known.plugin is None else known.plugin.source()
 
 
-def load_settings(name: str, settings: dict[str, str] | None = None) -> Any:
+def load_settings(name: str, settings: dict[str, str] | None = None, robot: Robot | None = None) -> Any:
     """A task's settings, from its file or its class, with those changed that `--set key=value` gives as text.
 
-    Raises ConfigError.
+    Speeds and lengths of Servoid's own tasks are fitted to `robot`; what is typed stays. Raises ConfigError.
     """
     known = find(name)
     base: Settings
     if known.plugin is None:
         base = load_yaml(resolve("tasks", name), known.cls.settings_type)
+        base = base if robot is None else fitted(base, robot)
     else:
         try:
             base = known.cls.settings_type()
@@ -104,7 +105,7 @@ def load_task(name: str, settings: dict[str, str] | None = None, dt: float = 0.0
     Raises ConfigError for an unknown task or setting, a value that does not parse, or what `robot` cannot do.
     """
     known = find(name)
-    task = known.cls(load_settings(name, settings), dt, robot)
+    task = known.cls(load_settings(name, settings, robot), dt, robot)
     task.name = known.name
     return task
 

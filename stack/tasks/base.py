@@ -5,17 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Behaviour, Criterion, Episode, Objective, Trace
 from servoid.hw.contracts.world import Percept
-from servoid.hw.robot.description import Robot, load_robot
-from servoid.hw.setting import Setting, asks, check
+from servoid.hw.robot.description import Robot, shipped_robot
+from servoid.hw.setting import Setting, asks, check, rescaled
+from servoid.policy.references.gait import load_gait
 from servoid.stack.tasks.terms.guidance import Weights, total_cost
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,32 @@ def beyond(settings: Any, robot: Robot) -> list[str]:
     return told
 
 
+def fitted(settings: T, robot: Robot) -> T:
+    """Settings that hold for the shipped robot as they hold for `robot`: speeds are the same shares of its top speeds,
+    lengths of its height, and times of its gait's cycle. Raises ConfigError."""
+    ours, theirs = (
+        {
+            "forward": (r.walking.forward, r.walking.backward),
+            "backward": (r.walking.backward, r.walking.forward),
+            "left": (r.walking.sideways, r.walking.sideways),
+            "turning": (r.walking.turning, r.walking.turning),
+            "height": (r.walking.height,),
+            "cycle": (load_gait(r.gait).cycle,),
+        }
+        for r in (robot, shipped_robot())
+    )
+
+    def factor(setting: Setting, value: float) -> float:
+        what = setting.of or setting.asks or "height"
+        opposite = setting.asks is not None and value < 0.0
+        return ours[what][opposite] / theirs[what][opposite]
+
+    try:
+        return rescaled(settings, factor)
+    except ValueError as error:
+        raise ConfigError(f"the task's settings do not fit {robot.name}: {error}") from error
+
+
 class BaseTask:
     """A task but for what is asked and how a run is judged."""
 
@@ -70,7 +100,12 @@ class BaseTask:
     @property
     def top(self) -> Array:
         """Top speeds `(3,)` of the robot, of the shipped one where none was given."""
-        return (self.robot or load_robot()).walking.scale
+        return (self.robot or shipped_robot()).walking.scale
+
+    @property
+    def cycle(self) -> float:
+        """Length of a cycle of the robot's gait [s]: within one, every walk sways."""
+        return load_gait((self.robot or shipped_robot()).gait).cycle
 
     def ticks(self, seconds: float) -> int:
         """The nearest number of ticks, at least one."""

@@ -13,7 +13,6 @@ from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading, turned
 from servoid.hw.setting import Setting
-from servoid.policy.references.gait import load_gait
 from servoid.stack.navigation.collision_avoidance import AvoidanceSettings, MeanVelocity, bearing_past
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
@@ -27,7 +26,7 @@ class CrossSettings(Settings):
     robots: Annotated[int, Setting("number of robots", least=2, most=4)] = 3
     circle: Annotated[float, Setting("radius of the circle on which they start", "m", above=0)] = 1.1
     spread: Annotated[float, Setting("how far a start may be from its even place on the circle", "rad", least=0)] = 0.2
-    body: Annotated[float, Setting("distance from the middle of a robot to its side", "m", above=0)] = 0.15
+    body: Annotated[float, Setting("distance from the middle of a robot to its side", "m", above=0, of="height")] = 0.15
     radius: Annotated[float, Setting("distance from the goal that counts as reached", "m", above=0)] = 0.14
     approach: SpeedProfile = field(default_factory=SpeedProfile)
     passing: AvoidanceSettings = field(default_factory=AvoidanceSettings)
@@ -82,7 +81,7 @@ class Cross(BaseTask):
             "arrived": float(there),
             "apart_m": _apart(trace),
             "touched": float(self._touched(trace)),
-            "path_m": measures.path_length(trace, load_gait().cycle),
+            "path_m": measures.path_length(trace, self.cycle),
             "seconds_to_cross": len(trace.yaw) * trace.dt if there == self.settings.robots else float("nan"),
         }
 

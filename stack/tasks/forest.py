@@ -15,7 +15,6 @@ from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Setting
-from servoid.policy.references.gait import load_gait
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.navigation.potential_field import FieldSettings, PotentialField
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
@@ -115,7 +114,7 @@ class Forest(BaseTask):
             "final_distance_m": _final_distance(trace, episode),
             "clearance_m": measures.clearance(trace),
             "touched": float(measures.touched(trace)),
-            "path_m": measures.path_length(trace, load_gait().cycle),
+            "path_m": measures.path_length(trace, self.cycle),
             "seconds_to_goal": len(trace.yaw) * trace.dt if self.success(trace, episode) else float("nan"),
         }
 

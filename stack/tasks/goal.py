@@ -17,7 +17,6 @@ from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Range, Setting
-from servoid.policy.references.gait import load_gait
 from servoid.policy.text.captions import MOTIONS
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
@@ -85,7 +84,7 @@ class Goal(BaseTask):
         arrival = int(outside[-1]) + 1 if len(outside) else 0  # the tick from which it stayed within the radius
         return {
             "final_distance_m": float(distances[-1]),
-            "path_m": measures.path_length(trace, load_gait().cycle),
+            "path_m": measures.path_length(trace, self.cycle),
             "seconds_to_goal": arrival * trace.dt if arrival < len(trace.displacement) else float("nan"),
         }
 

@@ -15,14 +15,14 @@ from servoid.hw.contracts.control import Instruction, Keyframes, State
 from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.geometry import to_heading, turned
-from servoid.hw.robot.description import Robot
+from servoid.hw.robot.description import Robot, shipped_robot
 from servoid.hw.setting import Setting
 from servoid.policy.features import Layout, raw_layout
 from servoid.stack.log.flightlog import FlightLog, read_log
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 
 _SOON = 0.2  # s: nearer keyframes are not hurried to
-_FASTEST = np.array([0.25, 0.1, 0.8])  # m/s forward and to the left, rad/s, of the asked velocity
+_FASTEST = np.array([0.25, 0.1, 0.8])  # m/s forward and to the left, rad/s, that is asked of the shipped robot
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Inbetween(BaseTask):
         return KeyframeEpisode(frames=joined, ticks=self._interval * np.arange(1, len(joined) + 1))
 
     def behaviour(self, episode: KeyframeEpisode) -> BaseBehaviour:
-        return _Pass(episode, self.dt)
+        return _Pass(episode, self.dt, _FASTEST * (self.robot or shipped_robot()).walking.relative)
 
     def criteria(self, trace: Trace, episode: KeyframeEpisode) -> list[Criterion]:
         """Not fallen until the last keyframe. How near it came is among the metrics, as in the paper."""
@@ -111,9 +111,9 @@ class Inbetween(BaseTask):
 
 
 class _Pass(BaseBehaviour):
-    def __init__(self, episode: KeyframeEpisode, dt: float) -> None:
+    def __init__(self, episode: KeyframeEpisode, dt: float, fastest: Array) -> None:
         super().__init__(episode)
-        self._dt, self._tick = dt, 0
+        self._dt, self._fastest, self._tick = dt, fastest, 0
 
     def percept(self, state: State) -> Percept:
         return Percept(source="task", age=0.0, goal=self.episode.places[-1, :2].copy())
@@ -129,7 +129,7 @@ class _Pass(BaseBehaviour):
         turn = float(frames[0, layout.slice("yaw")][0]) - float(state.yaw)
         turn = (turn + math.pi) % (2.0 * math.pi) - math.pi
         way = to_heading(frames[0, layout.slice("displacement")][:2], state)
-        velocity = np.clip(np.array([*way, turn]) / seconds, -_FASTEST, _FASTEST)
+        velocity = np.clip(np.array([*way, turn]) / seconds, -self._fastest, self._fastest)
         return Instruction(velocity=velocity, keyframes=Keyframes(ahead, frames.astype(np.float32)))
 
     def done(self, state: State) -> bool:

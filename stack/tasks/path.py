@@ -14,7 +14,6 @@ from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.setting import Setting
-from servoid.policy.references.gait import load_gait
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 from servoid.stack.tasks.terms import metrics as measures
 
@@ -86,7 +85,7 @@ class Path(BaseTask):
             "final_distance_m": end,
             "left_m": left,
             "length_m": _SPACING * (len(episode.path) - 1),
-            "path_m": measures.path_length(trace, load_gait().cycle),
+            "path_m": measures.path_length(trace, self.cycle),
         }
 
     def _errors(self, trace: Trace, points: Array) -> tuple[float, float, float]:

@@ -12,7 +12,6 @@ from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.setting import Setting
-from servoid.policy.references.gait import load_gait
 from servoid.stack.control.operator import Controls, Steering, open_steering
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 from servoid.stack.tasks.terms import metrics as measures
@@ -56,7 +55,7 @@ class Steer(BaseTask):
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
         return {
             "top_speed_mps": measures.top_speed(trace),
-            "distance_m": measures.path_length(trace, load_gait().cycle),
+            "distance_m": measures.path_length(trace, self.cycle),
         }
 
 

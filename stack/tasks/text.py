@@ -29,9 +29,9 @@ class TextSettings(Settings):
         "held_out"
     )
     sentence: Annotated[str | None, Setting("what to do all the time, instead of sentences drawn")] = None
-    cycle: Annotated[float, Setting("length of a gait cycle: motion is measured over whole ones", "s", above=0)] = (
-        field(default_factory=lambda: load_gait().cycle)
-    )
+    cycle: Annotated[
+        float, Setting("length of a gait cycle: motion is measured over whole ones", "s", above=0, of="cycle")
+    ] = field(default_factory=lambda: load_gait().cycle)
 
     def __post_init__(self) -> None:
         super().__post_init__()

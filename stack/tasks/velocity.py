@@ -27,9 +27,9 @@ class VelocitySettings(Settings):
     turn: Annotated[Range, Setting("how far the direction changes each time", "rad")] = (-1.0, 1.0)
     every: Annotated[float, Setting("time between changes", "s", above=0)] = 8.7
     settle: Annotated[float, Setting("time after each change that does not count", "s", least=0)] = 2.1
-    cycle: Annotated[float, Setting("length of a gait cycle: velocity is averaged over it", "s", above=0)] = field(
-        default_factory=lambda: load_gait().cycle
-    )
+    cycle: Annotated[
+        float, Setting("length of a gait cycle: velocity is averaged over it", "s", above=0, of="cycle")
+    ] = field(default_factory=lambda: load_gait().cycle)
     tolerance: Annotated[float, Setting("largest mean velocity error of a success", "m/s", above=0)] = 0.04
     turn_gain: Annotated[float, Setting("turning rate for each rad of wrong heading", "1/s", above=0)] = 1.5
     yaw_rate: Annotated[float, Setting("fastest turn", "rad/s", above=0, asks="turning")] = 0.8

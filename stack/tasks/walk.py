@@ -33,9 +33,9 @@ class WalkSettings(Settings):
     every: Annotated[float, Setting("time between changes of the command", "s", above=0)] = 5.0
     push: Annotated[Range, Setting("size of each push, in a random direction", "m/s", least=0)] = (0.0, 0.0)
     push_every: Annotated[float, Setting("time between pushes", "s", above=0)] = 1.0
-    cycle: Annotated[float, Setting("length of a gait cycle: velocity is averaged over it", "s", above=0)] = field(
-        default_factory=lambda: load_gait().cycle
-    )
+    cycle: Annotated[
+        float, Setting("length of a gait cycle: velocity is averaged over it", "s", above=0, of="cycle")
+    ] = field(default_factory=lambda: load_gait().cycle)
     tolerance: Annotated[
         float | None, Setting("largest mean velocity error of a success; none: not falling is enough", "m/s", above=0)
     ] = 0.1

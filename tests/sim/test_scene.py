@@ -16,8 +16,9 @@ from servoid.hw.contracts.control import State
 from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.sim.backend import SimBackend
+from servoid.sim.marks import Frame
 from servoid.sim.model import build
-from servoid.sim.render import Frame, render
+from servoid.sim.render import render
 from servoid.sim.rig.servo.plant import Plant
 from servoid.sim.scene import from_plain, plain, robot_bodies
 
@@ -131,6 +132,7 @@ def test_a_scene_survives_its_way_to_a_rig() -> None:
         plain(replace(scene, robots=np.zeros((1, 5))))
 
 
+@pytest.mark.slow
 def test_pillars_and_spheres_are_drawn() -> None:
     """In a process of its own: MuJoCo chooses how to draw when it is first imported."""
     here = Path(__file__)
@@ -147,7 +149,9 @@ def draw() -> None:
     bare = Frame(np.array([0, 0, 0.26]), upright, robot.home)
     stood = Frame(bare.place, upright, robot.home, pillars=np.array([[0.0, 0.25, 0.05]]))
     lain = Frame(bare.place, upright, robot.home, spheres=np.array([[0.0, 0.25, 0.1]]))
-    pictures = [next(iter(render(robot, [frame], 160, 120))).astype(int) for frame in (bare, stood, lain)]
+    pictures = [
+        next(iter(render(robot, [frame], 160, 120, shadows=False))).astype(int) for frame in (bare, stood, lain)
+    ]
     assert (np.abs(pictures[1] - pictures[0]).sum(-1) > 30).mean() > 0.01
     red = [(picture[..., 0] - picture[..., 1] > 60).mean() for picture in pictures]
     assert red[2] > 0.005 + 2 * red[0]

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import yaml
 
-import servoid.sim.worlds
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Command, Mode, Observation
 from servoid.hw.contracts.world import Start
@@ -37,10 +36,9 @@ ONES = np.ones(len(ROBOT.joints))
 HEAD, ARM, KNEE = (ROBOT.names.index(name) for name in ("head_pan", "l_sho_roll", "l_knee"))
 
 
-def make(monkeypatch: pytest.MonkeyPatch, n: int = 1, robot: Any = ROBOT, **changes: Any) -> Worlds:
+def make(n: int = 1, robot: Any = ROBOT, **changes: Any) -> Worlds:
     """Worlds of nominal robots with some of what is drawn replaced."""
-    monkeypatch.setattr(servoid.sim.worlds, "draw", lambda *args: replace(draw(*args), **changes))
-    return started(Worlds(robot, n, threads=1))
+    return started(Worlds(robot, n, threads=1, drawn=lambda *args: replace(draw(*args), **changes)))
 
 
 def started(worlds: Worlds, seeds: Any = None, joints: Any = None) -> Worlds:
@@ -112,8 +110,8 @@ def test_sensors_have_the_resolution_of_the_servo() -> None:
 
 
 @pytest.mark.parametrize("ticks_late", [0, 1])
-def test_joints_are_seen_late_by_the_latency(monkeypatch: pytest.MonkeyPatch, ticks_late: int) -> None:
-    worlds = make(monkeypatch, joint_latency=ticks_late * ROBOT.dt)
+def test_joints_are_seen_late_by_the_latency(ticks_late: int) -> None:
+    worlds = make(joint_latency=ticks_late * ROBOT.dt)
     moved, tick_angle = [worlds.truth.joints.copy()], 2 * np.pi / 4096
     for tick in range(1, 12):
         worlds.step(pan(0.5))
@@ -124,9 +122,9 @@ def test_joints_are_seen_late_by_the_latency(monkeypatch: pytest.MonkeyPatch, ti
     assert worlds.observe().age == pytest.approx(ticks_late * ROBOT.dt)
 
 
-def test_the_imu_is_seen_late_by_its_own_latency(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_imu_is_seen_late_by_its_own_latency() -> None:
     robot = replace(PLAIN_IMU, imu=replace(PLAIN_IMU.imu, gyro_noise=0.0))
-    worlds = make(monkeypatch, robot=robot, imu_latency=ROBOT.dt + TIMESTEP, gyro_bias=np.zeros(3))
+    worlds = make(robot=robot, imu_latency=ROBOT.dt + TIMESTEP, gyro_bias=np.zeros(3))
     rates = [worlds.batch.sensordata[:, :3].copy()]
     for tick in range(1, 12):
         worlds.step(hold(ROBOT.home, Mode.OFF))  # it collapses: the base turns
@@ -151,9 +149,9 @@ def test_gyro_noise_and_bias_are_those_of_the_robots_file() -> None:
     assert np.abs((left[1:] * left[:-1]).mean(0) - bias**2).max() < 3e-6  # white: what is left of ticks is unrelated
 
 
-def test_the_imus_filter_averages_its_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_imus_filter_averages_its_samples() -> None:
     robot = replace(ROBOT, imu=replace(ROBOT.imu, gyro_noise=0.0))
-    worlds = make(monkeypatch, robot=robot, imu_latency=TIMESTEP, gyro_bias=np.zeros(3))
+    worlds = make(robot=robot, imu_latency=TIMESTEP, gyro_bias=np.zeros(3))
     worlds.step(hold(ROBOT.home, Mode.OFF))
     worlds.step(hold(ROBOT.home, Mode.OFF))
     samples = worlds._fresh["sensordata"][0, :, :3]  # of one tick, which the filter spans
@@ -170,9 +168,9 @@ def test_reading_twice_within_a_tick_is_the_same_and_the_next_tick_is_not() -> N
         assert not np.array_equal(worlds.observe().specific_force, first.specific_force)
 
 
-def test_backlash_is_a_play_between_joint_and_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_backlash_is_a_play_between_joint_and_encoder() -> None:
     play, tick_angle = 0.05, 2 * np.pi / 4096
-    worlds = make(monkeypatch, joint_latency=0.0, backlash=play)
+    worlds = make(joint_latency=0.0, backlash=play)
 
     def error(goal: float) -> float:
         for _ in range(12):
@@ -185,10 +183,10 @@ def test_backlash_is_a_play_between_joint_and_encoder(monkeypatch: pytest.Monkey
     assert error(-0.5) == pytest.approx(play / 2, abs=tick_angle)  # ... and on the way down
 
 
-def test_zero_offsets_cancel_between_what_is_measured_and_commanded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_zero_offsets_cancel_between_what_is_measured_and_commanded() -> None:
     zero = np.zeros(20)
     zero[HEAD] = 0.03
-    worlds = make(monkeypatch, zero=zero)
+    worlds = make(zero=zero)
     assert worlds.observe().position[0, HEAD] == pytest.approx(0.0, abs=2e-3)  # at home, by its own encoder
     for _ in range(40):
         worlds.step(pan(0.3))
@@ -208,8 +206,8 @@ def first_torque(worlds: Worlds) -> float:
 
 
 @pytest.mark.parametrize("delay", [0.008, 0.020, 0.028, 0.040])
-def test_commands_act_after_the_delay(monkeypatch: pytest.MonkeyPatch, delay: float) -> None:
-    assert first_torque(make(monkeypatch, command_delay=delay)) == pytest.approx(delay)
+def test_commands_act_after_the_delay(delay: float) -> None:
+    assert first_torque(make(command_delay=delay)) == pytest.approx(delay)
 
 
 def with_servos(folder: Path, **changes: Any) -> Robot:
@@ -249,11 +247,11 @@ def test_damped_motors_brake_and_motors_off_are_free() -> None:
     assert bent[Mode.ACTIVE] < 0.1
 
 
-def test_gain_and_supply_scale_stiffness_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gain_and_supply_scale_stiffness_together() -> None:
     """The firmware turns an error into a share of the supply: less voltage is a softer joint."""
 
     def torque(gain: float, **changes: Any) -> float:
-        worlds = make(monkeypatch, command_delay=0.0, **changes)
+        worlds = make(command_delay=0.0, **changes)
         worlds.step(Command(pan(0.05).position, gain * ONES, Mode.ACTIVE))
         return float(worlds._fresh["actuator_force"][0, 0, HEAD])
 
@@ -306,9 +304,9 @@ def test_a_push_changes_the_velocity_in_the_world_frame() -> None:
     assert worlds.truth.position[0, 0] > 0.002 > abs(worlds.truth.position[1, 0])
 
 
-def test_friction_is_that_of_the_body(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_friction_is_that_of_the_body() -> None:
     def slid(friction: float) -> float:
-        worlds = make(monkeypatch, friction=friction)
+        worlds = make(friction=friction)
         start = worlds.truth.foot_position[0, :, 0].copy()
         worlds.push(np.array([[0.6, 0.0]]))
         for _ in range(8):

@@ -11,6 +11,7 @@ import numpy as np
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.schedule import DenoisingMatrix
 from servoid.policy.diffusion.settings import Autoregressive, DiffusionSettings, Pyramid
+from servoid.tools.common.pictures.panels import PLAN, new_figure, save_figure
 
 NETWORK = DenoiserConfig(108, 20)  # 4 past and 16 future states, 20 noise levels
 FOLDER = Path("docs/schedules")
@@ -33,15 +34,11 @@ def matrix(name: str) -> DenoisingMatrix:
 
 def draw(name: str, out: Path) -> None:
     """One picture: network calls from top to bottom, ticks from left to right, dark where there is noise."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     rows = matrix(name)
-    figure = Figure(figsize=(8.4, 0.9 + 0.16 * rows.calls), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure, both = new_figure(1, 2, (8.4, 0.9 + 0.16 * rows.calls))
     image: Any = None
     parts = (("states", rows.states, NETWORK.state_ticks), ("actions", rows.actions, NETWORK.action_ticks))
-    for axes, (title, levels, ticks) in zip(figure.subplots(1, 2), parts, strict=True):
+    for axes, (title, levels, ticks) in zip(both, parts, strict=True):
         box = (ticks[0] - 0.5, ticks[-1] + 0.5, rows.calls + 0.5, -0.5)
         image = axes.imshow(levels, cmap="Blues", vmin=0, vmax=NETWORK.levels, extent=box, aspect="auto")
         axes.set_title(title, fontsize=9)
@@ -49,11 +46,10 @@ def draw(name: str, out: Path) -> None:
         axes.set_xticks(np.arange(ticks[0], ticks[-1] + 1, 4))
         axes.tick_params(labelsize=7)
         known = 0.5 if title == "states" else PICTURES[name].delay - 0.5  # what is known lies to the left
-        axes.axvline(known, color="#f28e1c", lw=1.0)
+        axes.axvline(known, color=PLAN, lw=1.0)
     figure.axes[0].set_ylabel("network calls", fontsize=8)
     figure.colorbar(image, ax=figure.axes, label="noise level").ax.tick_params(labelsize=7)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=80)
+    save_figure(figure, out, dpi=80)
 
 
 if __name__ == "__main__":

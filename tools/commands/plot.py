@@ -1,182 +1,117 @@
-"""Draw a recorded run: its path from above, velocities, tilt, joint tracking and tick timing."""
+"""Draw a recorded run: its path from above, velocities, tilt, joints, supply and tick timing. Several logs are drawn
+over each other. `--joints` draws the targets and positions of joints instead, `--video` a film.
+"""
 
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-
-from servoid.hw.config import ConfigError
-from servoid.hw.contracts.body import Array
+from servoid.hw.config import ConfigError, nearest
 from servoid.stack.log.flightlog import FlightLog, read_log
 from servoid.tools.common import exit_codes
-from servoid.tools.common.output import add_json_argument, reporting
-from servoid.tools.common.pictures import flightpath
-from servoid.tools.evaluate.plots import GOAL, OBSTACLE, PLAN, ROBOT
+from servoid.tools.common.output import Progress, add_json_argument, reporting
+from servoid.tools.common.pictures import panels
+from servoid.tools.common.pictures.caption import heading
+from servoid.tools.common.pictures.drawing import prepare
+from servoid.tools.common.pictures.panels import Panel, Shown, new_figure, save_figure
+from servoid.tools.common.summary import OUTCOMES
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+COLOURS = ("#3459b8", "#d1495b", "#2e8b57", "#8a5fbf")  # of several logs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", type=Path, metavar="LOG", help="flight log (.mcap)")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="picture to write, PNG (default: beside the log)")
+    parser.add_argument("log", type=Path, nargs="+", metavar="LOG", help="flight log (.mcap); several over each other")
+    parser.add_argument("--joints", metavar="NAME,NAME", help="draw targets and positions of these joints instead")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help="picture to write, PNG (default: beside the first log)"
+    )
+    parser.add_argument("--video", type=Path, metavar="FILE", help="film a log instead: MP4")
+    parser.add_argument(
+        "--video-size", default="1280x720", metavar="WxH", help="size of the film (default: %(default)s)"
+    )
     add_json_argument(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
-        log = read_log(args.log)
-        out = args.out or args.log.with_suffix(".png")
-        plot_run(log, out)
-        if not log.complete:
-            report.line(f"{args.log}: cut short; what is there was drawn")
-        report.line(str(out))
-        report.result({"plot": out, "complete": log.complete})
+        logs = [read_log(path) for path in args.log]
+        made: dict[str, Any] = {}
+        if args.video is not None:
+            made["video"] = _film(logs, args)
+        else:
+            out = args.out or args.log[0].with_name("-".join(path.stem for path in args.log) + ".png")
+            plot_runs(logs, out, None if args.joints is None else args.joints.split(","))
+            made["plot"] = out
+        for log in logs:
+            if not log.complete:
+                report.line(f"{log.path}: cut short; what is there was drawn")
+        for path in made.values():
+            report.line(str(path))
+        report.result(made | {"complete": all(log.complete for log in logs)})
     return exit_codes.DONE
+
+
+def _film(logs: Sequence[FlightLog], args: argparse.Namespace) -> Path:
+    if len(logs) > 1:
+        raise ConfigError("--video: give one log: a film shows one run")
+    path: Path = args.video
+    size = prepare(path, args.video_size)
+    from servoid.tools.common.pictures.video import VideoError, make_video
+
+    try:
+        with Progress("filming") as progress:
+            make_video(logs[0], path, size, progress)
+    except VideoError as error:
+        raise ConfigError(f"--video: {error}") from None
+    return path
 
 
 def plot_path(log: FlightLog, out: Path) -> None:
     """The path from above alone, with goal and plans. Raises ModuleNotFoundError without matplotlib."""
-    figure, axes = _figure(1, 1, (6.4, 6.0))
-    _path(axes, log)
-    axes.set_title(title(log))
-    _save(figure, out)
+    figure, (axes,) = new_figure(1, 1, (6.4, 6.0))
+    panels.path(axes, Shown(log))
+    axes.set_title(title(log), fontsize=10)
+    save_figure(figure, out)
 
 
-def plot_run(log: FlightLog, out: Path) -> None:
-    """Everything on one page. Raises ConfigError for a log without states."""
-    if not log.messages["/state"]:
-        raise ConfigError(f"{log.path}: holds no state: the run ended before every sensor was read")
-    figure, axes = _figure(2, 3, (16.0, 9.0))
-    figure.suptitle(title(log))
-    _path(axes[0, 0], log)
-    _velocity(axes[0, 1], log)
-    _tilt(axes[0, 2], log)
-    _tracking(axes[1, 0], log)
-    _effort(axes[1, 1], log)
-    _timing(axes[1, 2], log)
-    _save(figure, out)
+def plot_runs(logs: Sequence[FlightLog], out: Path, joints: Sequence[str] | None = None) -> None:
+    """Everything about one run, or several over each other, or the named joints of them, on one page.
 
-
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns)
-
-
-def _save(figure: Any, out: Path) -> None:
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out, dpi=110, format="png")
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written ({error.strerror}): choose another place with --out") from None
+    Raises ConfigError for a log without states, or a joint that one does not have.
+    """
+    shown = []
+    for number, log in enumerate(logs):
+        if not log.messages["/state"]:
+            raise ConfigError(f"{log.path}: holds no state: the run ended before every sensor was read")
+        label = "" if len(logs) == 1 else chr(ord("A") + number)
+        shown.append(Shown(log, label, COLOURS[number % len(COLOURS)], number, len(logs)))
+    drawn: Sequence[Panel] = panels.PAGE
+    if joints is not None:
+        for one in shown:
+            for name in joints:
+                if name not in one.names:
+                    raise ConfigError(f"--joints: {one.log.path}: no joint '{name}': {nearest(name, one.names)}")
+        drawn = [panels.joint(name) for name in joints]
+    columns = 3 if joints is None else min(len(drawn), 2)
+    rows = math.ceil(len(drawn) / columns)
+    figure, axes = new_figure(rows, columns, (16.0, 12.0) if joints is None else (8.0 * columns, 3.6 * rows))
+    figure.suptitle("\n".join((f"{one.label}: " if one.label else "") + title(one.log) for one in shown))
+    for panel, place in zip(drawn, axes, strict=False):
+        for one in shown:
+            panel(place, one)
+    for place in axes[len(drawn) :]:
+        place.set_axis_off()
+    save_figure(figure, out)
 
 
 def title(log: FlightLog) -> str:
     """What ran, and how it ended."""
-    settings, result = log.header["settings"], log.result
-    end = "cut short" if result is None else result["outcome"]
+    result = log.result
+    end = "cut short" if result is None else OUTCOMES[result["outcome"]]
     if result is not None and "seconds" in result:
-        end += f" after {result['seconds']:.1f} s"
-    policy = log.header["policy"]["name"]  # settings name the default where a program brought its own
-    return f"{settings['task']} with {policy} on {settings['robot']}, seed {settings['seed']}: {end}"
-
-
-def _seconds(log: FlightLog, channel: str) -> Array:
-    """Time of each message since the task began (or the run, if it did not)."""
-    ticks = flightpath.task_ticks(log)
-    return (log.ticks(channel) - (ticks[0] if len(ticks) else 0)) / log.header["robot"]["rate"]
-
-
-def _path(axes: Axes, log: FlightLog) -> None:
-    ticks, first = log.ticks("/state"), flightpath.task_ticks(log)
-    rows = ticks >= (first[0] if len(first) else 0)
-    place = log.column("/state", "displacement")[rows]
-    for number, plan in enumerate(flightpath.plans(log)[::8]):
-        axes.plot(*plan.path.T, color=PLAN, lw=0.8, alpha=0.6, label="plans" if number == 0 else None)
-    axes.plot(place[:, 0], place[:, 1], color=ROBOT, lw=1.6, label="robot")
-    axes.plot(*place[0, :2], "o", color=ROBOT, ms=5)
-    robots = flightpath.robots(log)
-    for number, path in enumerate(robots.swapaxes(0, 1) if robots is not None else ()):
-        axes.plot(*path[:, :2].T, color=OBSTACLE, lw=1.2, label="others, as seen" if number == 0 else None)
-        axes.plot(*path[0, :2], "o", color=OBSTACLE, ms=5)
-    obstacles = flightpath.obstacles(log)
-    for x, y, size in obstacles[-1] if obstacles is not None else ():
-        turn = np.linspace(0.0, 2.0 * np.pi, 40)
-        axes.fill(x + size * np.cos(turn), y + size * np.sin(turn), color=OBSTACLE)
-    goal = flightpath.goal(log)
-    if goal is not None:
-        axes.plot(*goal, "*", color=GOAL, ms=14, label="goal")
-        radius = log.header["task"].get("radius", 0.1)
-        turn = np.linspace(0.0, 2.0 * np.pi, 60)
-        axes.plot(goal[0] + radius * np.cos(turn), goal[1] + radius * np.sin(turn), color=GOAL, lw=0.8)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel="x [m]", ylabel="y [m]", title="path from above, by the robot's estimate")
-    axes.legend(loc="best")
-    axes.grid(alpha=0.3)
-
-
-def _velocity(axes: Axes, log: FlightLog) -> None:
-    seconds, velocity = _seconds(log, "/state"), log.column("/state", "velocity")
-    for column, (name, colour) in enumerate((("forward", ROBOT), ("left", PLAN))):
-        axes.plot(seconds, velocity[:, column], color=colour, lw=0.8, label=name)
-        if log.messages["/instruction"]:
-            asked = log.column("/instruction", "velocity")[:, column]
-            axes.plot(_seconds(log, "/instruction"), asked, color=colour, lw=1.4, ls="--")
-    axes.set(xlabel="t [s]", ylabel="m/s", title="velocity of the base (dashed: asked)")
-    axes.legend(loc="best")
-    axes.grid(alpha=0.3)
-
-
-def _tilt(axes: Axes, log: FlightLog) -> None:
-    tilt = np.degrees(np.arccos(np.clip(-log.column("/state", "gravity")[:, 2], -1.0, 1.0)))
-    axes.plot(_seconds(log, "/state"), tilt, color=ROBOT, lw=0.9)
-    for event in log.messages["/event"]:
-        if event["kind"] not in ("phase", "task"):
-            start = flightpath.task_ticks(log)
-            rate = log.header["robot"]["rate"]
-            axes.axvline((event["tick"] - (start[0] if len(start) else 0)) / rate, color=PLAN, lw=0.8)
-    axes.set(xlabel="t [s]", ylabel="degrees", title="tilt (lines: events)")
-    axes.grid(alpha=0.3)
-
-
-def _tracking(axes: Axes, log: FlightLog) -> None:
-    """The error between what was commanded at a tick and where the joint was at the next."""
-    names = [joint["name"] for joint in log.header["robot"]["joints"]]
-    goal, position = log.column("/command", "position")[:-1], log.column("/observation", "position")[1:]
-    error = np.sqrt(np.nanmean((goal - position) ** 2, axis=0)) if len(goal) else np.zeros(len(names))
-    axes.barh(np.arange(len(names)), error, color=ROBOT)
-    axes.set_yticks(np.arange(len(names)), names, fontsize=7)
-    axes.invert_yaxis()
-    axes.set(xlabel="rad, root mean square", title="joint tracking error")
-    axes.grid(alpha=0.3, axis="x")
-
-
-def _effort(axes: Axes, log: FlightLog) -> None:
-    effort = np.abs(log.column("/observation", "effort"))
-    names = [joint["name"] for joint in log.header["robot"]["joints"]]
-    for joint in np.argsort(-np.nanmean(effort, axis=0))[:4]:
-        axes.plot(_seconds(log, "/observation"), effort[:, joint], lw=0.7, label=names[joint])
-    axes.set(xlabel="t [s]", ylabel="N m", title="effort of the four most loaded joints")
-    axes.legend(loc="best", fontsize=7)
-    axes.grid(alpha=0.3)
-
-
-def _timing(axes: Axes, log: FlightLog) -> None:
-    phases = ("read", "estimate", "act", "guard", "write", "record")
-    seconds = _seconds(log, "/timing")
-    parts = [log.column("/timing", name) * 1e-6 for name in phases]
-    axes.stackplot(seconds, parts, labels=phases, lw=0)
-    axes.plot(seconds, log.column("/timing", "late") * 1e-6, color="black", lw=0.6, label="late")
-    total = np.sum(parts, axis=0)
-    if len(total):
-        axes.set_ylim(0.0, max(1.0, 1.5 * float(np.percentile(total, 99))))
-    axes.set(xlabel="t [s]", ylabel="ms", title="tick timing")
-    axes.legend(loc="upper right", fontsize=7, ncols=4)
-    axes.grid(alpha=0.3)
+        end = f"{end} after {result['seconds']:.1f} s"
+    return f"{heading(log)}: {end}"

@@ -117,9 +117,10 @@ def changes(log: FlightLog) -> list[str]:
     from servoid.stack.log.provenance import fingerprint, sha256, versions
 
     settings = _settings(log)
+    robot = load_robot(settings.robot)
     planner, header = _planner(log), {**log.header, **_part("policy", log.header["policy"])}
     try:
-        policy = policy_fingerprint(settings.policy)
+        policy = policy_fingerprint(settings.policy, robot.gait)
     except ConfigError:
         if planner is None:
             raise
@@ -127,7 +128,7 @@ def changes(log: FlightLog) -> list[str]:
     if planner is not None:  # whatever the file says today
         policy["checkpoint_sha256"] = sha256(resolve(planner.checkpoint))
     policy["name"] = log.header["settings"]["policy"]  # as it was typed
-    now = fingerprint(load_robot(settings.robot)) | _part("policy", policy)
+    now = fingerprint(robot) | _part("policy", policy)
     now |= _task(settings) | {"versions": versions(), "git_commit": git_commit()}
     names = {
         "robot": "the robot's file",
@@ -163,13 +164,14 @@ def _part(name: str, values: dict[str, Any]) -> dict[str, Any]:
 
 def _task(settings: RunSettings) -> dict[str, Any]:
     """The task as a log's header has it, by the files of today."""
+    from servoid.hw.robot.description import load_robot
     from servoid.stack.log.provenance import described, files
     from servoid.stack.tasks import find, load_settings, source
 
     chosen = dict(settings.set)
     if settings.seconds is not None:
         chosen["seconds"] = repr(settings.seconds)
-    task = load_settings(settings.task, chosen)
+    task = load_settings(settings.task, chosen, load_robot(settings.robot))
     named = {"name": find(settings.task).name} | described(task)
     return {"task": named, "task_files": files(task), "task_source": source(settings.task)}
 

@@ -26,7 +26,14 @@ from servoid.tools.common.compare import difference_table, differences, summaris
 from servoid.tools.common.exit_codes import exit_code, explain
 from servoid.tools.common.folder_lock import locked
 from servoid.tools.common.output import Report, add_json_argument, reporting
-from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, positive, settings
+from servoid.tools.common.parser import (
+    add_gain_argument,
+    add_set_argument,
+    check_seed,
+    out_of_reach,
+    positive,
+    settings,
+)
 from servoid.tools.common.worker_pool import each
 from servoid.tools.evaluate.cache import EpisodeCache, depends_on, key
 from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult
@@ -67,6 +74,8 @@ def main(args: argparse.Namespace, work: Work | None = None) -> int:
     with reporting(args.json) as report:
         names = policies(args.policy)
         _check(args)
+        for text in out_of_reach(args):
+            report.line(text)
         begun = time.monotonic()
         failure: BaseException | None = None
         with nullcontext() if args.out is None else locked(args.out):

@@ -7,7 +7,6 @@ turns torque off at once. Exit code 0: the goal was met; 1: the task failed; 4: 
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from datetime import datetime
 from functools import partial
@@ -16,8 +15,16 @@ from typing import Any
 
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
-from servoid.tools.common.output import Report, add_json_argument, reporting
-from servoid.tools.common.parser import add_gain_argument, add_set_argument, check_seed, positive, settings
+from servoid.tools.common.output import Progress, Report, add_json_argument, reporting
+from servoid.tools.common.parser import (
+    add_gain_argument,
+    add_set_argument,
+    check_seed,
+    out_of_reach,
+    positive,
+    settings,
+)
+from servoid.tools.common.pictures.drawing import prepare
 from servoid.tools.common.prompt import confirm
 
 EXIT_CODES = {
@@ -50,6 +57,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", action="store_true", help="move a real robot without asking")
     parser.add_argument("--record", type=Path, metavar="FILE", help="flight log (default: runs/DATE-TASK.mcap)")
     parser.add_argument("--video", type=Path, metavar="FILE", help="film the run afterwards: MP4, and its path as PNG")
+    parser.add_argument(
+        "--video-size", default="1280x720", metavar="WxH", help="size of the film (default: %(default)s)"
+    )
     parser.add_argument("--fast", action="store_true", help="do not keep a simulation to real time on a terminal")
     add_json_argument(parser)
 
@@ -58,11 +68,10 @@ def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         check_seed(args.seed)
         if args.video is not None:
-            _prepare_video(args.video)
-        from servoid.hw.robot.description import load_robot
+            size = prepare(args.video, args.video_size)
         from servoid.stack.runtime.backends import backend_kind
         from servoid.stack.runtime.run import RunSettings, run
-        from servoid.stack.tasks import beyond, find, load_settings
+        from servoid.stack.tasks import find
         from servoid.tools.common.live import LiveLine
         from servoid.tools.common.summary import summary
 
@@ -82,7 +91,7 @@ def main(args: argparse.Namespace) -> int:
             realtime=(watched and not args.fast) if backend_kind(args.backend).simulated else None,
             port=args.port,
         )
-        for text in beyond(load_settings(args.task, settings(args)), load_robot(args.robot)):
+        for text in out_of_reach(args):
             report.line(text)
         live = LiveLine(sys.stderr if args.json else sys.stdout)
         try:
@@ -94,7 +103,7 @@ def main(args: argparse.Namespace) -> int:
         for text in summary(result, report.columns):
             report.line(text)
         if args.video is not None and result.log is not None:
-            files |= _film(report, result.log, args.video)
+            files |= _film(report, result.log, args.video, size)
         for name, path in files.items():
             if path is not None:
                 report.line(f"{name:>8}: {path}")
@@ -126,23 +135,7 @@ def _default_log(task: str) -> Path:
     return next(name for name in names if not name.exists())
 
 
-def _prepare_video(path: Path) -> None:
-    """Refuse a file that cannot be made before the robot moves; choose how to draw before MuJoCo is loaded."""
-    if path.suffix != ".mp4":
-        raise ConfigError(f"--video {path}: give a name that ends in .mp4")
-    if path.exists():
-        raise ConfigError(f"--video {path}: exists already: give another name")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-        path.unlink()
-    except OSError as error:
-        raise ConfigError(f"--video {path}: cannot be written ({error.strerror}): give another name") from None
-    if not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
-
-
-def _film(report: Report, log: Path, path: Path) -> dict[str, Path]:
+def _film(report: Report, log: Path, path: Path, size: tuple[int, int]) -> dict[str, Path]:
     """Video and plot of a run; where they cannot be made, the reason. The run itself has succeeded or not before."""
     from servoid.stack.log.flightlog import read_log
     from servoid.tools.common.pictures.video import VideoError, make_video
@@ -150,7 +143,8 @@ def _film(report: Report, log: Path, path: Path) -> dict[str, Path]:
     made: dict[str, Path] = {}
     failures = (VideoError, ConfigError, OSError, ValueError)  # a full disk, say, or no encoder
     try:
-        make_video(read_log(log), path)
+        with Progress("filming") as progress:
+            make_video(read_log(log), path, size, progress)
         made["video"] = path
     except failures as error:
         report.line(f"no video: {error}")

@@ -16,6 +16,7 @@ import math
 import os
 import select
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TextIO
@@ -107,6 +108,12 @@ class Screen:
         """What a line that is rewritten may take: a full one would go on in the next."""
         return max((columns(self._stream) if self._stream is not None else None) or 80, 2) - 1
 
+    def clear(self) -> None:
+        """Take away the line that was rewritten."""
+        if self._shown:
+            self.write("\r" + " " * self._shown + "\r")
+        self._shown = 0
+
     def end(self) -> None:
         """Leave the line that was rewritten standing."""
         if self._shown:
@@ -123,6 +130,36 @@ class Screen:
         except OSError:  # the robot goes on without it
             self._stream = None
         return self._stream is not None
+
+
+class Progress:
+    """How far something is that takes a while: call it with how much of how much is done.
+
+    A terminal's line is rewritten; elsewhere a line comes at first, and every ten seconds.
+    """
+
+    def __init__(self, what: str, stream: TextIO | None = None, term: str | None = None) -> None:
+        """`what` is being done, such as "filming"; `stream` is standard error unless given."""
+        self._what, self._screen = what, Screen(stream or sys.stderr, term)
+        self._began, self._shown = time.monotonic(), -math.inf
+
+    def __call__(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if now - self._shown < (0.2 if self._screen.rewrites else 10.0):
+            return
+        self._shown = now
+        left = f", {(now - self._began) / done * (total - done):.0f} s left" if done else ""
+        text = f"{self._what}: {100 * done // max(total, 1)} % of {total}{left}"
+        if self._screen.rewrites:
+            self._screen.rewrite(text)
+        else:
+            self._screen.write(text + "\n")
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._screen.clear()
 
 
 def _takes(stream: TextIO) -> bool:

@@ -29,6 +29,12 @@ class Parser(argparse.ArgumentParser):
             self.error(f"unknown {kind} '{name}'{suggestion(name, self._option_string_actions)}")
         return parsed
 
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        """argparse takes `--option=--` for an empty list."""
+        if action.option_strings and "--" in arg_strings:
+            raise argparse.ArgumentError(action, "'--' is no value")
+        return super()._get_values(action, arg_strings)
+
     def error(self, message: str) -> NoReturn:
         print(f"{self.prog}: {message} (see {self.prog} --help)", file=sys.stderr)
         raise SystemExit(exit_codes.USAGE)
@@ -101,3 +107,12 @@ def settings(args: argparse.Namespace) -> dict[str, str]:
             raise ConfigError(f"--set {item}: {key} is set twice")
         result[key] = value
     return result
+
+
+def out_of_reach(args: argparse.Namespace) -> list[str]:
+    """A sentence about each speed that is asked of the chosen robot and is more than it can. Raises ConfigError."""
+    from servoid.hw.robot.description import load_robot
+    from servoid.stack.tasks import beyond, load_settings
+
+    robot = load_robot(args.robot)
+    return beyond(load_settings(args.task, settings(args), robot), robot)

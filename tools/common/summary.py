@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import textwrap
 from collections.abc import Iterable, Iterator
@@ -86,7 +87,7 @@ def summary(result: Result, columns: int | None = None) -> Iterator[str]:
             if not criterion.met:
                 yield from _wrapped("  not met: ", str(criterion), columns)
     for name, value in result.metrics.items():
-        yield f"{name:>24}: {value:.3f}"
+        yield f"{name:>24}: " + ("-" if math.isnan(value) else f"{value:.3f}")
     yield (
         f"{result.ticks} ticks, {result.missed} missed, late p50 {result.late_p50_ms:.2f} ms,"
         f" p99 {result.late_p99_ms:.2f} ms"

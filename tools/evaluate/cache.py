@@ -25,7 +25,8 @@ def depends_on(settings: RunSettings, policy: Mapping[str, Any]) -> dict[str, An
     from servoid.stack.log.provenance import described, files, fingerprint, versions
     from servoid.stack.tasks import load_settings, source
 
-    task = load_settings(settings.task, dict(settings.set))
+    robot = load_robot(settings.robot)
+    task = load_settings(settings.task, dict(settings.set), robot)
     return {
         "task": settings.task,
         "source": source(settings.task),
@@ -33,7 +34,7 @@ def depends_on(settings: RunSettings, policy: Mapping[str, Any]) -> dict[str, An
         "files": files(task),
         "seconds": settings.seconds,
         "policy": dict(policy),
-        "robot": fingerprint(load_robot(settings.robot)),
+        "robot": fingerprint(robot),
         "backend": settings.backend,
         "randomise": settings.randomise,
         "gain": settings.gain,

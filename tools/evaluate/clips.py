@@ -26,7 +26,7 @@ def recipe(robot: str) -> dict[str, Any]:
 
     return {
         "expert": sha256(resolve("expert")),
-        "gait": asdict(load_gait()),
+        "gait": asdict(load_gait(load_robot(robot).gait)),
         "robot": fingerprint(load_robot(robot)),
         "seconds": SECONDS,
         "seed": SEED,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -39,11 +40,12 @@ class EpisodeResult:
     wall_seconds: float = 0.0
 
 
-def do_episode(job: EpisodeJob) -> EpisodeResult:
-    """Do an episode. One that cannot be done, for whatever reason, is an answer too: the other rows go on."""
+def do_episode(job: EpisodeJob, do: Callable[[RunSettings], dict[str, Any]] | None = None) -> EpisodeResult:
+    """Do an episode with `do`, which is `record` where nothing else is said. One that cannot be done, for whatever
+    reason, is an answer too: the other rows go on."""
     begun = time.monotonic()
     try:
-        return EpisodeResult(job, record(job.settings), wall_seconds=time.monotonic() - begun)
+        return EpisodeResult(job, (do or record)(job.settings), wall_seconds=time.monotonic() - begun)
     except Exception as error:
         if os.environ.get("SERVOID_DEBUG") == "1":
             traceback.print_exc()

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from servoid.hw.config import ConfigError
+from servoid.tools.common.pictures.panels import GOAL, OBSTACLE, ROBOT, new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-ROBOT, PLAN, GOAL, OBSTACLE, FAILED = "#3459b8", "#f28e1c", "#26a65b", "#8c6b51", "#c1403d"
+FAILED = "#c1403d"
 PANELS = 12  # episodes that are drawn one by one, where each has a scene of its own
 
 
@@ -21,16 +21,11 @@ def draw_paths(records: Sequence[Mapping[str, Any]], title: str, out: Path) -> N
 
     Raises ConfigError where the file cannot be written, ModuleNotFoundError without matplotlib.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     alone = any(record["pillars"] or record["spheres"] or record.get("others") for record in records)
     groups = [[record] for record in records[:PANELS]] if alone else [list(records)]
     columns = min(len(groups), 4)
     lines = math.ceil(len(groups) / columns)
-    figure = Figure(figsize=(3.4 * columns, 3.4 * lines) if alone else (6.4, 6.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    all_axes = figure.subplots(lines, columns, squeeze=False).ravel()
+    figure, all_axes = new_figure(lines, columns, (3.4 * columns, 3.4 * lines) if alone else (6.4, 6.0))
     for axes, group in zip(all_axes, groups, strict=False):
         for record in group:
             _episode(axes, record, bare=len(group) > 1)
@@ -42,11 +37,7 @@ def draw_paths(records: Sequence[Mapping[str, Any]], title: str, out: Path) -> N
         axes.set_visible(False)
     succeeded = sum(record["success"] for record in records)
     figure.suptitle(f"{title}\n{succeeded} of {len(records)} succeeded (failed: red); m")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out, dpi=100, format="png")
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written ({error.strerror}): choose another place with --out") from None
+    save_figure(figure, out, dpi=100)
 
 
 def _episode(axes: Axes, record: Mapping[str, Any], bare: bool) -> None:

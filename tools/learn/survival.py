@@ -75,7 +75,7 @@ def survival_of(policy: Policy, fleet: Fleet, seconds: float) -> dict[str, float
 
     robot, worlds = fleet.robot, fleet.n
     everything = np.ones(worlds, bool)
-    cycle, low, high = load_gait().cycle, _LOW * robot.walking.scale, _HIGH * robot.walking.scale
+    cycle, low, high = load_gait(robot.gait).cycle, _LOW * robot.walking.scale, _HIGH * robot.walking.scale
     fleet.reset(everything)
     policy.reset(None, fleet.seeds)
     command = np.zeros((worlds, 3))

@@ -111,7 +111,7 @@ def drift(
     alive, path, command = everything.copy(), np.zeros(walks), np.zeros((walks, 3))
     turned, start = np.zeros(walks), fleet.truth.position[:, :2].copy()
     last, heading, state = start, fleet.truth.yaw.copy(), fleet.observe()
-    ticks, cycle = round(seconds * robot.rate), round(load_gait().cycle * robot.rate)
+    ticks, cycle = round(seconds * robot.rate), round(load_gait(robot.gait).cycle * robot.rate)
     for k in counted(ticks, "measuring"):
         if k % (5 * robot.rate) == 0:
             low, high = np.array([[-0.2, -0.2, -0.8], [0.6, 0.2, 0.8]]) * robot.walking.scale

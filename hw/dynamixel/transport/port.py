@@ -67,15 +67,6 @@ class SerialPort:
     def baud(self) -> int:
         return self._serial.baudrate
 
-    @property
-    def latency_timer(self) -> int | None:
-        """Milliseconds that a USB adapter waits for more bytes before it hands them on; None where it has no such."""
-        path = Path("/sys/class/tty") / Path(os.path.realpath(self.name)).name / "device" / "latency_timer"
-        try:
-            return int(path.read_text())
-        except (OSError, ValueError):
-            return None
-
     def fileno(self) -> int:
         return self._fd
 

@@ -197,6 +197,7 @@ def test_an_alert_and_a_lit_led_do_not_hide_an_acknowledgement(servos: Servos, l
     assert "4 of 4" in told(tmp_path)
 
 
+@pytest.mark.slow
 def test_only_the_answer_about_torque_counts(servos: Servos, line: Lifeline, tmp_path: Path) -> None:
     """A servo that keeps its torque on, or whose late answer to another question comes by, has not let go."""
     line.hold()

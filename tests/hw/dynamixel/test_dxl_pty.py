@@ -33,6 +33,7 @@ def port() -> Iterator[str]:
         server.stdout.close()
 
 
+@pytest.mark.slow
 def test_it_is_found_read_driven_and_let_go(port: str) -> None:
     """Nothing here depends on how busy the machine is, but that an answer comes at all."""
     backend = DynamixelBackend(ROBOT, port=port)

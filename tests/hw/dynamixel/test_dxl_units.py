@@ -27,6 +27,7 @@ def with_joint(index: int, **changes: object) -> Robot:
     return replace(ROBOT, joints=tuple(joints))
 
 
+@pytest.mark.slow
 @given(st.integers(0, 19), st.floats(0, 1), st.sampled_from([1, -1]), st.floats(-0.3, 0.3))
 def test_a_goal_that_is_reached_reads_back(index: int, part: float, direction: int, zero: float) -> None:
     robot = with_joint(index, direction=direction, zero=zero)

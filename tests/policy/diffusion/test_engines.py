@@ -70,6 +70,7 @@ def difference(ours: tuple[torch.Tensor, ...], theirs: tuple[torch.Tensor, ...])
     return max(float((a - b).norm() / b.norm()) for a, b in zip(ours, theirs, strict=True))
 
 
+@pytest.mark.slow
 def test_any_batch_is_computed_as_torch_does(engine: str) -> None:
     denoiser = model().denoiser
     run = load_engine(engine, denoiser)
@@ -81,6 +82,7 @@ def test_any_batch_is_computed_as_torch_does(engine: str) -> None:
         assert difference(ours, theirs) <= ENGINES[engine].tolerance
 
 
+@pytest.mark.slow
 def test_instructions_are_read_as_torch_reads_them(engine: str) -> None:
     denoiser = told_model().denoiser
     run, inputs = load_engine(engine, denoiser), window(denoiser.config, 2, shared=True)
@@ -100,6 +102,7 @@ def test_instructions_are_read_as_torch_reads_them(engine: str) -> None:
     assert difference(*guided) <= 6 * ENGINES[engine].tolerance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mask", sorted(MASKS))
 def test_attention_is_masked_as_the_network_says(mask: str) -> None:
     denoiser = model(mask=mask, layers=1).denoiser
@@ -119,6 +122,7 @@ def test_attention_is_masked_as_the_network_says(mask: str) -> None:
             assert (change[seen] > 1e-5).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "tolerance"), [("onnx", 1e-5), ("openvino", 1e-5), ("onnx-int8", 0.03), ("openvino-bf16", 0.02)]
 )
@@ -141,6 +145,7 @@ def test_plans_are_those_of_torch(name: str, tolerance: float, schedule: str) ->
     )
 
 
+@pytest.mark.slow
 def test_fewer_actions_than_states_are_exported_too(engine: str) -> None:
     denoiser = model(horizon=12, actions=6).denoiser
     ours = load_engine(engine, denoiser)(*window(denoiser.config, 1, shared=True))
@@ -166,6 +171,7 @@ def test_what_is_not_installed_is_named_with_the_remedy(monkeypatch: pytest.Monk
     Runtime(made, DiffusionSettings(), ROBOT)  # torch needs nothing
 
 
+@pytest.mark.slow
 def test_the_gradient_through_the_network_needs_torch() -> None:
     guidance = GuidanceSettings(gradient="network")
     with pytest.raises(ValueError, match="set engine: torch"):
@@ -188,6 +194,7 @@ def test_what_is_not_a_number_deviates_from_torch(broken: str) -> None:
     assert math.isnan(deviation(engine, denoiser))
 
 
+@pytest.mark.slow
 def test_an_engine_that_computes_something_else_is_refused(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
     graph = export.exported(model(seed=1).denoiser)
     monkeypatch.setattr(export, "exported", lambda denoiser: graph)
@@ -195,6 +202,7 @@ def test_an_engine_that_computes_something_else_is_refused(engine: str, monkeypa
         load_engine(engine, model(seed=2).denoiser)
 
 
+@pytest.mark.slow
 def test_a_network_is_exported_once_and_a_damaged_file_again(monkeypatch: pytest.MonkeyPatch, cache: Path) -> None:
     denoiser = model(seed=3, layers=1).denoiser
     installed("onnx")

@@ -96,6 +96,7 @@ def test_each_of_a_batch_is_told_the_name_of_its_own_motion() -> None:
     assert not np.allclose(both[0], both[1], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_sentence_is_read_as_the_nearest_that_was_trained_with_unless_told_otherwise() -> None:
     pytest.importorskip("wordllama")
     told = "head straight on"  # held out

@@ -45,6 +45,7 @@ def mixture(weights: Tensor, means: Tensor, deviation: float) -> object:
 
 
 # DDPM leaves out how uncertain each prediction is: its samples are narrower the fewer the levels.
+@pytest.mark.slow
 @pytest.mark.parametrize(("eta", "steps", "count", "narrow"), [(0.0, 50, 4000, 0.05), (1.0, LEVELS, 1500, 0.08)])
 def test_samples_have_the_mean_and_spread_of_the_distribution(
     eta: float, steps: int, count: int, narrow: float

@@ -85,20 +85,17 @@ def test_guidance_is_asked_only_while_states_can_move(gradient: str) -> None:
     assert len(asked) == 5
 
 
-def test_noise_of_a_frame_is_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_noise_of_a_frame_is_drawn_once() -> None:
     config = model().config
-    drawn = []
-    seeded = rolling.seeded
 
-    def counted(*numbers: int) -> torch.Generator:
-        drawn.append(numbers)
-        return seeded(*numbers)
+    def drawn() -> int:
+        return rolling._noise_of_frame.cache_info().misses
 
-    monkeypatch.setattr(rolling, "seeded", counted)
+    before = drawn()
     first = frame_noise(config, [(910, 50)])
-    assert len(drawn) == config.history + config.horizon
+    assert drawn() - before == config.history + config.horizon
     next_tick = frame_noise(config, [(910, 51)])
-    assert len(drawn) == config.history + config.horizon + 1
+    assert drawn() - before == config.history + config.horizon + 1
     for then, now in zip(first, next_tick, strict=True):
         torch.testing.assert_close(now[:, :-1], then[:, 1:], atol=0, rtol=0)
     assert not torch.equal(frame_noise(config, [(911, 51)])[0], next_tick[0])

@@ -14,10 +14,17 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import CheckpointError, Origin, read_header
 from servoid.policy.features import Normaliser, raw_layout
-from servoid.policy.latent.actions import LatentActions, LatentConfig, load_latents, same_latents, save_latents
+from servoid.policy.latent.actions import (
+    LatentActions,
+    LatentConfig,
+    load_latents,
+    proprioception,
+    proprioception_layout,
+    same_latents,
+    save_latents,
+)
 from servoid.policy.latent.dataset import Demonstrations
 from servoid.policy.latent.network import Gaussian, LatentNetwork
-from servoid.policy.latent.proprioception import proprioception, proprioception_layout
 from servoid.policy.recording import DatasetError, Recording, read_recording
 
 ROBOT = load_robot()
@@ -108,6 +115,7 @@ def trained(recording: Recording, size: int, steps: int = 250) -> float:
     return float(np.sqrt(np.square(made.decode(raw, made.encode(raw, target)) - target).mean()))
 
 
+@pytest.mark.slow
 def test_a_few_latents_are_enough_because_the_decoder_knows_the_state() -> None:
     """Four numbers cannot hold twenty joints, unless the state tells the rest."""
     recording = state_dependent(3000, seed=0)

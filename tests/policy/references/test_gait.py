@@ -262,6 +262,7 @@ def test_a_robot_with_other_arms_can_walk() -> None:
     assert np.isfinite(gait.frames(NOW).position).all()
 
 
+@pytest.mark.slow
 def test_it_walks_five_seconds_on_the_nominal_robot() -> None:
     commands = np.array([[0.2, 0, 0], [-0.1, 0, 0], [0, 0.08, 0], [0.1, -0.05, 0], [0.1, 0, 0.5], [0, 0, -0.8]])
     fleet = Fleet(ROBOT, len(commands), None, seed=4, threads=1)

@@ -27,6 +27,7 @@ def ended(rig: RigProcess) -> bool:
     return rig.process.poll() is not None
 
 
+@pytest.mark.slow
 def test_it_stands_is_pushed_and_ends_with_torque_off_and_without_a_process() -> None:
     body = VirtualBackend(ROBOT, seed=3)
     assert body.clock.now_ns() == 0
@@ -69,6 +70,7 @@ def test_it_stands_is_pushed_and_ends_with_torque_off_and_without_a_process() ->
     body.close()  # twice is no harm
 
 
+@pytest.mark.slow
 def test_the_truth_is_asked_for_once_an_instant(monkeypatch: pytest.MonkeyPatch) -> None:
     body = VirtualBackend(ROBOT)
     body.connect()
@@ -89,6 +91,7 @@ def test_the_truth_is_asked_for_once_an_instant(monkeypatch: pytest.MonkeyPatch)
     assert [op for op in asked if op in ("truth", "push")] == ["truth", "truth", "push", "truth"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ahead", "touching"), [(0.10, True), (0.30, False)])
 def test_whether_it_touches_the_scene_is_told_by_the_rig(ahead: float, touching: bool) -> None:
     body = VirtualBackend(ROBOT, scene=Scene(np.array([[ahead, 0.0, 0.05]]), np.zeros((0, 4))))
@@ -97,6 +100,7 @@ def test_whether_it_touches_the_scene_is_told_by_the_rig(ahead: float, touching:
     body.close()
 
 
+@pytest.mark.slow
 def test_a_seed_draws_the_same_robot_as_in_simulation() -> None:
     """What a robot shows of its draw: battery voltage, the gyro's bias about the vertical, how late its head obeys."""
     turned = ROBOT.home.copy()

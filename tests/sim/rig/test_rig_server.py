@@ -65,6 +65,7 @@ def walk_about(rig: RigProcess) -> tuple[list[bytes], list[dict[str, object]], l
     return heard, rig.control.accepted(), [*truth.qpos[0], *truth.angular_velocity[0]]
 
 
+@pytest.mark.slow
 def test_two_locked_runs_are_the_same_bit_for_bit() -> None:
     runs = []
     for _ in range(2):
@@ -229,6 +230,7 @@ time.sleep(60)
 """
 
 
+@pytest.mark.slow
 def test_a_rig_whose_controller_was_killed_lives_on_and_then_leaves_nothing_behind() -> None:
     """As long as somebody talks to its servos, and no longer: a guardian does for a moment."""
     parent = subprocess.Popen([sys.executable, "-c", _STARTED, "2"], stdout=subprocess.PIPE, text=True)

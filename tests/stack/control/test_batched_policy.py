@@ -87,7 +87,7 @@ def test_a_world_that_begins_among_others_holds_its_pose_until_a_plan_that_knows
 
 def test_what_is_asked_is_corrected_world_by_world_and_has_the_name_of_its_correction() -> None:
     planner = spy()
-    policy = DiffusionPolicy(planner, Pace(4, 2, 1), trim=Trim(ROBOT.dt, 5.0, (2,)), shape=(2,))
+    policy = DiffusionPolicy(planner, Pace(4, 2, 1), trim=Trim(ROBOT, 5.0, (2,)), shape=(2,))
     turning = replace(many(state(0), 2), angular_velocity=np.tile([0.0, 0.0, 0.4], (2, 1)))
     command = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
     for _ in range(200):

@@ -48,6 +48,7 @@ def test_a_clip_that_begins_lying_is_refused() -> None:
         ClipPolicy(ROBOT, lying)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["sim", "virtual"])
 def test_the_robot_bows_by_the_file_of_the_clip(tmp_path: Path, backend: str) -> None:
     path = tmp_path / "bow.mcap"

@@ -191,8 +191,7 @@ class FakePipe:
     def recv(self) -> object:
         return self._answers.pop(0)[1]
 
-    def close(self) -> None:
-        pass
+    def close(self) -> None: ...
 
 
 @pytest.mark.parametrize(("replan", "delay", "slow"), [(4, 2, 2.6), (4, 4, 5.2), (2, 2, 2.5), (2, 1, 5.5), (1, 1, 1.3)])
@@ -216,7 +215,7 @@ def test_planning_goes_on_after_a_slow_plan(
 def test_what_is_asked_is_corrected_and_has_the_name_of_its_correction() -> None:
     """A name of its own for what was asked would pull against the correction: the planner names what it is asked."""
     spy = Spy()
-    policy = DiffusionPolicy(spy, Pace(4, 4, 2), trim=Trim(ROBOT.dt, rate=5.0))
+    policy = DiffusionPolicy(spy, Pace(4, 4, 2), trim=Trim(ROBOT, rate=5.0))
     turning = replace(state(0), angular_velocity=np.array([0.0, 0.0, 0.4]))
     for tick in range(200):
         act(policy, replace(turning, time_ns=tick * 20_000_000), np.full(20, 0.5), INSTRUCTION)
@@ -345,7 +344,7 @@ def beyond(trajectory: Any, instruction: Instruction) -> Any:
     return trajectory.velocity.square().sum((-1, -2))
 
 
-@pytest.mark.parametrize("process", [False, True])
+@pytest.mark.parametrize("process", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_guidance_weight_that_diverges_holds_the_robot_and_says_why(
     settings: DiffusionSettings, process: bool
 ) -> None:
@@ -388,6 +387,7 @@ def test_plans_that_take_no_time_are_for_simulation_only(settings: DiffusionSett
         diffusion_policy(ROBOT, replace(settings, delay=0), process=True)
 
 
+@pytest.mark.slow
 def test_rolling_gives_the_same_actions_in_line_and_beside_the_loop(settings: DiffusionSettings) -> None:
     rolling = replace(settings, schedule="rolling", steps=2, execution_horizon=1, delay=1)
     inline, process = diffusion_policy(ROBOT, rolling), diffusion_policy(ROBOT, rolling, process=True)

@@ -40,6 +40,7 @@ def test_one_robot_acts_as_a_world_of_the_fleet(kind: type) -> None:
         assert np.abs(targets[0] - ROBOT.home).max() > 0.1
 
 
+@pytest.mark.slow
 def test_the_shipped_expert_stays_up_on_robots_it_does_not_know() -> None:
     """Pushed each second, half of the robots while going backward in a turn, where an older expert fell most."""
     n = 64

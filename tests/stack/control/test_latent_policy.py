@@ -19,9 +19,8 @@ from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.settings import DiffusionSettings
 from servoid.policy.features import Normaliser, raw_layout, raw_row
-from servoid.policy.latent.actions import LatentActions, LatentConfig
+from servoid.policy.latent.actions import LatentActions, LatentConfig, proprioception_layout
 from servoid.policy.latent.network import LatentNetwork
-from servoid.policy.latent.proprioception import proprioception_layout
 from servoid.stack.control.diffusion import DiffusionPolicy, diffusion_policy
 from servoid.stack.control.plan_buffer import Pace
 
@@ -120,6 +119,7 @@ def trace(of: DiffusionPolicy) -> Array:
     return np.stack(out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("schedule", ["full_sequence", "rolling"])
 def test_a_checkpoint_with_latents_runs_by_itself(settings: DiffusionSettings, schedule: str) -> None:
     """In line and beside the loop, with nothing but its own file."""

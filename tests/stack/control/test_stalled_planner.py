@@ -19,6 +19,8 @@ from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import Result, RunSettings, prepare, run
 from servoid.tools.common.ground_truth import GroundTruth
 
+pytestmark = pytest.mark.slow
+
 STALL = 50  # ticks: twice as long as a plan lasts
 PHASES = (100, 103, 106, 109)  # ticks of the task at which it begins: over half a gait cycle, so over all of a step
 SPEED = 0.15  # m/s

@@ -204,6 +204,7 @@ def test_other_sticks_and_buttons_may_be_chosen(pad: VirtualPad) -> None:
     assert (task.settings.turning_stick, task.settings.end_button) == ("leftx", "x")
 
 
+@pytest.mark.slow
 def test_a_run_is_steered_by_the_gamepad_and_can_be_replayed(pad: VirtualPad, tmp_path: Path) -> None:
     def steer(record: Any) -> None:
         if record.proposal.instruction is not None:

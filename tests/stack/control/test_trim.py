@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from servoid.hw.robot.description import load_robot
 from servoid.stack.control.trim import Trim
 
-DT = 0.02
+ROBOT = load_robot()
+DT = ROBOT.dt
 
 
 def state(velocity: Any) -> Any:
@@ -21,7 +23,7 @@ def state(velocity: Any) -> Any:
 
 def test_a_robot_that_goes_too_fast_comes_to_what_was_asked() -> None:
     """A body that does 1.2 times what it is told, and sways as a walk does."""
-    trim, asked = Trim(DT, 1.0), np.array([0.2, 0.0, 0.5])
+    trim, asked = Trim(ROBOT, 1.0), np.array([0.2, 0.0, 0.5])
     went, told = [], np.zeros(3)
     for tick in range(400):
         sway = 0.1 * np.sin(2 * np.pi * tick / 24) * np.array([0.0, 1.0, 1.0])
@@ -32,7 +34,7 @@ def test_a_robot_that_goes_too_fast_comes_to_what_was_asked() -> None:
 
 
 def test_it_begins_anew_when_something_else_is_asked_and_leaves_standing_alone() -> None:
-    trim = Trim(DT, 1.0)
+    trim = Trim(ROBOT, 1.0)
     for _ in range(100):
         told = trim(state([0.3, 0.0, 0.0]), np.array([0.2, 0.0, 0.0]))
     assert told[0] < 0.15
@@ -43,7 +45,7 @@ def test_it_begins_anew_when_something_else_is_asked_and_leaves_standing_alone()
 
 
 def test_a_robot_that_is_stuck_is_not_asked_for_ever_more() -> None:
-    trim = Trim(DT, 1.0)
+    trim = Trim(ROBOT, 1.0)
     for _ in range(2000):
         told = trim(state(np.zeros(3)), np.array([0.2, 0.0, 0.5]))
     np.testing.assert_allclose(told, [0.28, 0.0, 0.8])
@@ -51,8 +53,8 @@ def test_a_robot_that_is_stuck_is_not_asked_for_ever_more() -> None:
 
 def test_many_robots_are_corrected_as_one_is() -> None:
     rng = np.random.default_rng(0)
-    asked, many = np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.6]]), Trim(DT, 1.0, (2,))
-    ones = [Trim(DT, 1.0), Trim(DT, 1.0)]
+    asked, many = np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.6]]), Trim(ROBOT, 1.0, (2,))
+    ones = [Trim(ROBOT, 1.0), Trim(ROBOT, 1.0)]
     for tick in range(120):
         if tick == 60:
             asked = np.array([[0.2, 0.0, 0.0], [0.1, 0.0, 0.0]])
@@ -63,7 +65,7 @@ def test_many_robots_are_corrected_as_one_is() -> None:
 
 
 def test_one_of_many_robots_begins_anew_alone() -> None:
-    asked, trim = np.tile([0.2, 0.0, 0.0], (2, 1)), Trim(DT, 1.0, (2,))
+    asked, trim = np.tile([0.2, 0.0, 0.0], (2, 1)), Trim(ROBOT, 1.0, (2,))
     for _ in range(100):
         told = trim(state(np.tile([0.3, 0.0, 0.0], (2, 1))), asked)
     trim.reset(np.array([True, False]))

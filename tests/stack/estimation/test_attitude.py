@@ -68,6 +68,7 @@ def test_the_accelerometer_corrects_the_tilt_but_not_when_it_is_shaken() -> None
     assert tilt_left(2.0) > 0.18  # 2 g is no gravity
 
 
+@pytest.mark.slow
 def test_the_gyros_bias_is_learned_while_standing_and_kept_while_moving() -> None:
     bias, noise = np.array([0.01, -0.02, 0.015]), np.random.default_rng(1)
     attitude = started()
@@ -134,6 +135,7 @@ def test_worlds_are_independent_and_reset_alone() -> None:
             assert many.yaw[i] == pytest.approx(single.yaw)
 
 
+@pytest.mark.slow
 def test_gravity_and_heading_hold_while_it_walks() -> None:
     robot = load_robot()
     fleet = Fleet(robot, 6, None, seed=1, threads=1)

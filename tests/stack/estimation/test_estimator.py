@@ -166,6 +166,7 @@ def test_standing_it_neither_moves_nor_sinks() -> None:
     assert (state.contact > 0.05).all()  # both feet carry
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["expert", "diffusion", "gait"])
 def test_drift_of_twenty_walks_is_a_small_share_of_the_path(policy: str) -> None:
     result = drift(ROBOT, maker(ROBOT, policy), load_odometry(ROBOT), walks=20, seconds=30.0, seed=11)

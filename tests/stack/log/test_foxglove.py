@@ -44,9 +44,9 @@ def test_joints_are_plain_numbers_under_their_names(told: dict[str, list[tuple[i
     assert message["timestamp"] == {"sec": at // 10**9, "nsec": at % 10**9}
     assert [joint["name"] for joint in message["joints"]] == list(ROBOT.names)
     positions = [joint["position"] for joint in message["joints"]]
-    np.testing.assert_array_equal(positions, records[3].observation.position)
+    np.testing.assert_allclose(positions, records[3].observation.position, atol=1e-5)
     targets = [joint["position"] for joint in told["/view/targets"][3][1]["joints"]]
-    np.testing.assert_array_equal(targets, records[3].command.position)
+    np.testing.assert_allclose(targets, records[3].command.position, atol=1e-5)
     assert len(told["/view/frames"]) == len(told["/view/motion"]) == 100
 
 

@@ -215,6 +215,7 @@ for i in range(10_000):
 """
 
 
+@pytest.mark.slow
 def test_a_killed_recording_loses_less_than_a_second(tmp_path):
     path = tmp_path / "a.mcap"
     here = os.pathsep.join(sys.path)

@@ -25,12 +25,14 @@ NEAR = {"robots": "2", "circle": "0.4", "spread": "0"}  # head-on, so that a run
 BLIND = NEAR | {"passing.apart": "0.001"}
 
 
+@pytest.mark.slow
 def test_two_that_walk_at_each_other_touch_and_it_is_seen() -> None:
     row = judge(RunSettings("cross", policy="gait", seconds=8.0, set=BLIND)).row
     assert row["metrics"]["touched"] == 1.0
     assert not row["success"]
 
 
+@pytest.mark.slow
 def test_two_that_heed_each_other_get_across() -> None:
     judged = judge(RunSettings("cross", policy="gait", seconds=25.0, set=NEAR))
     assert judged.row["outcome"] == "succeeded"
@@ -41,6 +43,7 @@ def test_two_that_heed_each_other_get_across() -> None:
     assert np.linalg.norm(judged.trace.robots[-1, 0, :2]) < 0.2  # where the first one came from
 
 
+@pytest.mark.slow
 def test_a_run_is_repeated_from_its_log(tmp_path: Path) -> None:
     settings = RunSettings("cross", policy="gait", seconds=3.0, seed=4, randomise=True, record=tmp_path / "a.mcap")
     run(settings)
@@ -70,6 +73,7 @@ def watched(script: Script = Script(), shove: float = 0.0, **more: Any) -> tuple
     return run(settings, backend=body, on_tick=watch, script=script), world, rows
 
 
+@pytest.mark.slow
 def test_one_that_falls_ends_safe_and_the_run_tells_of_it() -> None:
     result, world, rows = watched(shove=0.6, seconds=40.0)
     assert not result.success
@@ -80,6 +84,7 @@ def test_one_that_falls_ends_safe_and_the_run_tells_of_it() -> None:
     assert [tilt < np.radians(60) for tilt in rows[-1][1]] == [True, True, False]
 
 
+@pytest.mark.slow
 def test_an_interrupt_lowers_all_of_them() -> None:
     result, world, rows = watched(Script((Event(160, 0.0, "interrupt", None, "Ctrl-C"),)), seconds=20.0)
     assert result.outcome == "interrupted"
@@ -97,6 +102,7 @@ def test_each_robot_needs_a_policy_of_its_own() -> None:
         run(RunSettings("cross"), policy=Still())  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_the_command_line_runs_it_and_lists_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

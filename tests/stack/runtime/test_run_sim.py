@@ -37,6 +37,7 @@ def content(log):
     }
 
 
+@pytest.mark.slow
 def test_the_same_seed_is_the_same_run_and_another_is_not(tmp_path):
     _, first = record(tmp_path / "a.mcap", randomise=True)
     _, second = record(tmp_path / "b.mcap", randomise=True)
@@ -45,6 +46,7 @@ def test_the_same_seed_is_the_same_run_and_another_is_not(tmp_path):
     assert content(first)["/observation"] != content(other)["/observation"]
 
 
+@pytest.mark.slow
 def test_real_time_has_the_same_result(tmp_path):
     _, fast = record(tmp_path / "a.mcap", seconds=1.0)
     slow_result, slow = record(tmp_path / "b.mcap", seconds=1.0, realtime=True)
@@ -52,6 +54,7 @@ def test_real_time_has_the_same_result(tmp_path):
     assert slow_result.late_p99_ms > 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("policy", "seed"),
     [*(("gait", seed) for seed in range(4)), *((name, seed) for name in ("expert", "diffusion") for seed in (0, 1))],

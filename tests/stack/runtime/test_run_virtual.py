@@ -50,6 +50,7 @@ def walk(body: Any, seconds: float) -> tuple[Array, Array]:
     return np.array(joints), np.array(path)
 
 
+@pytest.mark.slow
 def test_a_walk_is_that_of_the_simulation_and_repeats_bit_for_bit() -> None:
     """10 s straight ahead. In tight turns soles slip, and there a little noise parts two simulations as well."""
     joints, path = walk(SimBackend(ROBOT), 10.0)
@@ -63,6 +64,7 @@ def test_a_walk_is_that_of_the_simulation_and_repeats_bit_for_bit() -> None:
         np.testing.assert_array_equal(first, second)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["gait", "expert"])
 def test_a_run_ends_damped_and_then_off(policy: str) -> None:
     body, phases = Watched(ROBOT, seed=2), []
@@ -74,6 +76,7 @@ def test_a_run_ends_damped_and_then_off(policy: str) -> None:
     assert body.torque == (0,) * 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("tick", [0, 30, 79, 111])
 def test_ctrl_c_at_any_phase_ends_with_torque_off(tick: int, count: int) -> None:
@@ -90,6 +93,7 @@ def test_ctrl_c_at_any_phase_ends_with_torque_off(tick: int, count: int) -> None
     assert body.torque == (0,) * 20
 
 
+@pytest.mark.slow
 def test_a_policy_that_hangs_after_a_push_is_broken_off_with_torque_off() -> None:
     """The second Ctrl-C is an exception in the middle of a tick: no request to the rig may be cut in half by it."""
 
@@ -106,6 +110,7 @@ def test_a_policy_that_hangs_after_a_push_is_broken_off_with_torque_off() -> Non
     assert body.torque == (0,) * 20
 
 
+@pytest.mark.slow
 def test_an_exception_in_a_run_ends_the_rig_too() -> None:
     body = Watched(ROBOT)
     processes = []

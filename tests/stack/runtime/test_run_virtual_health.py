@@ -48,6 +48,7 @@ def walk(happens: Any, robot: Any = ROBOT, seconds: float = 20.0) -> tuple[Resul
     return result, records, body
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("happens", "kind", "joint", "words"),
     [
@@ -74,6 +75,7 @@ def test_it_is_named_within_10_ticks_and_the_robot_lowered(happens: Any, kind: s
     assert result.outcome == "stopped"
 
 
+@pytest.mark.slow
 def test_a_warm_servo_is_softened_on_the_wire_and_the_walk_goes_on() -> None:
     result, _, body = walk(lambda rig: rig.inject("heat", servo="l_knee", value=66), seconds=1.5)
     assert result.outcome == "succeeded"
@@ -85,6 +87,7 @@ def test_a_warm_servo_is_softened_on_the_wire_and_the_walk_goes_on() -> None:
     assert min(gain for _, gain in lowered) >= 800 * DERATED
 
 
+@pytest.mark.slow
 def test_a_robot_whose_imu_has_its_own_port_walks_on_the_rig_with_the_boards() -> None:
     """However it is mounted there: the rig mounts its own the same way."""
     own = replace(ROBOT.imu, kind="witmotion", port="/dev/nothing", signs=(1.0, 1.0, 1.0), mounting=(0.3, -1.2, 2.0))

@@ -21,6 +21,7 @@ from servoid.tools.common.pictures import flightpath
 from servoid.tools.evaluate.judge import judge, simulation
 
 
+@pytest.mark.slow
 def test_who_walks_into_a_pillar_fails_by_the_truth() -> None:
     """The robot is told of another pillar: its own velocity leads it into the one that stands there."""
     forest = {"places": "0.3,0,0.05", "x": "1", "field.body": "0.001", "field.strength": "0.001"}
@@ -30,6 +31,7 @@ def test_who_walks_into_a_pillar_fails_by_the_truth() -> None:
     assert row["metrics"]["touched"] == 1.0 or row["fell"]
 
 
+@pytest.mark.slow
 def test_a_goal_behind_a_pillar_is_reached_around_it(tmp_path: Path) -> None:
     settings = RunSettings(
         "forest",
@@ -105,6 +107,7 @@ def test_a_backend_without_the_scene_is_refused() -> None:
         run(RunSettings("obstacle", policy="gait"), backend=SimBackend(load_robot()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["goal-near", "goal-far", "velocity", "path", "perturb", "survive", "text", "obstacle"]
 )
@@ -115,6 +118,7 @@ def test_every_task_runs_with_the_gait(name: str) -> None:
     assert row["metrics"]
 
 
+@pytest.mark.slow
 def test_a_rig_shows_the_same_scene_as_the_simulation() -> None:
     """Same robot, same sphere: on virtual within the quantisation and delay of the bus."""
     traces = []

@@ -344,6 +344,7 @@ def test_plans_are_logged_with_their_ticks_and_late_ones_noted(tmp_path):
     assert [event.text for event in result.events if event.kind == "plan"] == ["plan of 8 is late"]
 
 
+@pytest.mark.slow
 def test_a_script_repeats_which_plans_came_in_time():
     def sent(**kwargs):
         _, body, _ = stand(**kwargs)
@@ -369,6 +370,7 @@ def test_a_log_of_a_run_that_broke_says_so(tmp_path):
     assert "cable" in log.result["error"]
 
 
+@pytest.mark.slow
 def test_garbage_is_collected_again_after_a_real_time_run():
     stand(settings={"realtime": True}, seconds=0.1)
     assert gc.get_freeze_count() == 0

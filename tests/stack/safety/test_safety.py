@@ -69,6 +69,7 @@ proposals = st.lists(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(proposals)
 def test_1_2_no_command_leaves_range_or_rate(sequence):
@@ -88,6 +89,7 @@ def test_1_2_no_command_leaves_range_or_rate(sequence):
         previous = command.position
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.floats(-3, 3), min_size=N, max_size=N), st.lists(st.integers(1, 9), min_size=1, max_size=10))
 def test_2_homing_is_slow_from_any_pose_and_any_gaps(start, gaps):
@@ -173,6 +175,7 @@ def test_4_target_of_the_wrong_shape_is_a_fault():
 operations = st.sampled_from(["target", "nan", "stop", "fault", "start", "home", "tilt", "blind", "release"])
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(st.booleans(), st.lists(operations, min_size=1, max_size=40))
 def test_5_an_ended_guard_never_drives_again(run_first, sequence):

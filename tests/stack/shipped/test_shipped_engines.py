@@ -18,6 +18,8 @@ from servoid.policy.diffusion.runtime import Runtime, load_runtime
 from servoid.policy.diffusion.settings import load_settings
 from servoid.stack.tasks import load_task
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = load_settings()
 
 

@@ -28,6 +28,8 @@ from servoid.tools.common.ground_truth import GroundTruth
 from servoid.tools.evaluate.policies import Policies
 from servoid.tools.evaluate.spec import load_evaluation
 
+pytestmark = pytest.mark.slow
+
 SHIPPED = load_settings()
 UNGUIDED = replace(SHIPPED, guidance=replace(SHIPPED.guidance, weight=0.0))
 AHEAD = "walk forward"  # what all are told, whatever the cost asks for

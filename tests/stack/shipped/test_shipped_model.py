@@ -14,6 +14,8 @@ from servoid.hw.robot.description import load_robot
 from servoid.sim.backend import SimBackend
 from servoid.stack.runtime.run import RunSettings, run
 
+pytestmark = pytest.mark.slow
+
 ROBOT = load_robot()
 
 

@@ -22,6 +22,8 @@ from servoid.policy.text.captions import caption
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.tasks.terms.guidance import Weights, obstacle_cost
 
+pytestmark = pytest.mark.slow
+
 LAYOUT = raw_layout(len(ROBOT.joints))
 SOME = slice(2, None, 5)  # of a run's requests: those that are planned again
 

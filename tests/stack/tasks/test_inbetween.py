@@ -108,6 +108,7 @@ def test_joints_are_where_the_robot_s_file_has_them(robot: Robot) -> None:
     np.testing.assert_allclose(places[robot.names.index("l_knee")][2], -0.0285 - 0.11015, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_clips_that_cannot_be_used_are_refused(clip: Path, robot: Robot, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no clips: record some"):
         load_task("inbetween", {}, DT).scenario(np.random.default_rng(0))
@@ -124,6 +125,7 @@ def test_clips_that_cannot_be_used_are_refused(clip: Path, robot: Robot, tmp_pat
         load_task("inbetween", {"clips": str(clip)}, DT, stiff)
 
 
+@pytest.mark.slow
 def test_a_run_passes_through_keyframes(clip: Path) -> None:
     result = run(RunSettings("inbetween", policy="gait", set={"clips": str(clip), "count": "1"}))
     assert result.outcome == "succeeded"

@@ -110,6 +110,7 @@ def commands(settings: dict[str, str], seed: int = 0) -> Array:
     return np.array([task.instruct(tick, state(), NOTHING).velocity for tick in range(1500)])
 
 
+@pytest.mark.slow
 def test_walk_draws_a_command_every_five_seconds_within_its_ranges() -> None:
     drawn = np.concatenate([commands({}, seed) for seed in range(40)])
     changes = np.flatnonzero(np.any(np.diff(drawn[:1500], axis=0) != 0, axis=1)) + 1

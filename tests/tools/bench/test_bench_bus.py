@@ -12,6 +12,7 @@ from servoid.tools.bench.responder import CURRENT, VELOCITY
 from servoid.tools.cli import main
 
 
+@pytest.mark.slow
 def test_it_times_both_clients_beside_the_wire(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "bus", "--cycles", "10", "--baud", "2000000", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)

@@ -19,6 +19,7 @@ def options(*words: str) -> argparse.Namespace:
     return parser.parse_args(["--checkpoint", "random", "--width", "32", "--plans", "5", *words])
 
 
+@pytest.mark.slow
 def test_it_prints_one_row_for_each_network_runtime_and_kind_of_guidance(capfd: pytest.CaptureFixture[str]) -> None:
     assert policy.main(options("--engine", "torch", "--shape", "2,12,6", "--json")) == 0
     (line,) = capfd.readouterr().out.splitlines()
@@ -77,6 +78,7 @@ def test_an_engine_that_is_not_installed_is_skipped_and_named(
         policy.main(options(*words, "--engine", "onnx"))
 
 
+@pytest.mark.slow
 def test_another_engine_is_timed_beside_torch(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

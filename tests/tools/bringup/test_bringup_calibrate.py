@@ -42,6 +42,7 @@ def never(*_: Any, **__: Any) -> Any:
     raise AssertionError("the robot is measured")
 
 
+@pytest.mark.slow
 def test_it_finds_the_assembly_of_a_rig_on_a_serial_port_and_check_then_uses_it(
     bringup: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

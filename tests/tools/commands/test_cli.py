@@ -46,6 +46,7 @@ def test_help_loads_nothing_that_is_slow_to_load() -> None:
         (["tasks", "goal", "walk"], "servoid tasks: unknown argument 'walk'"),
         (["tasks", "gaol"], "servoid: unknown task 'gaol': did you mean 'goal'?"),
         (["--jason"], "servoid: unknown option '--jason'"),
+        (["rollout", "walk", "--robot=--"], "servoid rollout: argument --robot: '--' is no value"),
         (["bench"], "servoid bench: command missing; known: sim, policy, loop"),
         ([], "servoid: command missing; known: tasks"),
     ],
@@ -180,6 +181,7 @@ def test_json_is_standard_json() -> None:
     assert json.loads(to_json(values)) == {"nan": None, "array": [1.0, None], "count": 3, "flag": True}
 
 
+@pytest.mark.slow
 def test_tasks_lists_every_setting() -> None:
     result = servoid("tasks", "--json", check=True)
     assert result.stdout.count("\n") == 1

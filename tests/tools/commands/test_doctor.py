@@ -15,6 +15,7 @@ from safetensors.numpy import save_file
 from servoid.tools.commands import doctor
 
 
+@pytest.mark.slow
 def test_doctor_reports_this_machine() -> None:
     result = subprocess.run([sys.executable, "-m", "servoid", "doctor", "--json"], capture_output=True, text=True)
     report = json.loads(result.stdout)

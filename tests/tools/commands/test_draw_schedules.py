@@ -30,6 +30,7 @@ def test_pictures_show_what_is_known_as_clean_and_end_clean(name: str) -> None:
     assert (np.diff(drawn.states, axis=0) <= 0).all()
 
 
+@pytest.mark.slow
 def test_a_picture_is_drawn(tmp_path: Path) -> None:
     draw("rolling", tmp_path / "deep" / "rolling.png")
     assert (tmp_path / "deep" / "rolling.png").read_bytes().startswith(b"\x89PNG")

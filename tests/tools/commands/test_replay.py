@@ -19,6 +19,7 @@ from servoid.tools.commands.replay import changes, replay
 from servoid.tools.common.pictures.flightpath import plans
 
 
+@pytest.mark.slow
 def test_what_a_policy_is_made_of_is_in_the_log_and_changes_are_named(tmp_path: Path) -> None:
     mine = tmp_path / "mine.yaml"
     mine.write_text("execution_horizon: 6\ndelay: 2\n")
@@ -51,6 +52,7 @@ def test_what_a_policy_is_made_of_is_in_the_log_and_changes_are_named(tmp_path: 
     assert changes(log) == []
 
 
+@pytest.mark.slow
 def test_every_robot_of_a_recorded_scene_plans_with_the_settings_of_the_log(tmp_path: Path) -> None:
     mine = tmp_path / "mine.yaml"
     mine.write_text("execution_horizon: 4\ndelay: 2\n")
@@ -95,6 +97,7 @@ def test_a_walk_by_the_gait_tells_its_settings(name: str) -> None:
         policy_fingerprint("gate")
 
 
+@pytest.mark.slow
 def test_a_run_in_which_no_plan_was_in_time_is_repeated_without_one(tmp_path: Path) -> None:
     """As on a machine that is far too slow for the planner."""
     chosen = RunSettings("walk", seconds=0.6, set={"vx": "0.1"}, record=tmp_path / "a.mcap")
@@ -105,6 +108,7 @@ def test_a_run_in_which_no_plan_was_in_time_is_repeated_without_one(tmp_path: Pa
     assert replay(log)[1] is None
 
 
+@pytest.mark.slow
 def test_a_clip_that_is_not_the_one_it_was_is_named(tmp_path: Path) -> None:
     for name, turn in (("clip", "0.3"), ("other", "-0.3")):
         turned = {"vx": "0.15", "yaw_rate": turn}
@@ -120,6 +124,7 @@ def test_a_clip_that_is_not_the_one_it_was_is_named(tmp_path: Path) -> None:
     assert changes(log) == ["a file that the task's settings name"]
 
 
+@pytest.mark.slow
 def test_a_walk_that_is_stopped_in_mid_step_is_repeated_and_drawn(tmp_path: Path) -> None:
     """The planner goes on until the robot has come to rest, after the last tick of the task."""
     chosen = RunSettings("walk", seconds=9.0, set={"vx": "0.2"}, record=tmp_path / "a.mcap")

@@ -53,6 +53,7 @@ def rolled(capfd: pytest.CaptureFixture[str], *words: str) -> dict:
     return json.loads(line)
 
 
+@pytest.mark.slow
 def test_one_and_two_workers_give_the_same_and_all_that_was_promised(capfd: pytest.CaptureFixture[str]) -> None:
     one = rolled(capfd, "--workers", "1")
     two = rolled(capfd, "--workers", "2")
@@ -67,6 +68,13 @@ def test_one_and_two_workers_give_the_same_and_all_that_was_promised(capfd: pyte
     assert {"velocity_error_mps", "top_speed_mps", "odometry_error_m"} <= set(one["metrics"])
 
 
+def test_what_the_robot_cannot_do_is_said_before_it_tries(capfd: pytest.CaptureFixture[str]) -> None:
+    words = ["--seconds", "0.2", "--episodes", "1", "--workers", "1", "--set", "vx=9"]
+    assert rollout.main(options(*words)) == 0
+    assert capfd.readouterr().out.startswith("vx=9 is more than op3 can: 0.5 m/s at most that way")
+
+
+@pytest.mark.slow
 def test_an_episode_can_be_run_again_by_its_seed() -> None:
     seed = episode_seed(3, 1)
     assert seed == episode_seed(3, 1) != episode_seed(3, 0)
@@ -123,6 +131,7 @@ def test_an_episode_that_cannot_be_done_does_not_take_the_others_with_it(
     assert json.loads(line) == {"error": "the rig did not answer", "exit_code": 3}
 
 
+@pytest.mark.slow
 def test_many_episodes_take_no_more_memory_than_one() -> None:
     """In a process of its own: what else was freed in this one would be used again, and hide it."""
     code = """
@@ -160,6 +169,7 @@ def test_success_is_by_the_truth_and_only_of_whole_runs(
     assert (row["success"], row["fell"], row["aborted"]) == (success, fell, outcome == "stopped")
 
 
+@pytest.mark.slow
 def test_a_run_that_is_told_to_end_is_no_episode_even_where_its_task_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
     """The signal comes while the robot is being lowered: the run has a result, and nothing else would know of it."""
     lowering = []
@@ -295,6 +305,7 @@ def test_a_policy_is_compared_with_another_one(given: list[str], named: str) -> 
         rollout.policies(given)
 
 
+@pytest.mark.slow
 def test_a_rollout_with_out_goes_on_where_it_was(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """After Ctrl-C, the figures of what was done; the same command does the others, and another one is refused."""
     words = [*WORDS[:3], "--workers", "1", "--out", str(tmp_path / "out"), "--json", "--episodes", "4"]

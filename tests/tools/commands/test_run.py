@@ -13,6 +13,7 @@ import time
 
 import numpy as np
 import pytest
+from drawing import draws
 
 from servoid.hw.config import ConfigError
 from servoid.stack.log.flightlog import read_log
@@ -25,6 +26,12 @@ RUN = ["run", "walk", "--policy", "gait", "--seconds", "2", "--set", "vx=0.1"]
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def drawn():
+    if not (draws("egl") or draws("osmesa")):
+        pytest.skip("MuJoCo itself cannot draw on this machine")
 
 
 def start(*arguments, **options):
@@ -41,6 +48,7 @@ def ends_off(log):
     assert log.messages["/command"][-1]["mode"] == "OFF"
 
 
+@pytest.mark.slow
 def test_json_is_one_object_on_standard_output(capfd):
     assert main([*RUN, "--seed", "2", "--json"]) == 0
     out, err = capfd.readouterr()
@@ -70,6 +78,7 @@ def test_who_steers_is_given_real_time_whoever_reads_the_output(words, realtime,
     assert asked == [realtime]
 
 
+@pytest.mark.slow
 def test_live_line_summary_and_log_for_a_person(capsys):
     assert main(RUN) == 0
     out = capsys.readouterr().out
@@ -99,6 +108,8 @@ def test_a_fall_is_exit_code_1(capsys):
         ([*RUN, "--set", "vy=fast"], "vy"),
         ([*RUN, "--seed", "-1"], "--seed must not be negative, not -1"),
         ([*RUN, "--video", "run.avi"], "ends in .mp4"),
+        ([*RUN, "--video", "run.mp4", "--video-size", "1280"], "such as 1280x720"),
+        ([*RUN, "--video", "run.mp4", "--video-size", "1281x720"], "even numbers from 120 to 4096"),
         ([*RUN, "--record", "/proc/log.mcap"], "choose another place"),
         ([*RUN, "--seconds", "-3"], "not a positive number"),
         (["run", "cross", "--set", "robots=1"], "robots: must be 2 to 4, not 1"),
@@ -117,6 +128,7 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, message, capsys):
     assert len(error.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_replay_is_identical_and_says_where_a_changed_log_differs(capsys):
     main([*RUN, "--record", "a.mcap", "--set", "push=0.1", "--randomise", "--seed", "4"])
     capsys.readouterr()
@@ -136,6 +148,7 @@ def test_replay_is_identical_and_says_where_a_changed_log_differs(capsys):
     assert (difference.tick, difference.channel, difference.field) == (150, "/command", "position")
 
 
+@pytest.mark.slow
 def test_what_only_a_program_can_repeat_is_refused(capsys):
     assert main([*RUN, "--record", "a.mcap"]) == 0
 
@@ -152,6 +165,7 @@ def test_what_only_a_program_can_repeat_is_refused(capsys):
             replay.replay(log)
 
 
+@pytest.mark.slow
 def test_a_truncated_log_replays_as_far_as_it_goes(tmp_path, capsys):
     assert main([*RUN, "--record", "a.mcap"]) == 0
     data = (tmp_path / "a.mcap").read_bytes()
@@ -162,6 +176,7 @@ def test_a_truncated_log_replays_as_far_as_it_goes(tmp_path, capsys):
     assert (tmp_path / "b.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("seed", range(2))
 def test_a_signal_at_any_moment_ends_lowered_and_off_and_replays(seed, number, tmp_path, capsys):
@@ -183,6 +198,7 @@ def test_a_signal_at_any_moment_ends_lowered_and_off_and_replays(seed, number, t
     assert main(["replay", "a.mcap"]) == 0, capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_two_signals_end_at_once(tmp_path):
     process = start("run", "walk", "--policy", "gait", "--seconds", "600", "--record", "a.mcap")
     while not (tmp_path / "a.mcap").exists():
@@ -196,6 +212,7 @@ def test_two_signals_end_at_once(tmp_path):
     ends_off(read_log("a.mcap"))
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_ends_the_run_safe(tmp_path):
     def small_files():
         resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000))
@@ -216,6 +233,8 @@ def test_a_disk_that_fills_up_ends_the_run_safe(tmp_path):
     assert len(log.ticks("/observation")) > 10
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("drawn")
 @pytest.mark.parametrize(
     "error",
     [
@@ -239,6 +258,7 @@ def test_without_a_way_to_draw_the_run_still_succeeds(error, tmp_path, monkeypat
     assert (tmp_path / "a.png").exists()
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_picture_that_cannot_be_written_leaves_the_result_alone(tmp_path, monkeypatch, capsys):
     from servoid.tools.common.pictures import video
 
@@ -257,37 +277,36 @@ def test_a_film_that_cannot_be_written_is_refused_before_anything_moves(tmp_path
     assert not list(tmp_path.glob("runs/*"))
 
 
-def test_gl_that_does_not_work_is_explained(tmp_path):
+@pytest.mark.slow
+def test_gl_that_does_not_work_is_explained_before_anything_moves(tmp_path):
     process = start(*RUN, "--video", "a.mp4", env=os.environ | {"MUJOCO_GL": "glfw", "DISPLAY": ":99"})
     out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
-    assert "MUJOCO_GL=egl" in out
+    assert process.returncode == 2, err
+    assert err.startswith("servoid: --video: cannot draw on this machine with glfw: try MUJOCO_GL=egl")
+    assert not out
+    assert not list(tmp_path.iterdir())
 
 
-def draws() -> bool:
-    """Whether MuJoCo can draw here at all, without a line of this project's."""
-    code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).render()"
-    drawn = [sys.executable, "-c", code]
-    kinds = [os.environ | {"MUJOCO_GL": name} for name in ("egl", "osmesa")]
-    return any(subprocess.run(drawn, env=kind, capture_output=True).returncode == 0 for kind in kinds)
-
-
+@pytest.mark.slow
+@pytest.mark.usefixtures("drawn")
 def test_a_goal_run_is_filmed_and_plotted(tmp_path):
     av = pytest.importorskip("av")
-    process = start("run", "goal", "--policy", "gait", "--seconds", "2", "--video", "a.mp4")
+    size = ["--video-size", "320x240"]
+    process = start("run", "goal", "--policy", "gait", "--seconds", "2", "--video", "a.mp4", *size)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 1, err  # two seconds do not reach it
-    if not draws():
-        pytest.skip("MuJoCo itself cannot draw on this machine")
     assert "no video" not in out
+    assert "filming: 0 % of " in err
     with av.open(str(tmp_path / "a.mp4")) as container:
         pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert len(pictures) >= 50
+    assert pictures[0].shape == (240, 320, 3)
     assert pictures[10].std() > 10  # something is in it
     assert np.abs(pictures[10].astype(int) - pictures[40]).mean() > 0.1  # and moves
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_bench_loop_measures_real_time(capsys):
     assert main(["bench", "loop", "--seconds", "1", "--json"]) == 0
     values = json.loads(capsys.readouterr().out)

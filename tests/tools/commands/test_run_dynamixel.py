@@ -60,6 +60,7 @@ def written(rig: RigProcess, register: str) -> set[int]:
     return {write["value"] for write in rig.control.accepted() if write["register"] == register}
 
 
+@pytest.mark.slow
 def test_it_stands_more_softly_and_lets_go(rig: RigProcess, capsys: pytest.CaptureFixture[str]) -> None:
     """The same command as on a robot. `gain` is what the servos get: of 800, then none to brake."""
     for i in range(TRIES):

@@ -40,6 +40,7 @@ def start(*arguments: str) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.slow
 def test_the_verb_serves_a_port_until_ctrl_c(tmp_path: Path) -> None:
     """Any program can talk to it: the board answers a ping on the link, and both are gone afterwards."""
     process = start("virtual", "--link", "rig", "--json")
@@ -94,6 +95,7 @@ def test_a_link_that_points_to_nothing_or_that_a_killed_rig_left_is_replaced(tmp
     assert os.readlink(link) == "/dev/null"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "silent_board", "says"),
     [
@@ -127,6 +129,7 @@ def test_what_a_client_must_do_is_said_and_is_all_that_it_must_do(
     assert "--move JOINT=RAD" in err
 
 
+@pytest.mark.slow
 def test_joints_of_a_limp_virtual_robot_are_moved_by_a_command(capsys: pytest.CaptureFixture[str]) -> None:
     """Another program records a range meanwhile: it sees the joint on its way, through the servo's own register."""
     process = start("virtual", "--link", "rig", "--powered", "--json")
@@ -177,6 +180,7 @@ def test_a_locked_rig_that_nobody_could_advance_is_refused(capsys: pytest.Captur
     assert "give --link or --control" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_is_recorded_and_replays_bit_for_bit(capfd: pytest.CaptureFixture[str]) -> None:
     options = ["--seconds", "2", "--set", "push=0.05", "--randomise", "--seed", "3", "--set", "vx=0.1"]
     assert main([*RUN, *options, "--record", "a.mcap", "--json"]) == 0
@@ -188,6 +192,7 @@ def test_a_run_is_recorded_and_replays_bit_for_bit(capfd: pytest.CaptureFixture[
     assert main(["replay", "a.mcap"]) == 0, capfd.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_robot_of_ones_own_file_is_emulated(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """The servo's ID is another than the shipped robot's: the rig must be that of the file."""
     from servoid.hw.robot.description import load_robot, save_robot
@@ -199,6 +204,7 @@ def test_a_robot_of_ones_own_file_is_emulated(capfd: pytest.CaptureFixture[str],
     assert main([*RUN, "--robot", "mine.yaml", "--seconds", "0.5"]) == 0, capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_rollouts_are_the_same_on_one_and_two_workers(capfd: pytest.CaptureFixture[str]) -> None:
     words = ["rollout", "walk", "--policy", "expert", "--backend", "virtual", "--seconds", "2", "--episodes", "2"]
     figures = []
@@ -216,6 +222,7 @@ def test_a_port_for_the_virtual_rig_is_refused(capsys: pytest.CaptureFixture[str
     assert "drop --port" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_in_mid_walk_ends_with_torque_off_acknowledged(number: signal.Signals, tmp_path: Path) -> None:
     """A servo that had not said that torque is off would be exit code 3."""

@@ -17,7 +17,7 @@ import pytest
 
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.tools.common.live import LiveLine
-from servoid.tools.common.output import Screen
+from servoid.tools.common.output import Progress, Screen
 
 TIMING = SimpleNamespace(read=0, estimate=0, act=0, guard=0, write=0, record=0)
 
@@ -139,3 +139,14 @@ def test_a_terminal_that_cannot_rewrite_a_line_gets_few() -> None:
     line.close()
     assert "\r" not in stream.getvalue()
     assert len(stream.getvalue().splitlines()) == 4  # homing, running, and every five seconds
+
+
+@pytest.mark.parametrize(("term", "shown"), [("dumb", "filming: 0 % of 100\n"), ("xterm", "\rfilming: 0 % of 100")])
+def test_progress_is_one_line_where_it_can_be_rewritten(term: str, shown: str) -> None:
+    stream = Lines()
+    with Progress("filming", stream, term) as progress:
+        for done in range(100):
+            progress(done, 100)
+    assert stream.getvalue().startswith(shown)
+    assert stream.getvalue().endswith("\n" if term == "dumb" else " \r")  # a line that was rewritten is taken away
+    assert len(stream.getvalue().splitlines()) < 4

@@ -42,17 +42,20 @@ def begun_with(job: int) -> str:
     return Path("/proc/self/environ").read_text()
 
 
+@pytest.mark.slow
 def test_every_job_is_answered_on_processes_of_their_own() -> None:
     assert sorted(each(abs, iter([-1, -2, -3, -4, -5]), 2)) == [1, 2, 3, 4, 5]
     assert len(set(each(pid, range(6), 2)) | {os.getpid()}) == 3
     assert set(each(pid, range(2), 1)) == {os.getpid()}
 
 
+@pytest.mark.slow
 def test_at_the_deadline_what_runs_is_given_up_however_stubborn() -> None:
     assert list(each(stubborn, range(3), 2, time.monotonic() + 3.0)) == []
     assert list(each(abs, range(3), 1, time.monotonic())) == []
 
 
+@pytest.mark.slow
 def test_jobs_are_asked_for_when_they_can_be_done() -> None:
     """So that a run which refuses its settings does not do so a hundred times."""
     asked = []
@@ -68,17 +71,20 @@ def test_jobs_are_asked_for_when_they_can_be_done() -> None:
     answers.close()  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_an_error_comes_back() -> None:
     with pytest.raises(ConfigError, match="job 7"):
         list(each(refuse, [7], 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("work", [die, swallow])
 def test_a_process_that_dies_is_noticed(work: object) -> None:
     with pytest.raises(RuntimeError, match="died"):
         list(each(work, [1], 2))  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_worker_calculates_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """From its start: numpy and torch look when they are loaded. This process keeps what it has."""
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -183,16 +184,13 @@ def test_a_row_that_cannot_be_done_does_not_stop_the_others(tmp_path: Path, done
 
 
 @pytest.mark.parametrize("error", [BackendError("the rig did not answer"), ZeroDivisionError("no floor")])
-def test_an_error_of_one_run_does_not_stop_the_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
+def test_an_error_of_one_run_does_not_stop_the_others(tmp_path: Path, error: Exception) -> None:
     def record(settings: RunSettings) -> dict[str, Any]:
         if settings.task == "goal-far":
             raise error
         return {"success": True}
 
-    monkeypatch.setattr("servoid.tools.evaluate.episode.record", record)
-    measured = evaluate([FAR, NEAR], options(tmp_path), do_episode)
+    measured = evaluate([FAR, NEAR], options(tmp_path), partial(do_episode, do=record))
     assert str(error) in (measured["t/far"].refused or "")
     assert len(measured["t/near"].records) == 4
 
@@ -226,15 +224,14 @@ def test_where_nothing_was_measured_the_page_that_is_there_stays(
     assert (tmp_path / "papers.md").read_text() == "of an evaluation before"
 
 
-def test_an_episode_that_ctrl_c_ended_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_episode_that_ctrl_c_ended_is_not_kept(tmp_path: Path) -> None:
     """The run takes the signal for itself, and ends in good order: nothing else would tell the evaluation."""
 
-    def judge(settings: object) -> None:
+    def record(settings: RunSettings) -> dict[str, Any]:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("servoid.tools.evaluate.judge.judge", judge)
     with pytest.raises(KeyboardInterrupt):
-        evaluate([NEAR], options(tmp_path), do_episode)
+        evaluate([NEAR], options(tmp_path), partial(do_episode, do=record))
     assert not any('"episode"' in path.read_text() for path in (tmp_path / "episodes").glob("*.jsonl"))
 
 
@@ -253,6 +250,7 @@ def test_after_ctrl_c_the_figures_are_of_what_was_done(
     assert len(done.jobs) == 6
 
 
+@pytest.mark.slow
 def test_the_command_prints_and_writes_what_was_done_until_ctrl_c(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from servoid.tools.commands.evaluate import QUICK_EPISODES, QUICK_MINUTES, add_arguments, options_of
 from servoid.tools.common.parser import Parser
 from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult
@@ -35,6 +37,7 @@ def test_it_is_two_episodes_a_row_and_nine_minutes() -> None:
     assert len(rows) < len(PAPERS.rows) / 2
 
 
+@pytest.mark.slow
 def test_what_is_said_beside_it_is_heeded() -> None:
     chosen = options("--quick", "--episodes", "5", "--minutes", "3")
     told = options("--quick", "--minutes", "0")  # tells what was done

@@ -183,6 +183,7 @@ def test_rows_are_chosen_by_pattern_and_bring_what_they_are_held_against() -> No
         select(rows, ["a/sharee"], quick=False)
 
 
+@pytest.mark.slow
 def test_every_row_can_be_told_apart_and_is_of_a_task_that_there_is() -> None:
     from servoid.stack.tasks import load_settings
 

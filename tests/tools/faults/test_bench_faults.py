@@ -28,6 +28,7 @@ def goal(tick: float, position: float, register: str = "goal_position", value: i
 ON = goal(0, 0.0, "torque_enable", 1)
 
 
+@pytest.mark.slow
 def test_a_quick_campaign_goes_as_declared(capsys: pytest.CaptureFixture[str]) -> None:
     command = ["bench", "faults", "--quick", "--seeds", "1", "--workers", "1", "--deadline", "600", "--json"]
     assert main(command) == 0

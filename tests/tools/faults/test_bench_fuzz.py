@@ -15,6 +15,7 @@ from servoid.tools.faults import fuzz, targets
 from servoid.tools.faults.streams import IDS, WIDTH, stream
 
 
+@pytest.mark.slow
 def test_nothing_upsets_what_reads_bytes(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "fuzz", "--streams", "400", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)

@@ -50,6 +50,7 @@ def figures(words: list[str], capfd: pytest.CaptureFixture[str]) -> dict[str, An
     return values
 
 
+@pytest.mark.slow
 def test_a_controller_that_is_killed_leaves_no_torque_and_a_log(capfd: pytest.CaptureFixture[str]) -> None:
     """By the rig's own record: the guardian after it braked, and with it killed too, the watchdog. One that does
     nothing within the second that the bench gives it is counted as never."""
@@ -74,6 +75,7 @@ def test_servos_that_never_went_off_are_counted_and_have_a_bound() -> None:
     assert _last({0: 40.0, 1: 60.02}, 2) == 60.0
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_with_torque_off_that_all_servos_acknowledged(capfd: pytest.CaptureFixture[str]) -> None:
     for _ in range(TRIES):
         values = figures(["bench", "interrupt", "--times", "2"], capfd)
@@ -87,6 +89,7 @@ def test_ctrl_c_ends_with_torque_off_that_all_servos_acknowledged(capfd: pytest.
     assert values["acknowledged"] >= 1, "only the run that is interrupted twice may be too late to say so"
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_judged_after_its_guardian(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Or what the guardian had to do would not be seen. The last words are how it ended, without the figures."""
     program, ready = tmp_path / "run", tmp_path / "ready"

@@ -14,6 +14,7 @@ from servoid.tools.faults.soak import rss_mb
 TRIES = 3  # in real time a machine that is busy enough stops any walk
 
 
+@pytest.mark.slow
 def test_a_walk_goes_on_over_a_line_that_loses_packets(capsys: pytest.CaptureFixture[str]) -> None:
     for _ in range(TRIES):
         assert main(["bench", "soak", "--minutes", "0.05", "--warm-up", "1", "--share", "0.02", "--json"]) == 0

@@ -180,6 +180,7 @@ def test_command_and_task_go_together_and_last(table: pa.Table, robot: Robot) ->
     assert (gaps >= shortest[skill_of]).all()
 
 
+@pytest.mark.slow
 def test_same_options_same_files(collected: Path, tmp_path: Path) -> None:
     again, other, quiet = tmp_path / "again", tmp_path / "other", tmp_path / "quiet"
     assert cli.main([*COMMAND.split(), str(again)]) == 0

@@ -190,6 +190,7 @@ def test_commands_of_training_are_spread_over_what_is_asked() -> None:
     assert (commands[fast, 1:] == 0).all()  # no fast walking while turning or side-stepping
 
 
+@pytest.mark.slow
 def test_a_fresh_start_leaves_no_curve_of_the_old_run(tmp_path: Path) -> None:
     trainer(tmp_path, samples=48.0).run()
     assert rows(tmp_path)

@@ -56,6 +56,7 @@ def slipping(recorded: dict[str, np.ndarray]) -> Iterator[dict[str, np.ndarray]]
     torch.set_num_threads(threads)
 
 
+@pytest.mark.slow
 def test_fitting_takes_a_systematic_slip_out(slipping: dict[str, np.ndarray], tmp_path: Path) -> None:
     trainer(slipping, tmp_path / "o.safetensors").run()
     network = load_odometry(ROBOT, tmp_path / "o.safetensors")

@@ -2,62 +2,108 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
 from servoid.stack.log.flightlog import FlightLog
 from servoid.tools.common.pictures import flightpath
+from servoid.tools.common.pictures.caption import FilmCaptions
+from servoid.tools.common.pictures.drawing import SIZE
+
+if TYPE_CHECKING:  # MuJoCo chooses how to draw when it is imported: not before it is known
+    from servoid.sim.marks import Frame
 
 FPS = 25
+PUSHED = 0.5  # s that the arrow of a push is shown
+_GHOSTS = 3  # keyframes that are shown ahead
 
 
 class VideoError(Exception):
     """No video can be made here; the text says what is missing."""
 
 
-def make_video(log: FlightLog, path: Path, width: int = 640, height: int = 480) -> None:
-    """Draw a log's states and write them as H.264. Raises VideoError naming what is missing."""
+def make_video(
+    log: FlightLog,
+    path: Path,
+    size: tuple[int, int] = SIZE,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Draw a log's states, `size` being width and height, and write them as H.264.
+
+    `progress` is told how many pictures of how many are done. Raises VideoError naming what is missing.
+    """
     try:
         import av
     except ModuleNotFoundError:
         raise VideoError("this needs the 'video' extra: pip install 'servoid[video]'") from None
-    from servoid.sim.render import Frame, RenderError, render
+    from servoid.sim.render import RenderError, render
 
-    robot = load_robot(log.header["settings"]["robot"])
     if not log.messages["/state"]:
         raise VideoError("the log holds no state")
-    ticks, first = log.ticks("/state"), flightpath.task_ticks(log)
-    place, orientation = log.column("/state", "displacement"), log.column("/state", "orientation")
-    joints, goal, plans = log.column("/state", "position"), flightpath.goal(log), flightpath.plans(log)
-    obstacles, robots = flightpath.obstacles(log), flightpath.robots(log)
-    rolling = len((log.header.get("scene") or {"spheres": ()})["spheres"])  # the last ones of the obstacles
-    pillars = 0 if obstacles is None else obstacles.shape[1] - rolling
-    step = max(1, round(robot.rate / FPS))
-    frames = []
-    # Before the task the odometry frame is another one: the run is shown from where the task begins.
-    for row in np.flatnonzero(ticks >= first[0])[::step] if len(first) else range(0, len(ticks), step):
-        running = [plan for plan in plans if plan.adopted <= ticks[row]]
-        shown = running[-1].path if running and ticks[row] <= first[-1] else None
-        frame = Frame(place[row], orientation[row], joints[row], goal, shown)
-        now = int(np.clip(np.searchsorted(first, ticks[row]), 0, len(first) - 1)) if len(first) else 0
-        if obstacles is not None:
-            frame = replace(frame, pillars=obstacles[now][:pillars], spheres=obstacles[now][pillars:])
-        if robots is not None:
-            frame = replace(frame, robots=robots[now])
-        frames.append(frame)
+    rows, captions = _rows(log), FilmCaptions(log)
+    frames, (width, height) = _frames(log, rows), size
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with av.open(str(path), "w") as container:
             stream = container.add_stream("libx264", rate=FPS, options={"preset": "ultrafast", "crf": "23"})
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-            for picture in render(robot, frames, width, height):
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            pictures = render(load_robot(log.header["settings"]["robot"]), frames, width, height)
+            for number, (row, picture) in enumerate(zip(rows, pictures, strict=True)):
+                progress(number, len(rows))
+                told = captions.write(picture, int(row))
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(told, format="rgb24")))
             container.mux(stream.encode(None))
     except RenderError as error:
         path.unlink(missing_ok=True)
         raise VideoError(str(error)) from error
     except OSError as error:
         raise VideoError(f"{path}: {error}") from error
+
+
+def _rows(log: FlightLog) -> Array:
+    """Rows of the states that are shown. Before the task the odometry frame is another one: it begins with the task."""
+    ticks, first = log.ticks("/state"), flightpath.task_ticks(log)
+    step = max(1, round(log.header["robot"]["rate"] / FPS))
+    return np.flatnonzero(ticks >= (first[0] if len(first) else 0))[::step]
+
+
+def _frames(log: FlightLog, rows: Array) -> list[Frame]:
+    from servoid.sim.marks import Frame
+
+    ticks, first, plans = log.ticks("/state"), flightpath.task_ticks(log), flightpath.plans(log)
+    place, orientation = log.column("/state", "displacement"), log.column("/state", "orientation")
+    joints, path, reach = log.column("/state", "position"), flightpath.path(log), flightpath.reach(log)
+    goal, goals = flightpath.goal(log), flightpath.goals(log)
+    obstacles, robots = flightpath.obstacles(log), flightpath.robots(log)
+    pushes, keyframes = flightpath.pushes(log), flightpath.keyframes(log)
+    rolling = len((log.header.get("scene") or {"spheres": ()})["spheres"])  # the last ones of the obstacles
+    pillars = 0 if obstacles is None else obstacles.shape[1] - rolling
+    shown, held = [], PUSHED * log.header["robot"]["rate"]
+    for row in rows:
+        tick = ticks[row]
+        now = int(np.clip(np.searchsorted(first, tick), 0, len(first) - 1)) if len(first) else 0
+        running = [plan.path for plan in plans if plan.adopted <= tick] if len(first) and tick <= first[-1] else []
+        pushed = [push for at, push in pushes.items() if at <= tick < at + held]
+        coming = [pose for pose in keyframes if pose.tick >= tick][:_GHOSTS]
+        shown.append(
+            Frame(
+                place[row],
+                orientation[row],
+                joints[row],
+                goal=goal if goals is None else goals[now],
+                plan=running[-1] if running else None,
+                pillars=None if obstacles is None else obstacles[now][:pillars],
+                spheres=None if obstacles is None else obstacles[now][pillars:],
+                robots=None if robots is None else robots[now],
+                reach=reach,
+                path=None if path is None else path + flightpath.drift(log, now),
+                push=pushed[-1] if pushed else None,
+                ghosts=tuple(Frame(pose.place, pose.orientation, pose.joints) for pose in coming),
+            )
+        )
+    return shown

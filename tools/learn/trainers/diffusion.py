@@ -157,18 +157,15 @@ class DiffusionTrainer(Trainer):
 
     @property
     def title(self) -> str:
-        """See `Trainer.title`."""
         size = f"{self.network.parameter_count:,} parameters, {self.config.tokens} tokens"
         actions = "latent actions" if self.windows.latents else "joint targets"
         return f"{size} on {len(self.windows.training):,} windows with {actions}"
 
     @property
     def following(self) -> str:
-        """See `Trainer.following`."""
         return f"servoid rollout walk --policy {self.best_path} --episodes 50"
 
     def learn(self) -> dict[str, float]:
-        """See `Trainer.learn`."""
         import torch
 
         from servoid.policy.diffusion.objective import losses
@@ -199,13 +196,11 @@ class DiffusionTrainer(Trainer):
         }
 
     def shown(self, means: Mapping[str, float], steps_per_s: float) -> tuple[dict[str, float], str]:
-        """See `Trainer.shown`."""
         speed = steps_per_s * self.settings.batch * self.config.tokens
         text = f"states {means['state_loss']:.3f}, actions {means['action_loss']:.3f}, {1000 / steps_per_s:.0f} ms/step"
         return {"tokens_per_s": speed}, f"{text}, {speed:,.0f} tokens/s"
 
     def held_out(self) -> dict[str, float]:
-        """See `Trainer.held_out`."""
         return {self.LOSS: self.validation_loss()}
 
     def validation_loss(self, count: int = 1024) -> float:
@@ -226,7 +221,6 @@ class DiffusionTrainer(Trainer):
             return losses(network, *given, measure)[1].item()
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
-        """See `Trainer.ship`."""
         from servoid.policy.diffusion.model.checkpoint import Trained, save
 
         windows = self.windows
@@ -234,7 +228,6 @@ class DiffusionTrainer(Trainer):
         save(path, trained, self.robot, Origin(self.source, self.settings.licence, results, plain(self.settings)))
 
     def state(self) -> dict[str, Any]:
-        """See `Trainer.state`."""
         return {
             "config": asdict(self.config),
             "network": self.network.state_dict(),
@@ -249,7 +242,6 @@ class DiffusionTrainer(Trainer):
         }
 
     def restore(self, path: Path, saved: Mapping[str, Any]) -> None:
-        """See `Trainer.restore`."""
         from servoid.policy.features import Normaliser
 
         latents = _arrays(saved["latents"])

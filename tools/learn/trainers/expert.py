@@ -66,16 +66,13 @@ class ExpertTrainer(PpoTrainer):
 
     @property
     def title(self) -> str:
-        """See `Trainer.title`."""
         return f"the tracker in {self.env.n} worlds"
 
     @property
     def following(self) -> str:
-        """See `Trainer.following`."""
         return f"servoid rollout walk --policy {self.best_path} --episodes 50"
 
     def resume(self) -> bool:
-        """See `Trainer.resume`."""
         if (old := self.out / "state.pt").exists() and not (self.out / "resume.pt").exists():
             raise ConfigError(
                 f"{old}: a run of an older program, which cannot be resumed: use --no-resume or another --out, "
@@ -84,7 +81,6 @@ class ExpertTrainer(PpoTrainer):
         return super().resume()
 
     def adopt(self, path: Path) -> None:
-        """See `Trainer.adopt`."""
         network, _ = Mlp.load(path, "tracker", self.env.robot, self.env.observations["actor"].shape[1])
         hidden = list(network.sizes[1:-1])
         if hidden != list(self.settings.hidden):
@@ -94,7 +90,6 @@ class ExpertTrainer(PpoTrainer):
         self.begin_with(network)
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
-        """See `Trainer.ship`."""
         config = {"hidden": list(self.settings.hidden), "rewards": self.settings.rewards}
         about: dict[str, Any] = {
             "data": _SOURCE,

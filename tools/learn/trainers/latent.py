@@ -105,13 +105,11 @@ class LatentTrainer(Trainer):
 
     @property
     def title(self) -> str:
-        """See `Trainer.title`."""
         count = sum(p.numel() for p in self.network.parameters())
         return f"latents of {self.settings.size}, {count:,} parameters, on {len(self.pairs.training):,} ticks"
 
     @property
     def following(self) -> str:
-        """See `Trainer.following`."""
         return f"servoid train diffusion --data {self.data} --out runs/latent-walks --latent {self.best_path}"
 
     @property
@@ -121,7 +119,6 @@ class LatentTrainer(Trainer):
         return float(first * (last / first) ** self.share)
 
     def learn(self) -> dict[str, float]:
-        """See `Trainer.learn`."""
         import torch
 
         for group in self.optimiser.param_groups:
@@ -138,12 +135,10 @@ class LatentTrainer(Trainer):
         return {name: getattr(terms, name).item() for name in LOSSES}
 
     def shown(self, means: Mapping[str, float], steps_per_s: float) -> tuple[dict[str, float], str]:
-        """See `Trainer.shown`."""
         text = f"reconstruction {means['reconstruction']:.4f}, KL {means['kl']:.2f} nats, beta {self.beta:.4f}"
         return {"beta": self.beta, "steps_per_s": steps_per_s}, f"{text}, {steps_per_s:.0f} steps/s"
 
     def held_out(self, count: int = 8192) -> dict[str, float]:
-        """See `Trainer.held_out`."""
         import numpy as np
         import torch
 
@@ -157,7 +152,6 @@ class LatentTrainer(Trainer):
         return dict(zip(MEASURED, (*losses, kl), strict=True))
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
-        """See `Trainer.ship`."""
         from servoid.policy.checkpoint import Origin
         from servoid.policy.latent.actions import save_latents
 
@@ -165,7 +159,6 @@ class LatentTrainer(Trainer):
         save_latents(path, self.network.to_numpy(), self.robot, origin)
 
     def state(self) -> dict[str, Any]:
-        """See `Trainer.state`."""
         return {
             "network": self.network.state_dict(),
             "optimiser": self.optimiser.state_dict(),
@@ -174,7 +167,6 @@ class LatentTrainer(Trainer):
         }
 
     def restore(self, path: Path, saved: Mapping[str, Any]) -> None:
-        """See `Trainer.restore`."""
         import torch
 
         ours = self.pairs.states.mean, self.pairs.actions.mean

@@ -141,13 +141,11 @@ class OdometryTrainer(Trainer):
 
     @property
     def title(self) -> str:
-        """See `Trainer.title`."""
         walks = f"{self.settings.worlds} robots, {self.settings.seconds:g} s of {', '.join(self.names)}"
         return f"odometry on the walks of {walks}"
 
     @property
     def following(self) -> str:
-        """See `Trainer.following`."""
         return (
             f"cp {self.best_path} {checkpoint.CHECKPOINTS / 'odometry.safetensors'}  # every run and training reads it"
         )
@@ -191,7 +189,6 @@ class OdometryTrainer(Trainer):
         return rows[world[..., None], index].flatten(2), errors[world, at], whole
 
     def learn(self) -> dict[str, float]:
-        """See `Trainer.learn`."""
         rate = self.settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * self.share))
         for group in self.optimiser.param_groups:
             group["lr"] = rate
@@ -205,7 +202,6 @@ class OdometryTrainer(Trainer):
         return {"loss": loss.item(), "learning_rate": rate}
 
     def shown(self, means: Mapping[str, float], steps_per_s: float) -> tuple[dict[str, float], str]:
-        """See `Trainer.shown`."""
         return {"steps_per_s": steps_per_s}, f"loss {means['loss']:.5f}, {steps_per_s:.0f} steps/s"
 
     def held_out(self) -> dict[str, float]:
@@ -231,7 +227,6 @@ class OdometryTrainer(Trainer):
         return Mlp(layers, self.mean.numpy(), self.std.numpy())
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
-        """See `Trainer.ship`."""
         s = self.settings
         head = checkpoint.header(
             "odometry",
@@ -245,7 +240,6 @@ class OdometryTrainer(Trainer):
         self.fitted().save(path, head)
 
     def state(self) -> dict[str, Any]:
-        """See `Trainer.state`."""
         import torch
 
         return {

@@ -96,7 +96,6 @@ class PpoTrainer(Trainer):
 
     @property
     def length(self) -> str:
-        """See `Trainer.length`."""
         return f"{self.settings.samples:,.0f} samples or {self.settings.minutes:g} minutes"
 
     @property
@@ -167,18 +166,15 @@ class PpoTrainer(Trainer):
         }
 
     def shown(self, means: Mapping[str, float], steps_per_s: float) -> tuple[dict[str, float], str]:
-        """See `Trainer.shown`."""
         text = (
             f"episodes {means['episode_ticks']:.0f} ticks, reward {means['reward']:.3f}, {steps_per_s:,.0f} samples/s"
         )
         return {"samples_per_s": steps_per_s}, text
 
     def state(self) -> dict[str, Any]:
-        """See `Trainer.state`."""
         return {"ppo": self.ppo.save()}
 
     def restore(self, path: Path, saved: Mapping[str, Any]) -> None:
-        """See `Trainer.restore`."""
         try:
             self.ppo.load(saved["ppo"], None, True)
         except RuntimeError:  # torch's word for weights of other shapes
