@@ -96,8 +96,8 @@ class ClipReference(Reference):
         return np.where(self._loop[self.clip], self.time % last, np.minimum(self.time, last)) / last
 
     def advance(self) -> None:
-        self.time = self.time + self.rate
-        self._since = self._since + 1.0
+        self.time = np.asarray(self.time + self.rate)  # of one robot a sum is a number, and could not be set again
+        self._since = np.asarray(self._since + 1.0)
 
     def _index(self, time: Array) -> tuple[Array, Array]:
         """Frame before each time of a clip and how far on the next one is, of the present clips."""

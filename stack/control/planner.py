@@ -13,6 +13,7 @@ import signal
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext
 from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
 from typing import Protocol
@@ -74,8 +75,11 @@ class ProcessPlanner:
     that finds it busy, with a request from before it or from the last episode, waits here.
     """
 
-    def __init__(self, build: Callable[[], Answer], start_timeout: float = 120.0) -> None:
-        """Start the process and wait until it has called `build`, which must be picklable, there.
+    def __init__(
+        self, build: Callable[[], Answer], start_timeout: float = 120.0, context: SpawnContext | None = None
+    ) -> None:
+        """Start the process, in a `context` of its own where none is given, and wait until it has called `build`, which
+        must be picklable, there.
 
         Raises PlannerError with the reason when that fails or takes longer than `start_timeout` [s].
         """
@@ -83,7 +87,7 @@ class ProcessPlanner:
         self._busy = False
         self._waiting: tuple[int, PlanRequest] | None = None
         self._ready: tuple[int, Plan] | None = None
-        context = multiprocessing.get_context("spawn")
+        context = context or multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, build), name="planner", daemon=True)
         with held_back(signal.SIGINT, signal.SIGTERM):  # to the whole group: the loop still plans while it ends the run

@@ -29,6 +29,7 @@ class Attitude:
         self.quaternion = np.zeros((*shape, 4))
         self.bias = np.zeros((*shape, 3))
         self.yaw = np.zeros(shape)
+        self.learns = True  # whether it may be standing, and so learn the gyro's bias
         self._still = np.zeros(shape)
         self._seen = np.zeros(shape)
         self.reset(np.ones(shape, bool), np.zeros((*shape, 3)))
@@ -48,6 +49,14 @@ class Attitude:
         self._still = np.where(where, 0.0, self._still)
         # A bias that was given counts as a full memory.
         self._seen = np.where(where, 0.0 if bias is None else _BIAS_MEMORY, self._seen)
+
+    def level(self, specific_force: Array, yaw: Array) -> None:
+        """Take up anew from the accelerometer, facing `yaw` `(...,)` rad give or take whole turns; keep the bias."""
+        facing, bias, seen = yaw_of(self.quaternion), self.bias, self._seen
+        self.reset(np.ones(self._shape, bool), specific_force, bias)
+        self._seen = seen
+        self.quaternion = headed(self.quaternion, facing)
+        self.yaw = yaw + (facing - yaw + np.pi) % (2 * np.pi) - np.pi
 
     def update(
         self,
@@ -81,7 +90,7 @@ class Attitude:
         """Average the gyro while the robot stands. A soft robot creeps for seconds: what its legs say is no bias."""
         quiet = (np.abs(joint_velocity) < _STILL_JOINTS).all(-1)
         judged = np.where((self._seen < _FIRST)[..., None], gyro, rate)  # a few ticks' mean is no bias to judge by
-        quiet &= (np.linalg.norm(judged, axis=-1) < _STILL_RATE) & np.isfinite(gyro).all(-1)
+        quiet &= (np.linalg.norm(judged, axis=-1) < _STILL_RATE) & np.isfinite(gyro).all(-1) & self.learns
         self._still = np.where(quiet, self._still + dt, 0.0)
         learn = self._still > _STILL_TIME
         self._seen = np.where(learn, np.minimum(self._seen + dt, _BIAS_MEMORY), self._seen)

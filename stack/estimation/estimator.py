@@ -42,6 +42,8 @@ class Estimator:
         self._bias: Array | None = None
         self._soles: Array | None = None  # their orientations in the base frame at the tick before
         self._seen = np.zeros(shape, bool)  # worlds where they are of this episode
+        self._fallen_yaw: Array | None = None  # rad, of a robot that lies: its heading as it fell
+        self._force = np.zeros((*shape, 3))  # m/s2, the last specific force that was read
 
     def reset(self, where: Array | None = None, bias: Array | None = None) -> None:
         """Forget everything in the worlds `where` (default: all); the next observation starts anew.
@@ -58,6 +60,21 @@ class Estimator:
         """Make here and the present heading the origin of the odometry frame."""
         self._displacement = np.zeros((*self.shape, 3))
         self._heading0 = self._attitude.yaw.copy()
+
+    def fall(self) -> None:
+        """From now on the robot lies, or rolls on the ground: its legs say nothing of how it moves, and it is taken to
+        stay where it fell. Orientation goes on, on the bias that the gyro is known to have."""
+        self._fallen_yaw = self._attitude.yaw.copy()
+        self._attitude.learns = False
+
+    def stand(self) -> None:
+        """It stands again, still: gravity is what the accelerometer says now, and odometry goes on from where the robot
+        fell, with the heading that the gyro kept."""
+        if self._fallen_yaw is not None:
+            self._attitude.level(self._force, self._fallen_yaw)
+        self._fallen_yaw, self._attitude.learns = None, True
+        self.features.reset(np.ones(self.shape, bool))
+        self._seen = np.zeros(self.shape, bool)
 
     def update(self, observation: Observation, applied: Array, ticks: int = 1) -> State:
         """Estimate from one observation. `applied` `(..., n_joints)` rad is what was commanded last.
@@ -97,16 +114,18 @@ class Estimator:
         to_heading = _heading_frame(up)
         foot_velocity = np.einsum("...ij,...lj->...li", to_heading, foot_velocity)
         self.leg_velocity = np.einsum("...l,...li->...i", contact, foot_velocity)
-        force = np.where(np.isfinite(observation.specific_force), observation.specific_force, 0.0)
+        force = self._force = np.where(np.isfinite(observation.specific_force), observation.specific_force, 0.0)
         for _ in range(ticks):  # the network sees so many ticks back
             self.features.push(up, rate, force, q, dq, applied, foot_velocity, contact)
         velocity = self.leg_velocity
         if self._odometry is not None:
             velocity = velocity + self._odometry(self.features.window())
+        if self._fallen_yaw is not None:
+            velocity = np.zeros_like(velocity)
 
         yaw = self._attitude.yaw - self._heading0
         self._displacement[..., :2] += turned(velocity[..., :2], yaw) * dt
-        self._displacement[..., 2] = -ground[..., 0]
+        self._displacement[..., 2] = -ground[..., 0]  # of one that lies, its height if it stood
         return State(
             time_ns=observation.time_ns,
             orientation=headed(self._attitude.quaternion, -self._heading0),
@@ -141,6 +160,7 @@ class Estimator:
         self._heading0 = np.where(where, 0.0, self._heading0)
         self.features.reset(where)
         self._seen = self._seen & ~where
+        self._fallen_yaw, self._attitude.learns = None, True
         self._pending = np.zeros(self.shape, bool)
 
 

@@ -75,7 +75,7 @@ class Tally:
         success = bool(phases.ended is not None and assignment.success(trace))
         late = np.array(self._late or [0], dtype=float) * 1e-6
         return Result(
-            outcome=_outcome(phases, guard, success, trace),
+            outcome=_outcome(phases, guard, success),
             success=success,
             seconds=phases.task_ticks * trace.dt,
             ticks=phases.task_ticks,
@@ -92,9 +92,9 @@ class Tally:
         )
 
 
-def _outcome(phases: Phases, guard: Guard, success: bool, trace: Trace) -> str:
+def _outcome(phases: Phases, guard: Guard, success: bool) -> str:
     if phases.ended is not None:
         return "succeeded" if success else "timed_out" if phases.ended == "time" else "failed"
-    if trace.fallen:
+    if guard.cause == "fall":
         return "fell"
     return "interrupted" if guard.cause == "interrupt" else "stopped"

@@ -17,6 +17,7 @@ from servoid.hw.contracts.world import Scene
 from servoid.hw.dynamixel.calibration import calibrated
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.hw.seeds import Stream, generator
+from servoid.stack.control.get_up import GetUp, fingerprints, get_up
 from servoid.stack.control.policies import make_policy, policy_fingerprint
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import load_odometry
@@ -28,12 +29,13 @@ from servoid.stack.runtime.clock import RealTime, Schedule, WallClock
 from servoid.stack.runtime.interrupt import Interrupt, Stops
 from servoid.stack.runtime.loop import ControlledRobot, Loop
 from servoid.stack.runtime.multi_robot import Teammates
-from servoid.stack.runtime.phases import Phases
+from servoid.stack.runtime.phases import Phases, Recovering
 from servoid.stack.runtime.realtime import undisturbed
 from servoid.stack.runtime.result import Result, Tally
 from servoid.stack.runtime.settings import RunSettings, Script
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Guard
+from servoid.stack.safety.recovery import TRIES
 from servoid.stack.tasks import load_task, source
 from servoid.stack.tasks.steer import SteeredAgain
 
@@ -102,6 +104,8 @@ class Run:
     ) -> None:
         self.settings, self._backend, self._on_tick, self._policy = settings, backend, on_tick, policy
         self._confirm, self._script = confirm, script or Script()
+        self._get_up: GetUp | None = None
+        self._begun = 0  # times that the policy has begun
         self._interrupt = Interrupt(eager=True)
         self._open = ExitStack()
         self._tally = Tally()
@@ -126,6 +130,8 @@ class Run:
             raise ConfigError(
                 "nothing moves by itself on a real robot: give start=True (--start), or confirm at the prompt"
             )
+        if settings.recover:
+            self._get_up = get_up(self.robot)
         self._odometry = load_odometry(self.robot)
         if settings.record is not None:
             check_new(settings.record)
@@ -147,6 +153,8 @@ class Run:
         if scene is not None and scene.robots is not None and self._policy is not None:
             robots = len(scene.robots) + 1
             raise ConfigError(f"task '{name}' has {robots} robots, each with its own policy: name one instead")
+        if scene is not None and scene.robots is not None and self.settings.recover:
+            raise ConfigError(f"task '{name}' has several robots, and a fall of one ends it: drop --recover")
         if episode.pushes and simulation is None:
             raise ConfigError(f"backend '{self.body.name}' cannot push the robot: drop the task's push setting")
 
@@ -164,22 +172,26 @@ class Run:
         )
         self._open.callback(self.policy.close)
         self._interrupt.check()
-        if self._script.plans is not None:
-            self.policy.repeat(self._script.plans)
         self._open.callback(body.close)
         self._open.callback(setattr, self._interrupt, "eager", False)  # a second Ctrl-C must not break off the closing
-        self.policy.reset(None, np.array(settings.seed))
+        self._begin_policy()
         sensors, motors = body.connect()
         self._interrupt.check()
         if body.simulation is None and not settings.start and self._confirm is not None:
             known = f"{self._assembly}. " if self._assembly is not None else ""
-            self._confirm(f"{known}{robot.name} will go to its home pose and then: {task.name}")
+            again = (
+                "" if self._get_up is None else f"; if it falls, it gets up by itself, {TRIES} tries: keep away from it"
+            )
+            self._confirm(f"{known}{robot.name} will go to its home pose and then: {task.name}{again}")
         self._interrupt.settle()  # from here on a Ctrl-C is a request, until the motors are off
-        self.guard = Guard(robot, motors, settings.gain)
+        self.guard = Guard(robot, motors, settings.gain, recover=settings.recover)
         if self._assembly is not None:
             self.guard.note("system", self._assembly)
         self._controlled = ControlledRobot(robot, sensors, Estimator(robot, self._odometry), self.guard)
-        self.phases = Phases(self._controlled, self.assignment, self.behaviour, self.policy, body.simulation)
+        recovering = None if self._get_up is None else Recovering(self._get_up, self._begin_policy)
+        self.phases = Phases(
+            self._controlled, self.assignment, self.behaviour, self.policy, body.simulation, recovering
+        )
 
     def loop(self) -> None:
         """Do the ticks of the run, until torque is off. Raises BackendError where the body cannot be reached."""
@@ -229,6 +241,14 @@ class Run:
             result = _with_failure(result, self._recorder.error)
         return result
 
+    def _begin_policy(self) -> None:
+        """Let the policy begin, at first or anew; it adopts the plans that a recorded run adopted since then."""
+        plans = self._script.plans
+        if plans is not None:
+            self.policy.repeat(plans[self._begun] if self._begun < len(plans) else {})
+        self._begun += 1
+        self.policy.reset(None, np.array(self.settings.seed))
+
     def _behaviour(self) -> Behaviour:
         assignment, steered = self.assignment, self._script.velocities
         if assignment.task.steered and steered is not None:
@@ -242,6 +262,7 @@ class Run:
             policy_fingerprint(settings.policy, self.robot.gait) if own is None else {"name": type(own).__qualname__}
         )
         facts = header(settings, self.robot, self.assignment, source(settings.task), self.body.name, policy)
+        facts["recovery"] = None if self._get_up is None else fingerprints(self.robot)
         wait = self.body.simulation is not None and not self.realtime
         self._recorder = Recorder.create(settings.record, facts, wait=wait)
         return self._recorder

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,6 +34,7 @@ class RunSettings:
     record: Path | None = None  # flight log to write
     realtime: bool | None = None  # in step with the wall; None: only where there is hardware
     port: str | None = None
+    recover: bool = False  # get up again after a fall, and go on
 
     def __post_init__(self) -> None:
         if not 0.0 < self.gain <= MAX_GAIN:
@@ -49,7 +50,9 @@ class Script:
     """What came to a recorded run from outside, for a run that repeats it."""
 
     stops: tuple[Event, ...] = ()  # what ended it: Ctrl-C, a full disk
-    plans: Mapping[int, int] | None = None  # ticks of plan requests, and when their plans were adopted
+    # Ticks of plan requests, and when their plans were adopted, of each time that the policy began: it does so again
+    # when the robot has got up. None: whatever comes in time.
+    plans: Sequence[Mapping[int, int]] | None = None
     velocities: Array | None = None  # (ticks, 3) that a person steered by,
     ended: bool = False  # and whether the person ended the run
     planner: DiffusionSettings | None = None  # what it planned with: the policy's file may have moved or changed

@@ -11,7 +11,7 @@ class Event:
 
     Kinds: `phase` (the guard changed its state), `rejected` (a non-finite target), `fall`, `stale`, `button` (the stop
     button), `servo` (a hardware error), `temperature`, `voltage`, `overload` (a blocked joint), `derated` (gains went
-    down), `homing`, `policy`, `plan`, `record`, `interrupt`, `task`, `system`.
+    down), `homing`, `recovery` (a try to get up), `policy`, `plan`, `record`, `interrupt`, `task`, `system`.
     """
 
     tick: int

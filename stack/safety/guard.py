@@ -8,16 +8,21 @@ tests/stack/test_safety*.py:
 2. From one accepted goal to the next a joint moves at most `joint_speed * dt` for each elapsed tick, and for no more
    ticks than `stale`: a servo holds its goal meanwhile, so a long gap does not earn a leap. While homing the limit is
    `homing_speed`, for one tick however many were missed.
-3. Nothing is sent before `home`; nothing that a policy proposes is sent before `start`.
+3. Nothing is sent before `home`; nothing that a policy proposes is sent before `start`, or while the robot falls or
+   lies.
 4. A target that is not finite is never sent: the last goal holds, and after PATIENCE in a row the robot is damped.
 5. DAMPED and FAULT are final: DAMP, then OFF, and never ACTIVE again.
 6. Samples older than `stale` ticks, or that never came, end in FAULT; so do a servo's error and, once the robot was
-   brought home, tilt beyond `tilt`.
+   brought home, tilt beyond `tilt`, where it was not asked to recover.
 7. A stop that leaves time for it (Ctrl-C, the stop button, heat, a low supply, a blocked joint, a full disk, the end of
    a task) lets a walking robot come to rest, for REST_SECONDS at most, and lowers it then: lowered in mid step it often
    falls. With a joint that is blocked it takes no more steps. One that was not brought home, but holds the pose that it
    was found in, is not lowered: it hangs or lies.
 8. Gains only go down within a run: below what was asked for where servos get hot, the supply low or a joint blocked.
+   While a robot that is to recover falls and lies, they are zero, but for its arms as they come in.
+9. A fall is survived only where `recover` was asked for, and only from RUNNING. The robot is moved again when it has
+   lain still, with the limits of 1 and 2, in at most so many tries and so much time (recovery.py); what ends a run ends
+   it then too, damped at once. It runs on when it has stood still, on flat soles, at the home pose.
 
 Homing is the guard's own: from the pose that the robot is in, slowly, to the home pose.
 """
@@ -36,10 +41,11 @@ from servoid.hw.faults import STOP_BUTTON
 from servoid.hw.robot.description import Robot
 from servoid.stack.estimation.sample_hold import missing
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.health import BLOCKED, Health
+from servoid.stack.safety.health import BLOCKED, WALKING, Health
 from servoid.stack.safety.limits import limit
 from servoid.stack.safety.lowering import lowered_pose
 from servoid.stack.safety.min_jerk import MIN_JERK_PEAK, MinJerk
+from servoid.stack.safety.recovery import LOAD, TRIES, Recovery
 
 ASKED = {"interrupt", "button"}  # kinds of what a person does to stop the robot
 PATIENCE = 3  # targets in a row that may be not finite
@@ -60,26 +66,32 @@ class Phase(StrEnum):
     HOMING = "homing"  # going to the home pose
     READY = "ready"  # holding it
     RUNNING = "running"  # following targets
-    STOPPING = "stopping"  # the same, of a policy that is asked to stand
+    FALLEN = "fallen"  # falling, or lying: braked, until it is still
+    RECOVERING = "recovering"  # following targets to get up
+    STOPPING = "stopping"  # as running, of a policy that is asked to stand
     LOWERING = "lowering"  # going to a crouch, to end
     DAMPED = "damped"  # braking, then torque off
     FAULT = "fault"  # the same, for a reason that a person must look at
 
 
-POWERED = {Phase.HOMING, Phase.READY, Phase.RUNNING, Phase.STOPPING, Phase.LOWERING}
+DOWN = {Phase.FALLEN, Phase.RECOVERING}
+POWERED = {Phase.HOMING, Phase.READY, Phase.RUNNING, *DOWN, Phase.STOPPING, Phase.LOWERING}
 FOLLOWING = {Phase.RUNNING, Phase.STOPPING}
 ENDED = {Phase.DAMPED, Phase.FAULT}
 
 
 class Guard:
-    """Decides and sends every command. `gain` scales the servos' position gain, 1 being as configured."""
+    """Decides and sends every command. `gain` scales the servos' position gain, 1 being as configured; `recover`: a
+    fall while running does not end the run."""
 
-    def __init__(self, robot: Robot, motors: Motors, gain: float = 1.0) -> None:
+    def __init__(self, robot: Robot, motors: Motors, gain: float = 1.0, *, recover: bool = False) -> None:
         self.robot = robot
         self.phase = Phase.LIMP
         self.applied: Array = robot.home.copy()  # (n_joints,) rad: the last accepted goal
         self.off = False  # torque off has been sent
         self.cause: str | None = None  # kind of the event that ended the run, the first if there were several
+        self.recovery = Recovery(robot) if recover else None
+        self.down = False  # it fell while it ran, and has not got up
         self.lowest = lowered_pose(robot)
         self._motors = motors
         self._gain = np.full(len(robot.names), gain)
@@ -120,6 +132,23 @@ class Guard:
         self._expect(Phase.READY)
         self._enter(Phase.RUNNING, "running")
 
+    def lie_down(self, text: str) -> None:
+        """A try to get up has failed: lie still again, for the next one. Raises RuntimeError unless RECOVERING."""
+        self._expect(Phase.RECOVERING)
+        assert self.recovery is not None
+        self.note("recovery", text)
+        self.recovery.lie(self._tick)
+        self._enter(Phase.FALLEN, "lying down")
+
+    def go_on(self) -> None:
+        """Follow the policy again. Raises RuntimeError unless RECOVERING, and standing at home."""
+        self._expect(Phase.RECOVERING)
+        if self.recovery is None or not self.recovery.home:
+            raise RuntimeError("the robot does not stand at home yet")
+        self.down = False
+        self.note("recovery", f"it stands again after {self.recovery.tries} of {TRIES} tries")
+        self._enter(Phase.RUNNING, "running again")
+
     def stop(self, kind: str, text: str, joint: str | None = None) -> None:
         """End in order: brought to rest and lowered if it stands, damped, off. Does nothing when it is ending."""
         if self.phase is Phase.STOPPING and kind != BLOCKED:
@@ -137,7 +166,7 @@ class Guard:
             self._enter(Phase.STOPPING, "coming to rest")
         elif self.phase in {Phase.READY, *FOLLOWING} and self._stands:
             self._lower()
-        else:  # limp, held or on the way home: the robot may hang or lie, and a crouch would be one more motion
+        else:  # limp, held, fallen or on the way home: it may hang or lie, and a crouch would be one more motion
             self._enter(Phase.DAMPED, "damped")
 
     def give_up(self, text: str, joint: str | None = None) -> None:
@@ -187,18 +216,19 @@ class Guard:
 
         `observation` holds the newest sample of each joint and its age; `state` is read for the tilt alone, and is None
         while there is not a sample of everything yet; `target` `(n_joints,)` rad is what a policy proposes and is
-        looked at only in RUNNING and STOPPING, where None means that it proposes nothing and the goal holds.
+        looked at only in RUNNING, RECOVERING and STOPPING, where None means that it proposes nothing and the goal
+        holds.
         """
         if self.phase in POWERED:
             self._check(observation, state)
+        if self.phase in DOWN:
+            self._watch_recovery(observation, state)
         if self.phase is Phase.STOPPING and self._rests():
             self._lower()
-        if self.phase in FOLLOWING and target is not None:
+        if self.phase in {Phase.RECOVERING, *FOLLOWING} and target is not None:
             self._accept(target)
-        elif self.phase in {Phase.READY, *FOLLOWING}:
-            self._accepted = (
-                self._tick
-            )  # a goal that is held is accepted anew, so that time spent holding earns no leap
+        elif self.phase in {Phase.READY, Phase.RECOVERING, *FOLLOWING}:
+            self._accepted = self._tick  # a goal that is held is accepted anew: time spent holding earns no leap
         elif self.phase is Phase.HOMING:
             self._home_on(observation)
         elif self.phase is Phase.LOWERING:
@@ -288,6 +318,29 @@ class Guard:
         goals = [goal for _, goal in self._goals]
         return self._tick - self._goals[0][0] >= window and float(np.ptp(goals, axis=0).max()) < REST_RANGE
 
+    def _fall(self, text: str) -> None:
+        """Falling while it ran, of a robot that is to get up again."""
+        assert self.recovery is not None
+        self.down = True
+        self.note("fall", text)
+        self.recovery.fall(self._tick)
+        self._enter(Phase.FALLEN, "falling: gains down, arms in")
+
+    def _watch_recovery(self, observation: Observation, state: State | None) -> None:
+        """What becomes of a robot that is down: it is left lying, begins to get up, or goes limp with its joints."""
+        recovery = self.recovery
+        assert recovery is not None
+        recovery.watch(observation, state, self._tick)
+        lying = self.phase is Phase.FALLEN
+        if (why := recovery.hopeless(lying)) is not None:
+            self.fault("fall", why)
+        elif lying and recovery.lies:
+            recovery.rise()
+            self._enter(Phase.RECOVERING, f"getting up, try {recovery.tries} of {TRIES}")
+        elif lying:
+            self.applied = limit(recovery.goal(observation.position), self.applied, self.robot, self._elapsed())
+            self._accepted = self._tick
+
     def _lower(self) -> None:
         self._motion = MinJerk(self.applied, self.lowest, round(LOWER_SECONDS * self.robot.rate))
         self._enter(Phase.LOWERING, "lowering")
@@ -302,10 +355,13 @@ class Guard:
 
     def _check(self, observation: Observation, state: State | None) -> None:
         """Act on what is wrong. On the way home, or held as it was found, the robot may hang from a hand, tilted."""
-        upright = self._stands and self.phase is not Phase.HOMING
-        found = self._health.examine(observation, state, self.applied, upright=upright)
+        upright = self._stands and self.phase not in {Phase.HOMING, *DOWN}
+        load = None if self.phase is Phase.FALLEN else LOAD if self.phase is Phase.RECOVERING else WALKING
+        found = self._health.examine(observation, state, self.applied, upright=upright, load=load)
         for ends, kind, text, joint in found:
-            if ends == "now" and self.phase not in ENDED:
+            if kind == "fall" and self.recovery is not None and self.phase is Phase.RUNNING:
+                self._fall(text)
+            elif ends == "now" and self.phase not in ENDED:
                 self.fault(kind, text, joint)
             elif ends == "lowered":
                 self.stop(kind, text, joint)
@@ -316,7 +372,10 @@ class Guard:
         return min(max(1, self._tick - self._accepted), self.robot.limits.stale)
 
     def _make(self, mode: Mode) -> Command:
-        return Command(position=self.applied, gain=self._gain * self._health.factor, mode=mode)
+        gain = self._gain * self._health.factor
+        if self.phase is Phase.FALLEN and self.recovery is not None:
+            gain = gain * self.recovery.gain
+        return Command(position=self.applied, gain=gain, mode=mode)
 
     def _enter(self, phase: Phase, text: str) -> None:
         if self.phase is Phase.LIMP and phase in ENDED:

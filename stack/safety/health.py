@@ -37,6 +37,17 @@ class Finding(NamedTuple):
     joint: str | None = None
 
 
+class Load(NamedTuple):
+    """For how long [s] a joint may push with all it has without moving: until its gain goes down, and until it counts
+    as blocked."""
+
+    soft: float = SOFT_SECONDS
+    blocked: float = BLOCKED_SECONDS
+
+
+WALKING = Load()
+
+
 class Health:
     """Examines observations, tick after tick. `factor` `(n_joints,)` is what gains are to be multiplied by."""
 
@@ -53,18 +64,29 @@ class Health:
         self._supply: deque[float] = deque(maxlen=LOW_TICKS)  # V, the median of the servos' at the last ticks
         self._low = False  # whether the supply was ever too low
 
-    def examine(self, observation: Observation, state: State | None, applied: Array, *, upright: bool) -> list[Finding]:
+    def examine(
+        self,
+        observation: Observation,
+        state: State | None,
+        applied: Array,
+        *,
+        upright: bool,
+        load: Load | None = WALKING,
+    ) -> list[Finding]:
         """Everything wrong at this tick, the worst first.
 
         `observation` is the newest sample of each joint, `applied` `(n_joints,)` rad the last accepted goal. `upright`:
-        whether the robot is expected to be.
+        whether the robot is expected to be. `load` None: joints follow no goal, and none can be blocked.
         """
         found = [*self._samples(observation, state), *self._servos(observation)]
         if state is not None and upright and (tilt := tilt_of(observation, state)) > self._limits.tilt:
             found.append(Finding("now", "fall", f"tilted by {math.degrees(tilt):.0f} degrees"))
         found += [*self._bus(observation), *self._buttons(observation)]
         found += [*self._heat(observation), *self._voltage(observation)]
-        found += self._load(observation, applied)
+        if load is None:
+            self._blocked[:] = 0.0
+        else:
+            found += self._load(observation, applied, load)
         return sorted(found, key=lambda finding: ("now", "lowered", "").index(finding.ends))
 
     def _samples(self, observation: Observation, state: State | None) -> list[Finding]:
@@ -154,21 +176,21 @@ class Health:
                 found.append(Finding("", "derated", text, name))
         return found
 
-    def _load(self, observation: Observation, applied: Array) -> list[Finding]:
+    def _load(self, observation: Observation, applied: Array, load: Load) -> list[Finding]:
         """Joints that push with all they have and do not move."""
         error = np.abs(applied - observation.position)
         full = self._full / self._weak  # a weakened servo sags further before it gives all it has
         blocked = (error >= FULL * full) & (np.abs(observation.velocity) < self._still)
         self._blocked = np.where(blocked, self._blocked + self._robot.dt, 0.0)
-        soft = self._blocked > SOFT_SECONDS
-        if not soft.any():
+        if not (self._blocked > min(load)).any():
             return []
+        soft = self._blocked > load.soft
         found = []
         share = np.where(soft, DERATED * self._full / np.maximum(error, 1e-6), 1.0)
         for i in self._derate(share):
             text = f"{self._names[i]} pushes and does not move: its gain goes down to {self.factor[i]:.2f}"
             found.append(Finding("", "derated", text, self._names[i]))
-        for i in np.flatnonzero(self._blocked > BLOCKED_SECONDS).tolist():
+        for i in np.flatnonzero(self._blocked > load.blocked).tolist():
             text = f"{self._names[i]} pushes with all it has and does not move: is it blocked?"
             found.append(Finding("lowered", BLOCKED, text, self._names[i]))
         return found

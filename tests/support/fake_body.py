@@ -107,6 +107,10 @@ class StillEstimator:
     def reset_odometry(self) -> None:
         self.resets += 1
 
+    def fall(self) -> None: ...
+
+    def stand(self) -> None: ...
+
     def update(self, observation: Observation, applied: Array, ticks: int = 1) -> State:
         self.ticks.append(ticks)
         return State(

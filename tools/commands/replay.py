@@ -8,6 +8,7 @@ Exit code 0: identical; 1: it differs, and the first difference is named.
 from __future__ import annotations
 
 import argparse
+from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -24,6 +25,7 @@ from servoid.stack.runtime.run import RunSettings, Script, run
 from servoid.stack.safety.event import Event
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import add_json_argument, reporting
+from servoid.tools.common.pictures.flightpath import got_up
 
 if TYPE_CHECKING:
     from servoid.policy.diffusion.settings import DiffusionSettings
@@ -86,7 +88,7 @@ def replay(log: FlightLog, done: Callable[[], object] = lambda: None) -> tuple[i
     if log.header["policy"]["name"] != log.header["settings"]["policy"]:
         raise ConfigError(f"{log.path}: recorded with a program's own policy: only that program can repeat it")
     stops = [Event(**event) for event in log.messages["/event"] if event["kind"] in ("interrupt", "record")]
-    plans = {int(message["requested"]): int(message["adopted"]) for message in log.messages["/plan"]}
+    plans = _plans(log)
     recorded = _by_tick(log)
     repeated: dict[int, Tick] = defaultdict(lambda: defaultdict(list))
 
@@ -109,10 +111,20 @@ def replay(log: FlightLog, done: Callable[[], object] = lambda: None) -> tuple[i
     return len(recorded), None
 
 
+def _plans(log: FlightLog) -> list[dict[int, int]]:
+    """Requests and adoptions of plans, of each time that the policy began: at first, and when the robot had got up."""
+    again = got_up(log)
+    plans: list[dict[int, int]] = [{} for _ in range(len(again) + 1)]
+    for message in log.messages["/plan"]:
+        plans[bisect_right(again, message["tick"])][int(message["requested"])] = int(message["adopted"])
+    return plans
+
+
 def changes(log: FlightLog) -> list[str]:
     """What is not as it was when the log was written: robot, policy, task, packages, source; as far as the log says."""
     from servoid.hw.robot.description import load_robot
     from servoid.policy.checkpoint import git_commit, resolve
+    from servoid.stack.control.get_up import fingerprints
     from servoid.stack.control.policies import policy_fingerprint
     from servoid.stack.log.provenance import fingerprint, sha256, versions
 
@@ -129,6 +141,7 @@ def changes(log: FlightLog) -> list[str]:
         policy["checkpoint_sha256"] = sha256(resolve(planner.checkpoint))
     policy["name"] = log.header["settings"]["policy"]  # as it was typed
     now = fingerprint(robot) | _part("policy", policy)
+    now["recovery"] = fingerprints(robot) if settings.recover else None
     now |= _task(settings) | {"versions": versions(), "git_commit": git_commit()}
     names = {
         "robot": "the robot's file",
@@ -142,6 +155,7 @@ def changes(log: FlightLog) -> list[str]:
         "task": "the task's settings",
         "task_files": "a file that the task's settings name",
         "task_source": "the task's file",
+        "recovery": "a clip that it gets up by",
         "policy.source": "the policy's file",
         "versions": "installed packages",
         "git_commit": "the source",

@@ -28,6 +28,7 @@ from servoid.tools.common.folder_lock import locked
 from servoid.tools.common.output import Report, add_json_argument, reporting
 from servoid.tools.common.parser import (
     add_gain_argument,
+    add_recover_argument,
     add_set_argument,
     check_seed,
     out_of_reach,
@@ -64,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: %(default)s)")
     add_set_argument(parser)
     add_gain_argument(parser)
+    add_recover_argument(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="keep every episode there, and go on where it was")
     parser.add_argument("--fresh", action="store_true", help="with --out: do all episodes anew")
     add_json_argument(parser)
@@ -147,6 +149,7 @@ def _prepare(args: argparse.Namespace, name: str) -> _Policy:
         seed=args.seed,
         gain=args.gain,
         set=settings(args),
+        recover=args.recover,
     )
     if args.out is None:
         return _Policy(chosen, {}, None, ())

@@ -18,6 +18,7 @@ from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Progress, Report, add_json_argument, reporting
 from servoid.tools.common.parser import (
     add_gain_argument,
+    add_recover_argument,
     add_set_argument,
     check_seed,
     out_of_reach,
@@ -54,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything that is random (default: 0)")
     add_set_argument(parser)
     add_gain_argument(parser)
+    add_recover_argument(parser)
     parser.add_argument("--start", action="store_true", help="move a real robot without asking")
     parser.add_argument("--record", type=Path, metavar="FILE", help="flight log (default: runs/DATE-TASK.mcap)")
     parser.add_argument("--video", type=Path, metavar="FILE", help="film the run afterwards: MP4, and its path as PNG")
@@ -90,6 +92,7 @@ def main(args: argparse.Namespace) -> int:
             record=args.record or _default_log(find(args.task).name),
             realtime=(watched and not args.fast) if backend_kind(args.backend).simulated else None,
             port=args.port,
+            recover=args.recover,
         )
         for text in out_of_reach(args):
             report.line(text)

@@ -10,6 +10,7 @@ from servoid.tools.common.confidence import bootstrap, wilson
 
 Row = Mapping[str, Any]  # of an episode
 SHARES = ("success_rate", "fall_rate", "aborted_rate", "fell_ending_rate")
+RECOVERIES = ("falls", "recovered_share", "time_to_stand_s")
 _KEYS = dict(zip(SHARES, ("success", "fell", "aborted", "fell_ending"), strict=True))  # of an episode's row
 
 
@@ -37,10 +38,24 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "episodes": n,
         **{name: means[name] for name in SHARES},
         "success_ci95": wilson(successes, n),
+        **(recoveries(rows) if all("falls" in row for row in rows) else {}),
         "mean_seconds": means["mean_seconds"],
         "metrics": metrics,
         "sd": {name: spread.get(name) for name in ("mean_seconds", *metrics)},
         "failed_seeds": [row["seed"] for row in rows if not row["success"]],
+    }
+
+
+def recoveries(rows: Sequence[Row]) -> dict[str, Any]:
+    """Of robots that may get up: falls of all episodes, the share of them that they got up from, and the median time
+    from lying still to standing."""
+    import numpy as np
+
+    falls, seconds = sum(row["falls"] for row in rows), [s for row in rows for s in row["stand_seconds"]]
+    return {
+        "falls": falls,
+        "recovered_share": len(seconds) / falls if falls else None,
+        "time_to_stand_s": float(np.median(seconds)) if seconds else None,
     }
 
 
@@ -62,6 +77,10 @@ def table(summaries: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[l
     """Head and rows for a person: a line a figure, a column a policy."""
     names = list(dict.fromkeys(name for one in summaries.values() for name in one["metrics"]))
     rows = [["episodes", *(str(one["episodes"]) for one in summaries.values())]]
+    for name in RECOVERIES:
+        if all(name in one for one in summaries.values()):
+            shown = ["-" if one[name] is None else f"{one[name]:.4g}" for one in summaries.values()]
+            rows.append([name, *shown])
     for name in (*SHARES, "mean_seconds", *names):
         rows.append([name, *(_cell(name, one) for one in summaries.values())])
     return ["figure", *summaries], rows

@@ -16,14 +16,39 @@ from servoid.stack.safety.guard import Phase
 from servoid.tools.common.motion_quality import Poses
 
 
+class Falls:
+    """Counts falls of a robot that gets up again."""
+
+    def __init__(self, dt: float) -> None:
+        self._dt = dt
+        self._before = Phase.LIMP
+        self._rose: int | None = None  # tick at which the first try since the fall began
+        self._up = 0  # the last tick at which it did not stand
+        self.falls = 0
+        self.seconds: list[float] = []  # from lying still to standing, of each time that it got up
+
+    def watch(self, record: TickRecord, standing: bool) -> None:
+        """`standing`: whether the robot stands at this tick."""
+        before, phase, self._before = self._before, record.phase, record.phase
+        if phase is Phase.FALLEN and before is Phase.RUNNING:
+            self.falls, self._rose = self.falls + 1, None
+        if phase is Phase.RECOVERING and self._rose is None:
+            self._rose = record.tick
+        if phase is Phase.RUNNING and before is Phase.RECOVERING and self._rose is not None:
+            self.seconds.append((self._up + 1 - self._rose) * self._dt)
+        if not standing:
+            self._up = record.tick
+
+
 class GroundTruth:
     """An `on_tick` listener: one row for each tick of the task.
 
     In a world of several robots it follows the first; that any of them fell or touched another counts. `fell_ending`:
-    whether it fell after the task, while it came to rest or was lowered.
+    whether it fell after the task, while it came to rest or was lowered. Of a run that may `recover` the trace says of
+    a fall whether the robot is down at the end.
     """
 
-    def __init__(self, simulation: Simulation, dt: float) -> None:
+    def __init__(self, simulation: Simulation, dt: float, *, recover: bool = False) -> None:
         self._truth, self._surroundings, self._dt = simulation.truth, simulation.surroundings, dt
         self._rows: list[tuple[Array, float, Array, float, Array]] = []
         self._joints: list[Array] = []
@@ -31,17 +56,23 @@ class GroundTruth:
         self._obstacles: list[Array] = []
         self._robots: list[Array] = []
         self._fallen = self._touched = self.fell_ending = False
+        self._ever = False  # whether it has fallen
+        self.falls = Falls(dt) if recover else None
         self.upright = 0  # ticks of the task before the robot had fallen
 
     def __call__(self, record: TickRecord) -> None:
         instruction, truth = record.proposal.instruction, self._truth
+        if self.falls is not None:
+            self.falls.watch(record, not truth.fallen[0])
         if instruction is None:
             if self._rows and not self._fallen:
                 self.fell_ending |= record.phase in (Phase.STOPPING, Phase.LOWERING) and bool(truth.fallen[0])
                 self.fell_ending |= any(event.kind == "fall" for event in record.events)
             return
-        self._fallen |= bool(truth.fallen.any())
-        self.upright += not self._fallen
+        fallen = bool(truth.fallen.any())
+        self._ever |= fallen
+        self._fallen = self._ever if self.falls is None else fallen
+        self.upright += not self._ever
         self._joints.append(truth.joints[0].copy())
         self._up.append(-truth.gravity[0])
         if self._surroundings is not None:

@@ -85,6 +85,12 @@ def add_set_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_recover_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--recover", action="store_true", help="when the robot falls, let it get up and go on (default: a fall ends it)"
+    )
+
+
 def add_gain_argument(parser: argparse.ArgumentParser) -> None:
     """`--gain G`, for `RunSettings.gain`."""
     parser.add_argument(

@@ -41,6 +41,7 @@ def depends_on(settings: RunSettings, policy: Mapping[str, Any]) -> dict[str, An
         "seed": settings.seed,
         "code": code(),
         "versions": versions(),
+        **({"recover": True} if settings.recover else {}),
     }
 
 

@@ -32,15 +32,16 @@ def judge(job: RunSettings) -> Judged:
     """One run, with everything that the truth shows of it.
 
     One that the guard broke off is no success, however far it came, and one that never began has no metrics but those
-    that count what was left undone. Raises KeyboardInterrupt where the run was told to end, by a Ctrl-C that it took
-    for itself: that is no episode, and there shall be none after it.
+    that count what was left undone. One that may recover `fell` where it did not get up again. Raises KeyboardInterrupt
+    where the run was told to end, by a Ctrl-C that it took for itself: that is no episode, and there shall be none
+    after it.
     """
     from servoid.hw.robot.description import load_robot
     from servoid.stack.runtime.run import prepare, run
     from servoid.tools.common.ground_truth import GroundTruth
 
     assignment, backend = prepare(job)
-    ground_truth = GroundTruth(simulation(backend), load_robot(job.robot).dt)
+    ground_truth = GroundTruth(simulation(backend), load_robot(job.robot).dt, recover=job.recover)
     result = run(job, backend=backend, on_tick=ground_truth)
     _give_memory_back()
     if result.interrupted:
@@ -60,6 +61,8 @@ def judge(job: RunSettings) -> Judged:
         "metrics": {name: value for name, value in metrics.items() if began or name in undone},
         "odometry_error_m": ground_truth.odometry_error(result.trace),
     }
+    if ground_truth.falls is not None:
+        row |= {"falls": ground_truth.falls.falls, "stand_seconds": ground_truth.falls.seconds}
     return Judged(row, assignment, trace, ground_truth)
 
 

@@ -23,7 +23,6 @@ from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 from servoid.policy.features import Normaliser, raw_layout
-from servoid.stack.control import planner as planner_module
 from servoid.stack.control.diffusion import DiffusionPolicy, diffusion_policy
 from servoid.stack.control.plan_buffer import Pace
 from servoid.stack.control.planner import InlinePlanner, ProcessPlanner
@@ -196,14 +195,11 @@ class FakePipe:
 
 @pytest.mark.parametrize(("replan", "delay", "slow"), [(4, 2, 2.6), (4, 4, 5.2), (2, 2, 2.5), (2, 1, 5.5), (1, 1, 1.3)])
 @pytest.mark.parametrize("usual", [0.3, 0.7, 0.95])
-def test_planning_goes_on_after_a_slow_plan(
-    monkeypatch: pytest.MonkeyPatch, replan: int, delay: int, slow: float, usual: float
-) -> None:
+def test_planning_goes_on_after_a_slow_plan(replan: int, delay: int, slow: float, usual: float) -> None:
     """The slow one is adopted when it comes, and the next is asked for at the first chance after that."""
     pipe = FakePipe(lambda tick: slow if tick == 20 else usual * delay)
     context = SimpleNamespace(Pipe=lambda: (pipe, MagicMock()), Process=MagicMock())
-    monkeypatch.setattr(planner_module.multiprocessing, "get_context", lambda method: context)
-    policy = DiffusionPolicy(ProcessPlanner(MagicMock()), Pace(4, replan, delay, wait=False))
+    policy = DiffusionPolicy(ProcessPlanner(MagicMock(), context=context), Pace(4, replan, delay, wait=False))
     for tick in range(60):
         pipe.now = float(tick)
         act(policy, state(tick), np.full(20, 0.5), INSTRUCTION)

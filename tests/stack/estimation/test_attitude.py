@@ -165,3 +165,19 @@ def test_the_creep_of_a_standing_robot_is_not_taken_for_the_gyros_bias() -> None
     for before, after in itertools.pairwise(ticks):
         attitude.update(bias + creep, LEVEL, STILL, creep + (after - before) / DT)
     np.testing.assert_allclose(attitude.bias, bias, atol=0.002)
+
+
+def test_a_robot_that_lies_learns_no_bias_and_keeps_the_one_it_knows() -> None:
+    """Still on the ground it may be turned slowly by whatever lies on it."""
+    attitude = Attitude(0.02)
+    upright, still = np.array([0.0, 0.0, 9.81]), np.zeros(20)
+    for _ in range(100):
+        attitude.update(np.array([0.02, 0.0, 0.0]), upright, still)
+    known = attitude.bias.copy()
+    assert known[0] == pytest.approx(0.02, abs=1e-6)
+    attitude.learns = False
+    for _ in range(200):
+        attitude.update(np.array([0.05, 0.0, 0.0]), upright, still)
+    attitude.level(upright, attitude.yaw + 4.0 * np.pi)
+    np.testing.assert_array_equal(attitude.bias, known)
+    assert float(attitude.yaw) == pytest.approx(4.0 * np.pi, abs=0.1)

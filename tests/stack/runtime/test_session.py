@@ -352,7 +352,7 @@ def test_a_script_repeats_which_plans_came_in_time():
 
     recorded = sent(policy=Planning(late=(8, 20)))
     in_time = {tick: tick + 2 for tick in range(0, 200, 4) if tick not in (8, 20)}
-    np.testing.assert_array_equal(sent(policy=Planning(), script=Script(plans=in_time)), recorded)
+    np.testing.assert_array_equal(sent(policy=Planning(), script=Script(plans=(in_time,))), recorded)
     assert not np.array_equal(sent(policy=Planning()), recorded)
 
 

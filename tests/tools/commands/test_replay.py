@@ -101,7 +101,7 @@ def test_a_walk_by_the_gait_tells_its_settings(name: str) -> None:
 def test_a_run_in_which_no_plan_was_in_time_is_repeated_without_one(tmp_path: Path) -> None:
     """As on a machine that is far too slow for the planner."""
     chosen = RunSettings("walk", seconds=0.6, set={"vx": "0.1"}, record=tmp_path / "a.mcap")
-    late = run(chosen, script=Script(plans={}))
+    late = run(chosen, script=Script(plans=({},)))
     assert any("was not ready" in event.text for event in late.events)
     log = read_log(tmp_path / "a.mcap")
     assert not log.messages["/plan"]

@@ -3,7 +3,9 @@ the episode held."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from servoid.hw.geometry import headed, joined, turned, yaw_of
 from servoid.policy.features import raw_layout
 from servoid.stack.log.flightlog import FlightLog
 from servoid.stack.log.format import unpack
+from servoid.stack.safety.guard import Phase
 
 
 @dataclass(frozen=True)
@@ -43,18 +46,27 @@ def robots(log: FlightLog) -> Array | None:
     return _seen(log, "robots")
 
 
+def got_up(log: FlightLog) -> list[int]:
+    """Ticks at which the robot went on after a fall: the policy begins anew at the next."""
+    phases = [(int(message["tick"]), message["phase"]) for message in log.messages["/command"]]
+    return [tick for (_, before), (tick, now) in pairwise(phases) if (before, now) == (Phase.RECOVERING, Phase.RUNNING)]
+
+
 def plans(log: FlightLog) -> list[DrawnPlan]:
-    """Predicted paths of the task. Ticks of plans count calls of the policy: one a tick, and some after the task."""
-    ticks = task_ticks(log)
+    """Predicted paths of the task. Ticks of plans count calls of the policy, since it began: one a tick, and some after
+    the task."""
+    ticks, again = task_ticks(log), got_up(log)
+    first = [0, *np.searchsorted(ticks, again, side="right").tolist()]  # of the task, each time that the policy began
     if not log.messages["/plan"]:
         return []
     at = {int(tick): row for row, tick in enumerate(log.ticks("/state"))}
     displacement, yaw = log.column("/state", "displacement"), log.column("/state", "yaw")
     found = []
     for message in log.messages["/plan"]:
-        if message["requested"] >= len(ticks):
+        asked = first[bisect_right(again, message["tick"])] + message["requested"]
+        if asked >= len(ticks):
             continue  # to come to rest
-        row = at[int(ticks[message["requested"]])]
+        row = at[int(ticks[asked])]
         path = displacement[row, :2] + turned(unpack(message["path"]), yaw[row])
         found.append(DrawnPlan(int(message["tick"]), path))
     return found

@@ -1,0 +1,114 @@
+"""Gets up by a clip, open loop: first the clip's first pose, from however the robot lies, then the clip, then home.
+
+It proposes targets as a policy does. Which way the robot lies, gravity says; on its side the nearer of both. Going to
+the first pose often rolls it over, so that is looked at again before the clip is played.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import State
+from servoid.hw.robot.description import Robot
+from servoid.policy.motion.clip import Clip
+from servoid.policy.motion.library import Library
+from servoid.policy.references.clip import BLEND_SHARE, ClipReference
+from servoid.stack.log.provenance import sha256
+from servoid.stack.safety.min_jerk import MIN_JERK_PEAK, MinJerk
+from servoid.stack.safety.recovery import Recovery
+
+CLIPS = ("get-up-front", "get-up-back")
+SETTLE_SECONDS = 0.5  # in a clip's first pose: clips were recorded from there, at rest
+STAND_SECONDS = 1.5  # that the robot has to come to a stand in when the clip is over
+HOME_SECONDS = 2.0  # the same, when it is home
+
+
+class GetUp:
+    """One robot's way up. `begin` starts a try; `failed` says why one is over."""
+
+    def __init__(self, robot: Robot, clips: tuple[Clip, Clip]) -> None:
+        """`clips`: from lying on the front and on the back. Raises ConfigError where they do not fit."""
+        self._robot, self._clips = robot, clips
+        self._reference = ClipReference(robot, clips)
+        self._ahead = np.zeros(1, int)
+        self.failed: str | None = None
+        self._way: Iterator[Array] | None = None
+        self._state: State
+        self._applied: Array
+
+    def begin(self) -> None:
+        """Start a try, from however the robot lies at the next call of `act`."""
+        self.failed, self._way = None, None
+
+    def act(self, state: State, applied: Array, recovery: Recovery) -> Array | None:
+        """Joint targets `(n_joints,)` rad for the next tick; None when the try is over, and `failed` says why.
+
+        `applied` is what the guard sent last, `recovery` what it sees of whether the robot stands.
+        """
+        self._state, self._applied = state, applied
+        self._way = self._way or self._rise(recovery)
+        return next(self._way, None)
+
+    def _rise(self, recovery: Recovery) -> Iterator[Array]:
+        side = self._side()
+        for _ in CLIPS:
+            yield from self._go(self._clips[side].joints[0], BLEND_SHARE * self._robot.limits.joint_speed)
+            yield from self._wait(SETTLE_SECONDS)
+            if self._side() == side:
+                break
+            side = self._side()  # rolled over; from its other side there is no third
+        self._reference.play(side)
+        self._reference.enter(self._applied)
+        while not self._reference.ended:
+            yield self._reference.frames(self._ahead).position[0]
+            self._reference.advance()
+        for target in self._wait(STAND_SECONDS):
+            if recovery.stands:
+                break
+            yield target
+        else:
+            self.failed = f"'{CLIPS[side]}' did not end on its feet and still"
+            return
+        yield from self._go(self._robot.home, self._robot.limits.homing_speed)
+        yield from self._wait(HOME_SECONDS)
+        self.failed = "it stood up, and did not come to a stand at home"
+
+    def _side(self) -> int:
+        """0: on its front, or nearer to that; 1: on its back. The base's x axis, ahead, points down or up."""
+        return 0 if float(self._state.gravity[0]) >= 0.0 else 1
+
+    def _go(self, pose: Array, speed: float) -> Iterator[Array]:
+        """To a pose, no joint faster than `speed` [rad/s]."""
+        seconds = MIN_JERK_PEAK * float(np.abs(pose - self._applied).max()) / speed
+        way = MinJerk(self._applied, pose, int(np.ceil(seconds * self._robot.rate)))
+        while not way.done:
+            yield way.next()
+
+    def _wait(self, seconds: float) -> Iterator[Array]:
+        for _ in range(round(seconds * self._robot.rate)):
+            yield self._applied
+
+
+def get_up(robot: Robot) -> GetUp:
+    """By the clips of the shipped library. Raises ConfigError for a robot that has none, or cannot know how it lies."""
+    if robot.imu.kind == "none":
+        raise ConfigError(f"--recover: {robot.name} has no IMU, so it cannot know that it has fallen: drop --recover")
+    try:
+        library = Library(robot)
+        front, back = (library[name] for name in CLIPS)
+        return GetUp(robot, (front, back))
+    except ConfigError as error:
+        names = " and ".join(f"'{name}'" for name in CLIPS)
+        raise ConfigError(
+            f"--recover: {robot.name} has no clips {names} to get up by: drop --recover ({error})"
+        ) from error
+
+
+def fingerprints(robot: Robot) -> dict[str, str | None]:
+    """Hashes of the clips' files, by their names, of a robot that has them."""
+    library = Library(robot)
+    return {name: sha256(library.path(name)) for name in CLIPS}
