@@ -91,7 +91,7 @@ VERBS: dict[str, Verb] = {
     "replay": Verb("repeat a recorded run and compare", "servoid.tools.commands.replay"),
     "export": Verb("write a recorded run as CSV or Parquet", "servoid.tools.commands.export"),
     "plot": Verb("draw a recorded run", "servoid.tools.commands.plot"),
-    "completion": Verb("print what completes commands in a shell", "servoid.tools.commands.completion"),
+    "completion": Verb("print what completes commands in a shell", "servoid.tools.completion"),
 }
 
 

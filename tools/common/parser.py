@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
+from servoid.tools.common.output import say
 
 
 class Parser(argparse.ArgumentParser):
@@ -36,7 +37,7 @@ class Parser(argparse.ArgumentParser):
         return super()._get_values(action, arg_strings)
 
     def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: {message} (see {self.prog} --help)", file=sys.stderr)
+        say(f"{self.prog}: {message} (see {self.prog} --help)", sys.stderr)
         raise SystemExit(exit_codes.USAGE)
 
 
@@ -82,12 +83,6 @@ def add_set_argument(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="KEY=VALUE",
         help="change a setting of the task (see servoid tasks TASK)",
-    )
-
-
-def add_recover_argument(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--recover", action="store_true", help="when the robot falls, let it get up and go on (default: a fall ends it)"
     )
 
 
