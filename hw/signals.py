@@ -1,4 +1,4 @@
-"""Ctrl-C before and after a program's work: never lost in a library that is being imported, never a traceback."""
+"""Ctrl-C at a program's start and end: never lost in a library that is being imported, never a traceback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the `servoid` command begins: a Ctrl-C is in good hands before anything else is imported."""
+"""Where the `servoid` command starts: Ctrl-C is handled before anything else is imported."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class TorqueUnproven(BackendError):
     """Servos did not say in time that their torque is off. They may say it later, before a person reads of it."""
 
     def __init__(self, names: str) -> None:
-        super().__init__(f"{names} did not say that torque is off: hold the robot and switch its power off")
+        super().__init__(f"{names} did not report that torque is off: hold the robot and switch its power off")
         self._names = names
 
     def settle(self, how: str) -> None:

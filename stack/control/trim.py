@@ -1,4 +1,4 @@
-"""Slow correction of what is asked of a planner by what comes of it.
+"""Slow correction of a planner's commanded twist by the measured one.
 
 Guidance pulls a plan toward the asked twist, and the motions that a model knows pull it back, so that a robot goes a
 little faster or slower than it was told. An integrator on the difference, averaged over gait cycles, takes that out.

@@ -1,4 +1,4 @@
-"""What people look at, once more as plain numbers: Foxglove and PlotJuggler draw it as it is.
+"""The log again for people, as plain numbers that Foxglove and PlotJuggler can draw.
 
 Topics below `/view` follow Foxglove's message schemas where one fits (joints, frames, log lines) and hold nothing that
 is not in the log's own channels. Whoever reads a log to repeat or to judge a run leaves them out. What was not measured

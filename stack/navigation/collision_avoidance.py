@@ -1,4 +1,4 @@
-"""Which way to walk past others that walk themselves, for policies that go by a velocity."""
+"""Which way to walk past other walking robots, for policies that follow a velocity."""
 
 from __future__ import annotations
 

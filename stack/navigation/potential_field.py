@@ -1,4 +1,4 @@
-"""A potential field without traps: which way to walk to a goal past obstacles, for policies that go by a velocity."""
+"""A potential field without traps: which way to walk to a goal past obstacles, for policies that follow a velocity."""
 
 from __future__ import annotations
 

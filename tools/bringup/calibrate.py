@@ -1,7 +1,7 @@
 """Measure how each servo sits in its joint: zero and direction.
 
-Torque is off: you put the robot into its reference pose by hand, then turn one joint after the other. The result is
-kept in your configuration folder and used by everything that drives the robot. Nothing is written to a servo.
+Torque is off: you put the robot into its reference pose by hand, then turn one joint after another. The result is kept
+in your configuration folder and used by every command that drives the robot. Nothing is written to a servo.
 """
 
 from __future__ import annotations
@@ -45,15 +45,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="JOINT",
-        help="this joint only, of a robot that was calibrated; may be given again",
+        help="only this joint, of a calibrated robot; may be repeated",
     )
     parser.add_argument(
         "--keep-directions",
         action="store_true",
-        help="measure zeros only: directions are those of the earlier calibration, without one the robot file's",
+        help="measure only zeros; directions come from the earlier calibration, or from the robot's file",
     )
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write there instead of into the configuration folder")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of a virtual rig's assembly (default: 0)")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help="file to write (default: in your configuration folder)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="random seed of the virtual rig's assembly (default: 0)"
+    )
     parser.add_argument("--yes", action="store_true", help="write without asking")
 
 
@@ -213,7 +217,7 @@ def _reference(pose: str, robot: Robot) -> Array:
     if pose == "home":
         return robot.home
     if outside := [joint.name for joint in robot.joints if not joint.range[0] <= 0.0 <= joint.range[1]]:
-        raise ConfigError(f"{', '.join(outside)} cannot be at 0: give --pose home")
+        raise ConfigError(f"{', '.join(outside)} cannot be at 0: use --pose home")
     return np.zeros(len(robot.joints))
 
 

@@ -1,7 +1,7 @@
 """Compare every register that matters with the robot's file.
 
-With `--fix` what differs is written, with torque off, and compared again. Nothing moves. Exit code 0: the robot is as
-its file says; 1: something differs.
+`--fix` writes what differs, with torque off, and compares again. Nothing moves. Exit code 0: the robot matches its
+file; 1: something differs.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser)
-    parser.add_argument("--fix", action="store_true", help="write what differs")
+    parser.add_argument("--fix", action="store_true", help="correct what differs")
 
 
 def main(args: argparse.Namespace) -> int:

@@ -1,7 +1,7 @@
 """Find the serial port of the robot.
 
-Lists the USB serial ports. Where a person is watching it then waits for an adapter to be plugged in, or unplugged and
-plugged in again, and says which one that was.
+Lists the USB serial ports. On a terminal it then waits for an adapter to be plugged in, or unplugged and plugged in
+again, and prints which one it was.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--wait",
         type=positive,
         metavar="S",
-        help=f"wait so long for a change (default: {PATIENCE:g} on a terminal, not at all elsewhere)",
+        help=f"how long to wait for a change (default: {PATIENCE:g} on a terminal, else 0)",
     )
 
 

@@ -1,8 +1,8 @@
-"""Move one joint, slowly and a little.
+"""Move one joint slowly, a little.
 
 Torque comes on at every joint, each where it is; then one joint moves while an arrow key is held, at 0.25 rad/s and at
-most 0.35 rad from where it was found. It stops when the key is let go. q, Ctrl-C or a minute without a key turn torque
-off. The guard stands between: what it has refused is sent to no servo. Support the robot, it is limp before and after.
+most 0.35 rad from where it was found. It stops when the key is released. q, Ctrl-C or a minute without a key turn
+torque off. Every goal passes the guard. Support the robot: it is limp before and after.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ _SHOW_EVERY = 5  # ticks
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("joint", help="joint to move")
+    parser.add_argument("joint", metavar="JOINT", help="joint to move")
     add_line_arguments(parser)
-    parser.add_argument("--by", type=float, metavar="RAD", help="go by so much and back, instead of listening to keys")
+    parser.add_argument("--by", type=float, metavar="RAD", help="angle to move by, and back, instead of using keys")
     parser.add_argument("--start", action="store_true", help="switch torque on without asking")
 
 
@@ -45,9 +45,9 @@ def main(args: argparse.Namespace) -> int:
         if args.joint not in robot.names:
             raise ConfigError(f"{robot.name} has no joint '{args.joint}'; {nearest(args.joint, robot.names)}")
         if args.by is not None and not 0.0 < abs(args.by) <= SPAN:
-            raise ConfigError(f"--by {args.by:g}: give an angle up to {SPAN:g} rad, or a negative one; it is not 0")
+            raise ConfigError(f"--by {args.by:g}: must be between -{SPAN:g} and {SPAN:g} rad, and not 0")
         if args.by is None and not sys.stdin.isatty():
-            raise ConfigError("keys need a terminal: give --by RAD to move without one")
+            raise ConfigError("keys need a terminal: without one, use --by RAD")
         name = "virtual" if is_virtual(args) else "dynamixel"
         port = None if name == "virtual" else args.port
         body = make_backend(name, robot, seed=0, randomise=False, port=port)

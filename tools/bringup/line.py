@@ -36,7 +36,7 @@ def add_line_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--port",
         metavar="PATH|virtual",
-        help="serial port of the robot (servoid bringup find-port), or a virtual rig of its own",
+        help="serial port of the robot, or 'virtual' for a temporary rig",
     )
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     add_json_argument(parser)
@@ -48,7 +48,9 @@ def is_virtual(args: argparse.Namespace) -> bool:
         from servoid.tools.bringup.ports import usb_ports
 
         there = ", ".join(usb_ports()) or "none is plugged in"
-        raise ConfigError(f"say which port with --port PATH (USB ports here: {there}), or --port {VIRTUAL} to practise")
+        raise ConfigError(
+            f"port missing: name it with --port PATH (USB ports here: {there}), or practise with --port {VIRTUAL}"
+        )
     return bool(args.port == VIRTUAL)
 
 

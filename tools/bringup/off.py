@@ -1,7 +1,7 @@
 """Switch torque off, wherever it is on.
 
 Another program may have ended and left it on. Servos are braked for 0.4 s first, so that a robot settles instead of
-dropping; then it is limp: hold it. Exit code 3: a servo did not say that its torque is off.
+dropping; then it is limp: hold it. Exit code 3: a servo did not report that its torque is off.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from servoid.tools.common.prompt import confirm
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser)
-    parser.add_argument("--baud", type=int, metavar="N", help="ask at this baud (default: the robot's)")
-    parser.add_argument("--yes", action="store_true", help="do it without asking")
+    parser.add_argument("--baud", type=int, metavar="N", help="baud of the bus (default: the robot's)")
+    parser.add_argument("--yes", action="store_true", help="switch torque off without asking")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -47,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
                 report.line(f"{len(found.servos)} servos answer at {baud} bit/s, and none has torque")
         if left:
             raise BackendError(
-                f"{', '.join(left)} did not say that torque is off: hold the robot and switch its power off"
+                f"{', '.join(left)} did not report that torque is off: hold the robot and switch its power off"
             )
         report.result({"servos": len(found.servos), "off": names})
     return exit_codes.DONE

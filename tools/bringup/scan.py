@@ -1,8 +1,8 @@
-"""Ask who is on the bus, at every baud.
+"""List the servos and boards on the bus, at every baud.
 
 Lists each servo and board with ID, baud, model, firmware, voltage, temperature and errors, and what does not fit the
-robot's file. Switches the servos' power on where a board keeps it off; moves nothing. Exit code 3: something is
-to be mended.
+robot's file. Switches the servos' power on where a board keeps it off; moves nothing. Exit code 3: something needs
+fixing.
 """
 
 from __future__ import annotations
@@ -26,7 +26,12 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser)
     parser.add_argument(
-        "--baud", type=int, action="append", default=[], metavar="N", help="ask at this baud only; may be given again"
+        "--baud",
+        type=int,
+        action="append",
+        default=[],
+        metavar="N",
+        help="only this baud; may be repeated (default: all)",
     )
 
 
@@ -43,7 +48,7 @@ def main(args: argparse.Namespace) -> int:
             found = census(line.bus, bauds, report.line)
         if not found.devices and not found.problems:
             raise BackendError(
-                f"{args.port}: nobody answers at {', '.join(map(str, bauds))} bit/s: is the supply on, is the adapter "
+                f"{args.port}: no answer at {', '.join(map(str, bauds))} bit/s: is the supply on, is the adapter "
                 "on the servos' connector, and do both have the same ground?"
             )
         if found.skipped:

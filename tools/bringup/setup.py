@@ -1,9 +1,9 @@
-"""Give a servo its ID and baud, one servo at a time.
+"""Set a servo's ID and baud, one servo at a time.
 
-Plug in one servo, alone or behind the board, and name the joint that it is for. A fresh servo answers with ID 1 at
-57600 bit/s; one that was used before is found at any baud. It keeps the numbers without power. Nothing moves. In an
-assembled robot the servo is set up where it is, if it is the only one that is no joint's yet; --from says which, where
-there are several. Refused are a servo with torque on, and an ID that two servos obey or that another one has.
+Plug in one servo, alone or behind the board, and name the joint that it is for. A factory-new servo answers with ID 1
+at 57600 bit/s; a used one is found at any baud. It keeps its ID and baud without power. Nothing moves. In an assembled
+robot the servo is set up in place, if it is the only one without a joint; --from chooses one of several. A servo with
+torque on is refused, and so is an ID that two servos obey or that another one has.
 """
 
 from __future__ import annotations
@@ -27,12 +27,17 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("joint", nargs="?", help="joint that the servo is for: ID, baud and model are its file's")
+    parser.add_argument(
+        "joint",
+        nargs="?",
+        metavar="JOINT",
+        help="joint that the servo is for; the robot's file has its ID, baud and model",
+    )
     add_line_arguments(parser)
-    parser.add_argument("--id", type=int, metavar="N", help="new ID, instead of naming a joint")
+    parser.add_argument("--id", type=int, metavar="N", help="new ID, instead of JOINT")
     parser.add_argument("--baud", type=int, metavar="N", help="new baud (default: the robot's)")
-    parser.add_argument("--from", type=int, dest="present", metavar="N", help="the ID that the servo has now")
-    parser.add_argument("--from-baud", type=int, metavar="N", help="the baud that it has now")
+    parser.add_argument("--from", type=int, dest="present", metavar="N", help="present ID of the servo")
+    parser.add_argument("--from-baud", type=int, metavar="N", help="present baud of the servo")
     parser.add_argument("--yes", action="store_true", help="write without asking")
 
 
@@ -140,12 +145,12 @@ def _chosen(found: Census, robot: Robot, present: tuple[int | None, int | None])
         )
     if not servos:
         raise BackendError(
-            f"{len(found.servos)} servos answer, and each has a joint already: say which one with --from ID, or unplug "
+            f"{len(found.servos)} servos answer, and each has a joint already: choose one with --from ID, or unplug "
             "all but the one to be set up"
         )
     there = "; ".join(map(str, servos[:4])) + (" ..." if len(servos) > 4 else "")
     raise BackendError(
-        f"{len(servos)} servos have no joint yet ({there}): say which one with --from ID --from-baud N, or unplug all "
+        f"{len(servos)} servos have no joint yet ({there}): choose one with --from ID --from-baud N, or unplug all "
         "but the one to be set up"
     )
 
@@ -156,13 +161,15 @@ def _wanted(args: argparse.Namespace, robot: Robot) -> tuple[int, int, int | Non
     check_baud(baud)
     if args.joint is not None:
         if args.id is not None:
-            raise ConfigError("give a joint or --id, not both: a joint's ID is that of the robot's file")
+            raise ConfigError("name a joint or --id, not both: the robot's file has the joint's ID")
         if args.joint not in robot.names:
             raise ConfigError(f"{robot.name} has no joint '{args.joint}'; {nearest(args.joint, robot.names)}")
         i = robot.names.index(args.joint)
         return robot.joints[i].id, baud, robot.servos[i].model_number
     if args.id is None:
-        raise ConfigError("say which joint the servo is for (servoid bringup setup JOINT), or which --id it shall have")
+        raise ConfigError(
+            "joint missing: name the servo's joint (servoid bringup setup JOINT), or its new ID with --id"
+        )
     if not 0 <= args.id <= MAX_ID:
         raise ConfigError(f"--id {args.id}: servo IDs are 0..{MAX_ID}")
     if args.id == robot.bus.board_id and robot.bus.board != "none":

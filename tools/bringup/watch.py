@@ -1,6 +1,6 @@
-"""Watch the robot: angles, temperatures, voltages, loads and errors of every servo, the IMU, and how well the bus does.
+"""Show angles, temperatures, voltages, loads and errors of every servo, the IMU, and the state of the bus.
 
-Only reads: torque stays as it is. Until Ctrl-C, or for `--seconds`.
+It only reads: torque stays as it is. It ends after Ctrl-C or `--seconds`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _SILENT = 1.0  # s after which a servo is said to be silent
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser)
-    parser.add_argument("--seconds", type=positive, metavar="S", help="end after so long (default: Ctrl-C)")
+    parser.add_argument("--seconds", type=positive, metavar="S", help="how long to watch (default: until Ctrl-C)")
 
 
 def main(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""Check whether this machine is ready: packages, rendering, disk, serial ports, checkpoints."""
+"""Check that this machine is ready: packages, rendering, disk, serial ports, checkpoints."""
 
 from __future__ import annotations
 

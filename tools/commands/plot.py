@@ -57,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _film(logs: Sequence[FlightLog], args: argparse.Namespace) -> Path:
     if len(logs) > 1:
-        raise ConfigError("--video: give one log: a film shows one run")
+        raise ConfigError("--video: a film shows one run: name one log")
     path: Path = args.video
     size = prepare(path, args.video_size)
     from servoid.tools.common.pictures.video import VideoError, make_video

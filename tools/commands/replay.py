@@ -44,7 +44,7 @@ class Divergence:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", type=Path, help="flight log of a simulated run")
+    parser.add_argument("log", type=Path, metavar="LOG", help="flight log of a simulated run (.mcap)")
     add_json_argument(parser)
 
 

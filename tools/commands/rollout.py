@@ -2,11 +2,11 @@
 
 Every episode is a `servoid run` of its own, with its own random stream: results do not depend on the number of workers,
 and any episode can be repeated with `servoid run TASK --seed S`. Several policies (`--policy expert --policy gait`, or
-`--policy expert,gait`) do the same episodes; the difference of each to the first is told with its 95 % interval, paired
-by seed.
+`--policy expert,gait`) run the same episodes; each one's difference from the first is printed with its 95 % interval,
+paired by seed.
 
-With --out, every episode is kept as it is done, a line of JSON each, and the same command goes on where it was. After
-Ctrl-C, or an episode that cannot be done, the figures of those that were are told.
+With --out, every finished episode is kept as a line of JSON, and the same command continues where it stopped. After
+Ctrl-C, or an episode that fails with an error, the figures of the finished episodes are printed.
 """
 
 from __future__ import annotations
@@ -49,25 +49,27 @@ Work = Callable[[EpisodeJob], EpisodeResult]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("task", metavar="TASK", help="a name (servoid tasks), or FILE.py:Class")
-    parser.add_argument("--episodes", type=int, default=50, metavar="N", help="of each policy (default: %(default)s)")
-    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: one a core)")
-    parser.add_argument("--backend", default="sim", help="sim or virtual (default: %(default)s)")
+    parser.add_argument("task", metavar="TASK", help="task: a name (see servoid tasks) or FILE.py:Class")
+    parser.add_argument(
+        "--episodes", type=int, default=50, metavar="N", help="episodes of each policy (default: %(default)s)"
+    )
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: one per core)")
+    parser.add_argument("--backend", default="sim", metavar="NAME", help="sim or virtual (default: %(default)s)")
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: %(default)s)")
     parser.add_argument(
         "--policy",
         action="append",
         metavar="NAME|FILE",
-        help="as in `run` (default: diffusion); may be given again, to compare",
+        help="controller, as in `servoid run`; may be repeated, to compare (default: diffusion)",
     )
-    parser.add_argument("--randomise", action="store_true", help="draw the robot anew for each episode")
-    parser.add_argument("--seconds", type=positive, metavar="S", help="length of the task instead of its own")
+    parser.add_argument("--randomise", action="store_true", help="draw each robot's mass, friction, delays and more")
+    parser.add_argument("--seconds", type=positive, metavar="S", help="length of an episode (default: the task's)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: %(default)s)")
     add_set_argument(parser)
     add_gain_argument(parser)
     add_recover_argument(parser)
-    parser.add_argument("--out", type=Path, metavar="DIR", help="keep every episode there, and go on where it was")
-    parser.add_argument("--fresh", action="store_true", help="with --out: do all episodes anew")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to keep every episode in, and to continue from")
+    parser.add_argument("--fresh", action="store_true", help="with --out: repeat all episodes")
     add_json_argument(parser)
 
 
@@ -104,7 +106,7 @@ def policies(given: Sequence[str] | None) -> list[str]:
     names = [name for text in given or ["diffusion"] for name in text.split(",")]
     for name in names:
         if not name or names.count(name) > 1:
-            raise ConfigError(f"--policy '{name}': " + ("given twice" if name else "give a name or a file"))
+            raise ConfigError(f"--policy '{name}': " + ("given twice" if name else "name or file missing"))
     return names
 
 
@@ -113,12 +115,12 @@ def _check(args: argparse.Namespace) -> None:
     from servoid.stack.tasks import find
 
     if args.episodes < 1:
-        raise ConfigError(f"--episodes: {args.episodes} is not a number of episodes; give 1 or more")
+        raise ConfigError(f"--episodes must be at least 1, not {args.episodes}")
     if args.workers < 0:
-        raise ConfigError(f"--workers: {args.workers} is not a number of processes; give 0 for one a core")
+        raise ConfigError(f"--workers must not be negative, not {args.workers}; 0 is one per core")
     check_seed(args.seed)
     if args.fresh and args.out is None:
-        raise ConfigError("--fresh does the episodes in --out anew: give --out")
+        raise ConfigError("--fresh repeats the episodes in --out: name the folder with --out")
     if find(args.task).cls.steered:
         raise ConfigError(f"task '{args.task}' is steered by a person: use `servoid run {args.task}`")
     if not backend_kind(args.backend).simulated:

@@ -1,7 +1,7 @@
 """Run a task on a robot.
 
-Writes a flight log, for `servoid plot` and `servoid replay`. Ctrl-C lowers the robot and turns torque off; a second one
-turns torque off at once. Exit code 0: the goal was met; 1: the task failed; 4: the guard stopped the run.
+Writes a flight log for `servoid plot` and `servoid replay`. Ctrl-C lowers the robot and turns torque off; a second
+Ctrl-C turns torque off at once. Exit code 0: the task succeeded; 1: it failed; 4: the guard stopped the run.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ EXIT_CODES = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("task", metavar="TASK", help="what to do: a name (servoid tasks), or FILE.py:Class")
-    parser.add_argument("--backend", default="sim", help="body to run on: sim (default), virtual or dynamixel")
+    parser.add_argument("task", metavar="TASK", help="task: a name (see servoid tasks) or FILE.py:Class")
+    parser.add_argument("--backend", default="sim", metavar="NAME", help="sim, virtual or dynamixel (default: sim)")
     parser.add_argument("--port", metavar="PATH", help="serial port of the robot (--backend dynamixel)")
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     parser.add_argument(
@@ -49,20 +49,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="controller: diffusion (default), expert, gait, a checkpoint, diffusion settings, or FILE.py:Class",
     )
     parser.add_argument(
-        "--randomise", action="store_true", help="draw the simulated robot's mass, friction, delays ..."
+        "--randomise", action="store_true", help="draw the simulated robot's mass, friction, delays and more"
     )
-    parser.add_argument("--seconds", type=positive, metavar="S", help="length of the task instead of its own")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything that is random (default: 0)")
+    parser.add_argument("--seconds", type=positive, metavar="S", help="length of the task (default: the task's)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
     add_set_argument(parser)
     add_gain_argument(parser)
     add_recover_argument(parser)
-    parser.add_argument("--start", action="store_true", help="move a real robot without asking")
+    parser.add_argument("--start", action="store_true", help="let a real robot move without asking")
     parser.add_argument("--record", type=Path, metavar="FILE", help="flight log (default: runs/DATE-TASK.mcap)")
     parser.add_argument("--video", type=Path, metavar="FILE", help="film the run afterwards: MP4, and its path as PNG")
     parser.add_argument(
         "--video-size", default="1280x720", metavar="WxH", help="size of the film (default: %(default)s)"
     )
-    parser.add_argument("--fast", action="store_true", help="do not keep a simulation to real time on a terminal")
+    parser.add_argument("--fast", action="store_true", help="simulate as fast as possible, also on a terminal")
     add_json_argument(parser)
 
 

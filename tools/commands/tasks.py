@@ -1,4 +1,4 @@
-"""List the tasks; with a task, explain its settings, to be changed with --set key=value."""
+"""List the tasks, or explain the settings of one, which --set KEY=VALUE changes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from servoid.tools.common.output import Report, add_json_argument, reporting
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("task", nargs="?", metavar="TASK", help="explain this one: a name or FILE.py:Class")
+    parser.add_argument("task", nargs="?", metavar="TASK", help="task to explain: a name or FILE.py:Class")
     add_json_argument(parser)
 
 

@@ -1,8 +1,8 @@
-"""Serve a virtual rig on a serial port: servos and board that answer real bytes, moved by physics, until Ctrl-C.
+"""Serve a virtual rig on a serial port until Ctrl-C: servos and board that answer real bytes, moved by physics.
 
-Any program that speaks to Dynamixel servos can use the port. While the robot is held and its servos are limp, joints
-are moved as by hand with `servoid virtual --link PATH --move JOINT=RAD ...`, from where they are, within `--over`
-seconds: so other programs record ranges and calibrate.
+Any program that speaks to Dynamixel servos can use the port. While the robot is held and its servos are limp,
+`servoid virtual --link PATH --move JOINT=RAD ...` moves joints as a hand would, within `--over` seconds, so that other
+programs can record ranges and calibrate.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ BOARD_POWER = 24  # register of the board
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="default: op3")
-    parser.add_argument("--link", type=Path, metavar="PATH", help="make a link of this name to the port")
+    parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
+    parser.add_argument("--link", type=Path, metavar="PATH", help="link to the port, to be created")
     parser.add_argument("--faults", type=Path, metavar="FILE", help="fault scenario (YAML)")
     parser.add_argument(
         "--clock",
         choices=("real", "locked"),
         default="real",
-        help="time: the machine's, or only as far as a connection to the control socket advances it (default: real)",
+        help="real time, or time that a client of the control socket advances (default: real)",
     )
     parser.add_argument("--control", type=Path, metavar="PATH", help="control socket (default: beside --link)")
-    parser.add_argument("--seed", type=int, default=0, help="of the sensors' errors")
-    parser.add_argument("--randomise", action="store_true", help="another robot within the ranges of training")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument("--randomise", action="store_true", help="draw the robot's mass, friction, delays and more")
     add_factory_state_arguments(parser)
     parser.add_argument(
         "--move",
         nargs="+",
         metavar="JOINT=RAD",
-        help="serve nothing, but move limp joints of the rig that runs at --link or --control, as by hand",
+        help="serve nothing; move limp joints of the rig running at --link or --control",
     )
-    parser.add_argument("--over", type=float, default=1.0, metavar="S", help="how long a --move takes (default: 1)")
+    parser.add_argument("--over", type=float, default=1.0, metavar="S", help="duration of --move (default: 1)")
     add_json_argument(parser)
 
 
@@ -58,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
             move(report, args.control, args.move, args.over)
             return exit_codes.DONE
         if args.clock == "locked" and args.control is None:
-            raise ConfigError("--clock locked needs a control socket: give --link or --control")
+            raise ConfigError("--clock locked needs a control socket: use --link or --control")
         serve(report, args)
     return exit_codes.DONE
 
@@ -70,7 +70,7 @@ def serve(report: Report, args: argparse.Namespace) -> None:
     try:
         server = build(args, told=report.line)
     except OSError as error:
-        raise ConfigError(f"the virtual port cannot be made: {error}: choose another --link or --control") from error
+        raise ConfigError(f"the virtual port cannot be created: {error}: choose another --link or --control") from error
 
     def stop(signum: int, frame: FrameType | None) -> None:
         server.stop()
@@ -104,13 +104,13 @@ def told(robot: str, servos: int, board_id: int, baud: int, port: str, args: arg
             f"ID {board_id}; they answer 0.3 s later. A client that knows no board needs --powered or --no-board."
         )
     if args.fresh:
-        lines.append(f"As from the factory, ID 1 at 57600 bit/s: {', '.join(args.fresh)}.")
+        lines.append(f"Factory-new, ID 1 at 57600 bit/s: {', '.join(args.fresh)}.")
     lines.append("The robot is held above the ground until all servos have torque.")
     if args.control is not None:
         where = f"--link {args.link}" if args.link is not None else f"--control {args.control}"
         lines.append(f"While servos are limp, move their joints by hand: servoid virtual {where} --move JOINT=RAD ...")
     else:
-        lines.append("To move its joints by hand, give --link or --control.")
+        lines.append("To move its joints by hand, start it with --link or --control.")
     return [*lines, "Ctrl-C ends it."]
 
 
@@ -122,9 +122,9 @@ def move(report: Report, control_path: Path | None, words: list[str], seconds: f
     from servoid.sim.rig.process.control import Control
 
     if control_path is None:
-        raise ConfigError("--move needs a rig that runs: give its --link or --control")
+        raise ConfigError("--move needs a running rig: name its --link or --control")
     if not 0.0 <= seconds < float("inf"):
-        raise ConfigError(f"--over {seconds}: give a time from 0 s on")
+        raise ConfigError(f"--over must not be negative or infinite, not {seconds}")
     goals = dict(_goal(word) for word in words)
     control = Control(control_path)
     try:
@@ -148,5 +148,5 @@ def _goal(word: str) -> tuple[str, float]:
     except ValueError:
         angle = float("nan")
     if not (name and abs(angle) < float("inf")):
-        raise ConfigError(f"--move {word}: give JOINT=RAD, such as l_knee=0.5")
+        raise ConfigError(f"--move {word}: write JOINT=RAD, such as l_knee=0.5")
     return name, angle

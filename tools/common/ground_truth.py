@@ -1,4 +1,4 @@
-"""Watches a simulated run by the truth, in the frame that the robot's odometry started in.
+"""The truth of a simulated run, tick by tick, in the frame that the robot's odometry started in.
 
 With other robots it is the frame of the scene, in which their goals are.
 """

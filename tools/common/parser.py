@@ -86,6 +86,14 @@ def add_set_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_recover_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--recover",
+        action="store_true",
+        help="let a robot that falls get up and continue (default: a fall ends the run)",
+    )
+
+
 def add_gain_argument(parser: argparse.ArgumentParser) -> None:
     """`--gain G`, for `RunSettings.gain`."""
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""Episodes that were done, kept by what they depend on: an interrupted evaluation goes on where it was."""
+"""Episodes that were done, kept by what they depend on: an interrupted evaluation continues where it stopped."""
 
 from __future__ import annotations
 

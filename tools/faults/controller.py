@@ -1,4 +1,4 @@
-"""A `servoid run` in a process of its own, on a virtual rig that runs free: something to do harm to.
+"""A `servoid run` in a process of its own, on a virtual rig that runs free: the target of faults.
 
 Everything is as on hardware from the port up, in real time. What happened is judged by what the rig's servos took, and
 when, by the rig's own clock.

@@ -1,4 +1,4 @@
-"""Closed-loop survival of a network: what chooses the one to keep, instead of the loss."""
+"""Closed-loop survival of a network, which selects the checkpoint to keep instead of the loss."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""`servoid motions`: where clips come from, and what becomes of them."""
+"""`servoid motions`: making, playing, checking and changing clips."""

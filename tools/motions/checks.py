@@ -1,4 +1,4 @@
-"""What may be wrong with a clip, as figures, without physics."""
+"""Figures of what may be wrong with a clip, without physics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motions played open loop in physics: what becomes of a robot that does no more than follow the goals."""
+"""Motions played open loop in physics: what happens to a robot that only follows the goals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is made of an action file: clips by their pages, as data (`configs/motions/`)."""
+"""Recipes: which clips to make of an action file, by pages, as data (`configs/motions/`)."""
 
 from __future__ import annotations
 

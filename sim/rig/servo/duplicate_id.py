@@ -1,4 +1,4 @@
-"""A servo from the spares box: on the bus, at the ID of another, and moving nothing."""
+"""A spare servo on the bus: it has the ID of another servo and moves nothing."""
 
 from __future__ import annotations
 

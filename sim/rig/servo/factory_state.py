@@ -113,24 +113,24 @@ def ticks_per_turn(items: ControlTable) -> int:
 
 def add_factory_state_arguments(parser: argparse.ArgumentParser) -> None:
     for option, text in (
-        ("--fresh", "this joint's servo is as from the factory: ID 1, 57600 bit/s"),
-        ("--only", "no other joint's servo is plugged in"),
+        ("--fresh", "joint whose servo is factory-new: ID 1, 57600 bit/s"),
+        ("--only", "only joint whose servo is plugged in"),
     ):
-        parser.add_argument(option, action="append", default=[], metavar="JOINT", help=f"{text}; may be given again")
+        parser.add_argument(option, action="append", default=[], metavar="JOINT", help=f"{text}; may be repeated")
     parser.add_argument(
         "--assembly",
         choices=ASSEMBLIES,
         default="file",
-        help="zeros and directions: as in the robot's file (default), or others that calibration has to find",
+        help="zeros and directions: those of the robot's file (default), or others that calibration has to find",
     )
     parser.add_argument(
         "--no-board",
         action="store_false",
         dest="board",
-        help="servos alone, always powered, as on a U2D2 with a supply of their own",
+        help="servos only, always powered, as on a U2D2 with their own supply",
     )
-    parser.add_argument("--powered", action="store_true", help="the board gives the servos power from the start")
-    parser.add_argument("--baud", type=int, metavar="BPS", help="of servos and board (default: as in the robot's file)")
+    parser.add_argument("--powered", action="store_true", help="board with the servos' power on from the start")
+    parser.add_argument("--baud", type=int, metavar="BPS", help="baud of servos and board (default: the robot's)")
 
 
 def factory_state_of(args: argparse.Namespace) -> FactoryState:

@@ -324,7 +324,7 @@ def test_torque_that_does_not_go_off_is_said(robot: Robot) -> None:
     sensors, motors = backend.connect()
     run(robot, sensors, motors, 2)
     robot.joint("l_knee").answers = False
-    with pytest.raises(BackendError, match=r"l_knee \(ID 14\) did not say that torque is off"):
+    with pytest.raises(BackendError, match=r"l_knee \(ID 14\) did not report that torque is off"):
         backend.close()
     assert robot.line.gone, "the port is given back all the same"
     assert sum(servo.get("torque_enable") for servo in robot.servos) == 1
@@ -334,7 +334,7 @@ def test_torque_that_does_not_go_off_is_said(robot: Robot) -> None:
 def test_torque_that_is_proven_off_after_all_is_no_longer_doubted(
     robot: Robot, heard_by: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a busy machine "20 of 20 off, acknowledged" was followed by "20 did not say that torque is off"."""
+    """On a busy machine "20 of 20 off, acknowledged" was followed by "20 did not report that torque is off"."""
 
     class Guardian:
         def close(self) -> bool:
@@ -344,12 +344,12 @@ def test_torque_that_is_proven_off_after_all_is_no_longer_doubted(
     sensors, motors = backend.connect()
     run(robot, sensors, motors, 2)
     robot.joint("l_knee").answers = False
-    with pytest.raises(BackendError, match=r"l_knee .*did not say") as raised:
+    with pytest.raises(BackendError, match=r"l_knee .*did not report") as raised:
         motors.write(Command(ROBOT.home, np.ones(20), Mode.OFF))
     robot.joint("l_knee").answers = heard_by == "closing"
     monkeypatch.setattr(backend, "_lifeline", Guardian())
     backend.close()
-    assert "did not say" not in str(raised.value)
+    assert "did not report" not in str(raised.value)
     assert "l_knee (ID 14) were late to say that torque is off: it is off now, ack" in str(raised.value)
 
 

@@ -147,7 +147,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anybody_measures(
     monkeypatch.setenv("XDG_CONFIG_HOME", str(configuration / "file"))
     code, answer, _ = bringup("calibrate", "--port", "/dev/ttyUSB0")
     assert code == 2
-    assert "set XDG_CONFIG_HOME to a folder of yours" in answer["error"]
+    assert "set XDG_CONFIG_HOME to your own folder" in answer["error"]
 
 
 # What a person does --------------------------------------------------------------------------------------------------
@@ -257,7 +257,7 @@ def test_the_reference_pose_must_be_within_every_range() -> None:
     from servoid.tools.bringup.calibrate import _reference
 
     bent = replace(ROBOT, joints=(replace(ROBOT.joints[0], range=(0.2, 1.0)), *ROBOT.joints[1:]))
-    with pytest.raises(ConfigError, match="head_pan cannot be at 0: give --pose home"):
+    with pytest.raises(ConfigError, match="head_pan cannot be at 0: use --pose home"):
         _reference("zero", bent)
 
 

@@ -86,8 +86,8 @@ def test_a_servo_that_reports_an_error_ends_it(rig: RigProcess, bringup: Any) ->
     ("words", "said"),
     [
         (("l_kneee", "--by", "0.1"), "did you mean 'l_knee'"),
-        (("l_knee", "--by", "0.5"), "up to 0.35 rad"),
-        (("l_knee", "--by", "0"), "it is not 0"),
+        (("l_knee", "--by", "0.5"), "between -0.35 and 0.35 rad"),
+        (("l_knee", "--by", "0"), "and not 0"),
     ],
 )
 def test_wrong_words(bringup: Any, words: tuple[str, ...], said: str) -> None:

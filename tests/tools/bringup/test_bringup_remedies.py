@@ -70,7 +70,7 @@ def test_of_two_strays_the_remedies_adopt_each(rig: RigProcess, bringup: Any) ->
     code, answer, _ = bringup("setup", "l_knee", *VIRTUAL, "--yes")
     assert code == 3
     assert "2 servos have no joint yet" in answer["error"]
-    assert "say which one with --from ID --from-baud N" in answer["error"]
+    assert "choose one with --from ID --from-baud N" in answer["error"]
     code, found, _ = bringup("scan", *VIRTUAL)
     follow(bringup, found["problems"])
     assert bringup("scan", *VIRTUAL)[0] == 0

@@ -101,7 +101,7 @@ def test_a_board_without_servos_and_a_line_without_anybody(rig: RigProcess, brin
         os.close(master)
         os.close(slave)
     assert code == 3
-    assert "nobody answers at 2000000 bit/s: is the supply on" in answer["error"]
+    assert "no answer at 2000000 bit/s: is the supply on" in answer["error"]
 
 
 def test_ports_that_cannot_be_opened(rig: RigProcess, bringup: Any, tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_ports_that_cannot_be_opened(rig: RigProcess, bringup: Any, tmp_path: Pa
     assert (code, "no such port" in answer["error"]) == (3, True)
     code, answer, _ = bringup("check")
     assert code == 2
-    assert "--port virtual to practise" in answer["error"]
+    assert "practise with --port virtual" in answer["error"]
     with bus_of(rig):
         code, answer, _ = bringup("check", "--port", rig.port)
     assert code == 3
@@ -174,7 +174,7 @@ def test_nothing_is_written_without_a_yes(
         (("--id", "5", "--baud", "128000"), "Dynamixel servos have 9600, 57600"),
         (("l_kneee",), "did you mean 'l_knee'?"),
         (("l_knee", "--id", "5"), "not both"),
-        ((), "say which joint"),
+        ((), "joint missing"),
     ],
 )
 def test_what_no_servo_can_be_set_to_is_a_usage_error(bringup: Any, words: tuple[str, ...], said: str) -> None:

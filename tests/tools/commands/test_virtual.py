@@ -177,7 +177,7 @@ def test_a_run_says_that_it_was_the_rig_that_was_late(tmp_path: Path, capsys: py
 
 def test_a_locked_rig_that_nobody_could_advance_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["virtual", "--clock", "locked"]) == 2
-    assert "give --link or --control" in capsys.readouterr().err
+    assert "use --link or --control" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ def _check_new(path: Path) -> None:
     if path.suffix != ".mp4":
         raise ConfigError(f"--video {path}: give a name that ends in .mp4")
     if path.exists():
-        raise ConfigError(f"--video {path}: exists already: give another name")
+        raise ConfigError(f"--video {path}: already exists: choose another name")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()

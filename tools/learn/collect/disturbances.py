@@ -1,4 +1,4 @@
-"""What goes wrong on purpose while data is collected: action noise and pushes, each episode its own kind.
+"""Deliberate disturbances while data is collected: action noise and pushes, different in each episode.
 
 Noise moves the robot off the expert's path, and the label beside it says what the expert does there.
 """
