@@ -39,7 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--list", action="store_true", help="list the names of the rows and stop")
     parser.add_argument(
-        "--policy", default="diffusion", metavar="POLICY", help="controller, as in `servoid run` (default: diffusion)"
+        "--policy",
+        default="diffusion",
+        metavar="NAME|FILE",
+        help="controller, as in `servoid run` (default: diffusion)",
     )
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (default: runs/EVALUATION)")

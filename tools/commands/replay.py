@@ -1,7 +1,7 @@
 """Repeat a recorded simulated run and say whether it comes out identical.
 
 Runs the log's configuration and seed again, without its observations, and compares every observation, state, command,
-plan and event bit by bit. A planner has the settings that the log holds, whatever became of the file that they were in.
+plan and event bit by bit. A planner gets its settings from the log, not from the file that they came from.
 Exit code 0: identical; 1: it differs, and the first difference is named.
 """
 

@@ -46,7 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--policy",
         default="diffusion",
-        help="controller: diffusion (default), expert, gait, a checkpoint, diffusion settings, or FILE.py:Class",
+        metavar="NAME|FILE",
+        help="controller: expert, gait, a checkpoint, diffusion settings or FILE.py:Class (default: diffusion)",
     )
     parser.add_argument(
         "--randomise", action="store_true", help="draw the simulated robot's mass, friction, delays and more"

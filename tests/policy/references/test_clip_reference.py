@@ -127,7 +127,7 @@ def test_many_worlds_play_their_own_clips_as_one_does() -> None:
 
 def test_a_clip_beyond_the_joint_ranges_is_refused() -> None:
     joints = CLIP.joints.copy()
-    joints[3, 11] = 2.4
+    joints[3, 11] = ROBOT.upper[11] + 0.2
     with pytest.raises(ConfigError, match=r"clip 'circle': l_knee goes 0\.20 rad beyond the robot's range"):
         ClipReference(ROBOT, [replace(CLIP, joints=joints)])
     with pytest.raises(ConfigError, match="at least one clip"):
