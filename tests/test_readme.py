@@ -42,7 +42,7 @@ def commands(text: str) -> Iterator[list[str]]:
     for line in (*lines, *(" ".join(span.split()) for span in inline(text))):
         words = shlex.split(line, comments=True) if line.startswith("servoid") else []
         if words and words[0] == "servoid":
-            yield words[1:]
+            yield words[1 : words.index(">") if ">" in words else None]
 
 
 def check(words: list[str], verbs: dict[str, Verb] = VERBS) -> None:

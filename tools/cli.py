@@ -12,7 +12,6 @@ import traceback
 from dataclasses import dataclass, field
 from importlib import metadata
 from textwrap import fill
-from types import ModuleType
 
 from servoid.hw.signals import ignore_interrupts
 from servoid.tools.common import exit_codes
@@ -92,6 +91,7 @@ VERBS: dict[str, Verb] = {
     "replay": Verb("repeat a recorded run and compare", "servoid.tools.commands.replay"),
     "export": Verb("write a recorded run as CSV or Parquet", "servoid.tools.commands.export"),
     "plot": Verb("draw a recorded run", "servoid.tools.commands.plot"),
+    "completion": Verb("print what completes commands in a shell", "servoid.tools.completion"),
 }
 
 
@@ -142,10 +142,16 @@ def _dispatch(prog: str, verbs: dict[str, Verb], argv: list[str]) -> int:
     verb = verbs[name]
     if verb.verbs:
         return _dispatch(f"{prog} {name}", verb.verbs, rest)
+    args = parser_of(f"{prog} {name}", verb).parse_args(rest)
+    return int(importlib.import_module(verb.module).main(args))
+
+
+def parser_of(prog: str, verb: Verb) -> Parser:
+    """The parser of a verb that has a module."""
     module = importlib.import_module(verb.module)
-    parser = Parser(prog=f"{prog} {name}", description=_summary(module), formatter_class=_Formatter)
+    parser = Parser(prog=prog, description=(module.__doc__ or "").strip(), formatter_class=_Formatter)
     module.add_arguments(parser)
-    return int(module.main(parser.parse_args(rest)))
+    return parser
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):
@@ -156,10 +162,6 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
         """Paragraphs wrapped to the terminal; those with an indented line stay as they are."""
         paragraphs = (part if "\n " in part else fill(part, width) for part in text.split("\n\n"))
         return "\n\n".join(paragraphs)
-
-
-def _summary(module: ModuleType) -> str:
-    return (module.__doc__ or "").strip()
 
 
 def _overview(prog: str, verbs: dict[str, Verb]) -> Parser:

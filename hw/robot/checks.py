@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from servoid.hw.config import Marks, available, nearest
+from servoid.hw.config import ConfigError, Marks, available, nearest
 
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot, Servo
@@ -22,6 +23,12 @@ def check_robot(robot: Robot, marks: Marks) -> None:
     _check_angles(robot, marks)
     _check_mirror(robot, marks)
     _check_legs(robot, marks)
+
+
+def check_bus_port(robot: Robot, port: str) -> None:
+    """Raise ConfigError where the port of the servos is the one that the IMU has to itself."""
+    if robot.imu.port is not None and Path(port).resolve() == Path(robot.imu.port).resolve():
+        raise ConfigError(f"--port {port}: {robot.name}'s IMU is on this port: give the port of the servos' adapter")
 
 
 def check_servo(servo: Servo, marks: Marks) -> None:

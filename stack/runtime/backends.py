@@ -10,6 +10,7 @@ from typing import Any
 from servoid.hw.config import ConfigError, nearest
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.world import Scene
+from servoid.hw.robot.checks import check_bus_port
 from servoid.hw.robot.description import Robot
 
 
@@ -56,6 +57,8 @@ def make_backend(
         raise ConfigError("--port virtual belongs to servoid bringup: for a run use --backend virtual, without --port")
     if not kind.simulated and port is None:
         raise ConfigError(f"backend '{name}' needs a port: give --port PATH (`servoid bringup find-port` finds it)")
+    if port is not None:
+        check_bus_port(robot, port)
     if not kind.simulated and randomise:
         raise ConfigError(f"backend '{name}': real hardware cannot be randomised: drop --randomise")
     make = getattr(import_module(kind.module), kind.attribute)

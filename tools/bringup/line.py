@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Clock
+from servoid.hw.robot.checks import check_bus_port
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.tools.common.output import Report, add_json_argument
 
@@ -82,6 +83,7 @@ def open_line(
     from servoid.hw.dynamixel.transport.bus import MARGIN, Bus
     from servoid.hw.dynamixel.transport.port import SerialPort
 
+    check_bus_port(robot, str(args.port))
     with ExitStack() as stack:
         clock: Clock = WallClock()
         path, control = str(args.port), None

@@ -50,6 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         check_seed(args.seed)
+        if args.link is not None and not args.link.name:
+            raise ConfigError(f"--link '{args.link}': give the name of a link that is to be made, such as /tmp/rig")
         if args.control is None and args.link is not None:
             args.control = args.link.with_name(args.link.name + ".control")
         if args.move is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import BackendError
 
@@ -28,7 +30,7 @@ def exit_code(error: BaseException) -> int:
     """The exit code that an exception ends the program with."""
     if isinstance(error, ConfigError):
         return USAGE
-    if _missing_extra(error):
+    if _missing_extra(error) or _of_a_file(error):
         return USAGE
     if isinstance(error, BackendError):
         return HARDWARE
@@ -47,7 +49,14 @@ def explain(error: BaseException) -> str:
     extra = _missing_extra(error)
     if extra:
         return f"this needs the '{extra}' extra ({text}): pip install 'servoid[{extra}]'"
+    if isinstance(error, OSError) and _of_a_file(error):
+        return f"{str(error.filename)[:200]}: {error.strerror}: choose another file or folder"
     return f"internal error: {type(error).__name__}: {text} (SERVOID_DEBUG=1 shows where)"
+
+
+def _of_a_file(error: BaseException) -> bool:
+    """Whether the system refused a file that it names: a name that is too long, say, or a disk that is full."""
+    return isinstance(error, OSError) and isinstance(error.filename, str | os.PathLike) and error.strerror is not None
 
 
 def _missing_extra(error: BaseException) -> str | None:

@@ -60,6 +60,8 @@ class Report:
 def say(text: str, stream: TextIO) -> None:
     """Print a line. Once a terminal was closed, or went with an ssh connection, nothing is printed: what remains to be
     done is done all the same."""
+    encoding = stream.encoding or "utf-8"
+    text = text.encode(encoding, "backslashreplace").decode(encoding)  # names of files may be no text
     try:
         print(text, file=stream, flush=True)
     except OSError as error:

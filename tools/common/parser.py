@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
+from servoid.tools.common.output import say
 
 
 class Parser(argparse.ArgumentParser):
@@ -29,8 +30,14 @@ class Parser(argparse.ArgumentParser):
             self.error(f"unknown {kind} '{name}'{suggestion(name, self._option_string_actions)}")
         return parsed
 
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        """argparse takes `--option=--` for an empty list."""
+        if action.option_strings and "--" in arg_strings:
+            raise argparse.ArgumentError(action, "'--' is no value")
+        return super()._get_values(action, arg_strings)
+
     def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: {message} (see {self.prog} --help)", file=sys.stderr)
+        say(f"{self.prog}: {message} (see {self.prog} --help)", sys.stderr)
         raise SystemExit(exit_codes.USAGE)
 
 
@@ -48,6 +55,17 @@ def positive(text: str) -> float:
         value = -1.0
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
+    return value
+
+
+def counted(text: str) -> int:
+    """An argument that is a number of things: 1 or more."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 1 on")
     return value
 
 

@@ -268,9 +268,8 @@ def select(rows: Sequence[Row], patterns: Sequence[str], quick: bool) -> list[Ro
     for pattern in patterns:
         matching = fnmatch.filter(names, pattern)
         if not matching:
-            close = difflib.get_close_matches(pattern, names, n=1)
-            hint = f"did you mean '{close[0]}'?" if close else f"there are {', '.join(names)}"
-            raise ConfigError(f"--rows {pattern}: no such row; {hint}")
+            close = difflib.get_close_matches(pattern, names, n=3, cutoff=0.0)
+            raise ConfigError(f"--rows {pattern}: no such row; the nearest are {', '.join(close)}; --list shows all")
         chosen.update(matching)
     chosen.update(row.figure.row for row in rows if row.name in chosen and isinstance(row.figure, Beside))
     return [row for row in rows if row.name in chosen]

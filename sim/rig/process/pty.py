@@ -19,10 +19,16 @@ _KERNEL_BUFFER = 4095  # bytes that a terminal holds for its reader
 
 
 class Pty:
-    """A pty, with a symbolic link to it where one is asked for. Raises OSError where it cannot be made."""
+    """A pty, with a symbolic link to it where one is asked for. Raises OSError where it cannot be made.
 
-    def __init__(self, link: Path | None = None) -> None:
+    A link that is there is another program's, unless it points to nothing, or a rig `left` it that was killed: the pty
+    that it points to may be somebody's terminal by now.
+    """
+
+    def __init__(self, link: Path | None = None, left: bool = False) -> None:
         self._link = link
+        if link is not None and link.is_symlink() and (left or not link.exists()):
+            link.unlink()
         self._backlog = bytearray()
         self.master = self.slave = -1
         self.open()
@@ -34,9 +40,10 @@ class Pty:
         os.set_blocking(self.master, False)
         self.name = os.ttyname(self.slave)
         if self._link is not None:
-            if self._link.is_symlink():
-                self._link.unlink()
-            self._link.symlink_to(self.name)
+            try:
+                self._link.symlink_to(self.name)
+            except FileExistsError:
+                raise FileExistsError(f"{self._link} is there already, and no virtual rig made it") from None
 
     @property
     def port(self) -> str:
@@ -101,5 +108,5 @@ class Pty:
             os.close(self.slave)
             self.master = self.slave = -1
             self._backlog.clear()
-        if self._link is not None and self._link.is_symlink():
+        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self.name:
             self._link.unlink()

@@ -61,9 +61,10 @@ class Server:
         self.lateness = Lateness(told)
         self._sent_ns = 0  # when the last of them went out
         self._waiting: deque[bytes] = deque()  # packets that came together because the rig was late
+        left = control is not None and control.is_socket()  # unless a rig that runs has it
         self._listener = None if control is None else _listen(control)
         try:
-            self.pty = Pty(link)
+            self.pty = Pty(link, left)
         except OSError:
             if self._listener is not None and control is not None:
                 self._listener.close()

@@ -76,6 +76,10 @@ def test_it_runs_as_hardware(
     port: str, robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    words = ["--policy", "gait", "--robot", str(robot), "--seconds", "1", "--record", str(tmp_path / "run.mcap")]
-    code = main(["run", "stand", "--backend", "dynamixel", "--port", port, "--start", *words])
+    words = ["--policy", "gait", "--robot", str(robot), "--seconds", "1"]
+    for i in range(5):
+        log = ["--record", str(tmp_path / f"{i}.mcap")]
+        code = main(["run", "stand", "--backend", "dynamixel", "--port", port, "--start", *words, *log])
+        if code != 3:  # a busy machine's rig, which did not answer in time
+            break
     assert code in (0, 4), capfd.readouterr().err  # 4: a busy machine's late samples

@@ -103,7 +103,7 @@ def test_registers_that_differ_are_a_table_and_refused(rig: RigProcess, capsys: 
     ("port", "code", "message"),
     [
         ([], 2, "needs a port: give --port PATH"),
-        (["--port", "virtual"], 2, "for a run give --backend virtual, without --port"),
+        (["--port", "virtual"], 2, "for a run use --backend virtual, without --port"),
         (["--port", "nowhere"], 3, "nowhere: no such port"),
         (["--port", "nowhere", "--randomise"], 2, "drop --randomise"),
         (["--port", "nowhere", "--set", "push=0.1"], 2, "push"),

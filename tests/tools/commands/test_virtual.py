@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -15,7 +16,11 @@ import serial
 from waiting import until
 
 from servoid.hw.dynamixel.protocol import codec
+from servoid.hw.robot.description import load_robot
 from servoid.sim.rig.process.control import RigProcess
+from servoid.sim.rig.process.pty import Pty
+from servoid.sim.rig.process.server import Server
+from servoid.sim.rig.rig import Rig
 from servoid.stack.log.flightlog import read_log
 from servoid.tools.cli import main
 from servoid.tools.commands.run import tell_lateness
@@ -55,6 +60,39 @@ def test_the_verb_serves_a_port_until_ctrl_c(tmp_path: Path) -> None:
     assert process.returncode == 0, err
     assert out == ""
     assert not list(tmp_path.iterdir()), "link and socket are taken away"
+
+
+@pytest.mark.parametrize("link", ["", ".", "/", ".."])
+def test_a_link_that_is_no_name_is_refused(link: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["virtual", "--link", link]) == 2
+    assert "--link" in capsys.readouterr().err
+
+
+def test_what_another_program_has_linked_is_neither_replaced_nor_deleted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "notes").write_text("mine")
+    (tmp_path / "rig").symlink_to("notes")
+    assert main(["virtual", "--link", "rig"]) == 2
+    assert "rig is there already, and no virtual rig made it" in capsys.readouterr().err
+    assert (tmp_path / "rig").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["notes", "rig"]
+
+
+def test_a_link_that_points_to_nothing_or_that_a_killed_rig_left_is_replaced(tmp_path: Path) -> None:
+    link = tmp_path / "rig"
+    link.symlink_to("nothing")
+    first = Pty(link)
+    with socket.socket(socket.AF_UNIX) as control:
+        control.bind(str(tmp_path / "rig.control"))  # of a rig that was killed: nobody listens
+    server = Server(Rig(load_robot()), link=link, control=tmp_path / "rig.control")
+    assert os.readlink(link) == server.pty.name != first.name
+    first.close()
+    assert os.readlink(link) == server.pty.name, "it is another rig's by now"
+    link.unlink()
+    link.symlink_to("/dev/null")
+    server.close()
+    assert os.readlink(link) == "/dev/null"
 
 
 @pytest.mark.slow

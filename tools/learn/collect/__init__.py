@@ -22,6 +22,7 @@ from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
 from servoid.tools.common.folder_lock import locked
 from servoid.tools.common.output import add_json_argument, reporting
+from servoid.tools.common.parser import positive
 
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
@@ -49,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     parser.add_argument(
-        "--seconds", type=float, default=15.0, metavar="S", help="length of an episode (default: %(default)g)"
+        "--seconds", type=positive, default=15.0, metavar="S", help="length of an episode (default: %(default)g)"
     )
     parser.add_argument(
         "--randomise",

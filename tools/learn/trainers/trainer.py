@@ -17,6 +17,7 @@ import yaml
 
 from servoid.hw.config import ConfigError
 from servoid.tools.common.folder_lock import locked
+from servoid.tools.common.parser import counted
 from servoid.tools.learn.flags import add_setting_flags, plain
 from servoid.tools.learn.progress import ProgressLine
 from servoid.tools.learn.settings import TrainingRun
@@ -60,7 +61,7 @@ def add_run_arguments(
         help="continue the run in --out with the settings it started with; its length may change (default: yes)",
     )
     shown = f"threads of torch (default: {threads or 'all cores'})"
-    run.add_argument("--threads", type=int, default=threads or os.cpu_count(), metavar="N", help=shown)
+    run.add_argument("--threads", type=counted, default=threads or os.cpu_count(), metavar="N", help=shown)
     add_setting_flags(parser, base, run)
     return run
 
