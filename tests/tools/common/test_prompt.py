@@ -34,7 +34,9 @@ def answering(monkeypatch: pytest.MonkeyPatch, answer: str) -> Iterator[None]:
     with terminal(monkeypatch) as type_in:
         asked, stderr = threading.Event(), sys.stderr
 
-        class Screen:
+        class Watched:
+            encoding, errors = stderr.encoding, stderr.errors
+
             def write(self, text: str) -> int:
                 if "Press Enter to continue" in text:
                     asked.set()
@@ -46,7 +48,7 @@ def answering(monkeypatch: pytest.MonkeyPatch, answer: str) -> Iterator[None]:
             def fileno(self) -> int:
                 return stderr.fileno()
 
-        monkeypatch.setattr(sys, "stderr", Screen())
+        monkeypatch.setattr(sys, "stderr", Watched())
         person = threading.Thread(target=lambda: asked.wait(60.0) and type_in(answer))
         person.start()
         try:

@@ -179,7 +179,7 @@ def test_rows_are_chosen_by_pattern_and_bring_what_they_are_held_against() -> No
     rows = [SHARE, FALLS, TWICE, EXPERT]
     assert [row.name for row in select(rows, ["a/tw*"], quick=False)] == ["a/twice", "a/expert"]
     assert select(rows, [], quick=True) == rows
-    with pytest.raises(ConfigError, match="did you mean 'a/share'"):
+    with pytest.raises(ConfigError, match="the nearest are a/share"):
         select(rows, ["a/sharee"], quick=False)
 
 
