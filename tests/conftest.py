@@ -10,8 +10,12 @@ from synthetic_recording import write_dataset
 
 from servoid.hw.robot.description import load_robot
 
-# Under nohup, which leaves a hang-up ignored for all that it starts, tests of what a hang-up does would wait for ever.
-signal.signal(signal.SIGHUP, signal.SIG_DFL)
+# A shell lets what it starts in the background ignore Ctrl-C and Ctrl-\\, and nohup a hang-up. A run leaves alone what
+# it finds ignored, and the tests of what these signals do would wait for ever.
+for number in (signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP):
+    signal.signal(number, signal.SIG_DFL)
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
