@@ -13,6 +13,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from scripted import Memory
@@ -293,3 +294,29 @@ def test_it_needs_nothing_but_the_standard_library() -> None:
         [sys.executable, "-I", "-S", "-c", code], capture_output=True, text=True, check=True, cwd="/"
     )
     assert result.stdout.split() == ["False", "False"]
+
+
+def test_servos_are_braked_for_a_while_before_torque_goes_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Torque that went off at once would let the robot drop. In a time that passes only while the port is read."""
+    passed = [0.0]
+    sent: list[tuple[float, bytes]] = []
+
+    class Port:
+        def __init__(self, fd: int) -> None: ...
+
+        def drain(self) -> None: ...
+
+        def write(self, data: bytes) -> None:
+            sent.append((passed[0], data))
+
+        def read(self, seconds: float) -> bytes:
+            passed[0] += seconds + 1e-6
+            return b""
+
+    monkeypatch.setattr(guardian, "GuardedPort", Port)
+    monkeypatch.setattr(guardian, "time", SimpleNamespace(monotonic=lambda: passed[0]))
+    plan = guardian.ReleasePackets(0, "port", 1, b"damp", b"off", b"", 0.0, {}, {}, "")
+    assert guardian.release(plan) == set()
+    braked = next(place for place, data in sent if data == b"damp")
+    released = next(place for place, data in sent if data.startswith(b"off"))
+    assert released - braked >= guardian.DAMP_SECONDS

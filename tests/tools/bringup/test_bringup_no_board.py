@@ -80,6 +80,6 @@ def test_it_runs_as_hardware(
     for i in range(5):
         log = ["--record", str(tmp_path / f"{i}.mcap")]
         code = main(["run", "stand", "--backend", "dynamixel", "--port", port, "--start", *words, *log])
-        if code != 3:  # a busy machine's rig, which did not answer in time
+        if code not in (3, 4):  # a busy machine's rig did not answer in time, or its samples came late
             break
-    assert code in (0, 4), capfd.readouterr().err  # 4: a busy machine's late samples
+    assert code == 0, capfd.readouterr().err
