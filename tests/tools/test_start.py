@@ -48,6 +48,20 @@ def test_an_interrupt_that_a_destructor_swallows_comes_again() -> None:
     assert (result.stdout, result.stderr) == ("raised\n", "")
 
 
+def test_no_second_python_is_started_to_find_a_library() -> None:
+    """It would get Ctrl-C too, and answer with a traceback from deep in its own start."""
+    source = (
+        "import subprocess, sys\n"
+        "sys.addaudithook(lambda event, words: event == 'subprocess.Popen' and print(words[0], words[1]))\n"
+        "from servoid.tools.start import main\n"
+        "sys.argv = ['servoid', 'tasks']\n"
+        "main()\nimport mujoco.rendering.classic.gl_context\n"
+    )
+    result = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, env=os.environ)
+    assert sys.executable not in result.stdout
+    assert result.stderr == ""
+
+
 def interrupted(words: str, after: float, times: int) -> tuple[int, str]:
     """Exit code and standard error of a command whose processes all get SIGINT so long after its start, as from a
     terminal."""
