@@ -68,9 +68,21 @@ def _clip(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[in
     return policy
 
 
+def _task_policy(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
+    from servoid.policy.priors.task_policy import TaskPolicy
+
+    policy: Policy = TaskPolicy(robot, Path(source), shape)
+    return policy
+
+
 # Policies of Servoid's own; besides there are the planner's other settings in configs/policies/.
 POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "gait": _gait}
-_KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert, "clip": _clip}  # of .safetensors files
+_KINDS: dict[str, Maker] = {  # of .safetensors files
+    "diffusion": _diffusion,
+    "tracker": _expert,
+    "clip": _clip,
+    "task_policy": _task_policy,
+}
 
 
 def _own(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
@@ -131,7 +143,7 @@ def policy_fingerprint(name: str, gait: str = "gait") -> dict[str, Any]:
     maker = _maker(name)
     planner = _planner(name) if maker is _diffusion else None
     own = _plugin(name) if maker is _own else None
-    named = name if maker in (_expert, _clip) else None if planner is None else planner.checkpoint
+    named = name if maker in (_expert, _clip, _task_policy) else None if planner is None else planner.checkpoint
     checkpoint = None if named is None else resolve(named)
     return {
         "name": name,
