@@ -62,7 +62,7 @@ VERBS: dict[str, Verb] = {
     "train": Verb(
         "train a network",
         verbs={
-            "expert": Verb("train the tracker of references with PPO", "servoid.tools.learn.trainers.expert"),
+            "tracker": Verb("train the tracker of gait and clips with PPO", "servoid.tools.learn.trainers.tracker"),
             "odometry": Verb("train the correction of leg odometry", "servoid.tools.learn.trainers.odometry"),
             "latent": Verb(
                 "train latent actions for a diffusion model to plan in", "servoid.tools.learn.trainers.latent"
