@@ -15,6 +15,12 @@ from servoid.stack.control.base import BasePolicy
 _NOW = np.array([0])
 
 
+def check_entry(clip: Clip) -> None:
+    """Raises ConfigError for a clip that a run cannot begin with."""
+    if clip.about.begins != "upright":
+        raise ConfigError(f"clip '{clip.name}' begins {clip.about.begins}, and a run begins standing")
+
+
 class ClipPolicy(BasePolicy):
     """Plays a clip once, from the pose that the robot is in, and stays in its last pose; of one robot or of `shape`.
 
@@ -23,8 +29,7 @@ class ClipPolicy(BasePolicy):
     """
 
     def __init__(self, robot: Robot, clip: Clip, shape: tuple[int, ...] = ()) -> None:
-        if clip.about.begins != "upright":
-            raise ConfigError(f"clip '{clip.name}' begins {clip.about.begins}, and a run begins standing")
+        check_entry(clip)
         self._reference = ClipReference(robot, [clip], shape)
         self._entering = np.ones(shape, bool)
 

@@ -43,8 +43,11 @@ class Motions:
         """Rolls the clips out first, which takes seconds. Raises ConfigError for clips of another robot."""
         self.robot, self.n, self.settings, self.clips = robot, n, settings, tuple(clips)
         self.reference = GaitOrClip(robot, clips, (n,))
-        self._lying, self._along = lying(robot, _LYING, seed), along(robot, clips, _ALONG, seed)
         self._begins = np.array([clip.about.begins for clip in clips])
+        self._lies = np.char.startswith(self._begins, "lying")
+        wanted = settings.clip_share > 0.0
+        self._along = along(robot, clips, _ALONG, seed) if wanted else None
+        self._lying = lying(robot, _LYING, seed) if wanted and self._lies.any() else None
         self._ends = np.array([clip.about.ends for clip in clips])
         self._chances = np.full(len(clips), 0.5)  # of failure
         self._astray, self._since = np.zeros(n, int), np.zeros(n, int)  # ticks: far off; since the last change
@@ -85,10 +88,9 @@ class Motions:
             if rng.random() >= self.settings.clip_share:
                 continue
             clip = self._choose(rng, np.ones(len(self.clips), bool))
-            states, rows = self._states(clip, rng)
-            if not len(rows):
+            states, row = self._state(clip, rng)
+            if states is None:
                 continue  # it begins as a walk does: standing, and goes over to some clip
-            row = int(rng.choice(rows))
             self._first[i], self._first_time[i] = clip, states.time[row]
             joints[i] = np.clip(states.joints[row], self.robot.lower, self.robot.upper)
             position[i], orientation[i] = states.position[row], states.orientation[row]
@@ -102,17 +104,21 @@ class Motions:
             joint_velocity=joint_velocity,
         )  # fmt: skip
 
-    def _states(self, clip: int, rng: np.random.Generator) -> tuple[States, Array]:
-        """Where to draw the beginning of a clip from, and the rows there."""
-        lies = str(self._begins[clip]).startswith("lying")
-        if lies and rng.random() < 0.5:
-            front, back = self._begins[clip] == "lying on the front", self._begins[clip] == "lying on the back"
-            fits = self._lying.front if front else ~self._lying.front if back else np.ones(len(self._lying.clip), bool)
-            return self._lying, np.flatnonzero(fits)
-        rows = np.flatnonzero(self._along.clip == clip)
-        if self._begins[clip] == "upright" and rng.random() < 0.5:
-            return self._along, rows[:0]
-        return self._along, rows
+    def _state(self, clip: int, rng: np.random.Generator) -> tuple[States | None, int]:
+        """Where to draw the beginning of a clip from, and the row there; None: it begins standing."""
+        states = self._along
+        if states is None:
+            return None, 0
+        fits = states.clip == clip
+        if rng.random() < 0.5:
+            if self._begins[clip] == "upright":
+                return None, 0
+            if self._lies[clip] and self._lying is not None:
+                states, front = self._lying, self._lying.front
+                sides = {"lying on the front": front, "lying on the back": ~front}
+                fits = sides.get(str(self._begins[clip]), np.ones(len(front), bool))
+        rows = np.flatnonzero(fits)
+        return (states, int(rng.choice(rows))) if len(rows) else (None, 0)
 
     def enter(self, where: Array, rngs: Sequence[np.random.Generator]) -> None:
         """Begin the references of episodes that have begun in the worlds `where`."""
@@ -128,8 +134,7 @@ class Motions:
             self._play(entered, first, self._pose, rates, self._first_time)
 
     def _rate(self, rng: np.random.Generator, clip: int) -> float:
-        lies = str(self._begins[clip]).startswith("lying")
-        slow, fast = self.settings.get_up_rates if lies else self.settings.rates
+        slow, fast = self.settings.get_up_rates if self._lies[clip] else self.settings.rates
         return float(rng.uniform(slow, 1.0 + (fast - 1.0) * self._level))
 
     def _walk_ticks(self, rng: np.random.Generator, first: bool = False) -> int:
@@ -156,7 +161,7 @@ class Motions:
         off = ((truth.gravity + up_vector(frames.root_orientation[:, 0])) ** 2).sum(-1) > _ASTRAY_GRAVITY
         low = np.abs(truth.position[:, 2] - frames.height[:, 0]) > _ASTRAY_HEIGHT * self.robot.standing_height
         grace = self._since < _GRACE_SECONDS * self.robot.rate
-        lies = np.char.startswith(self._begins[self.reference.clip.clip], "lying") & self.on_clip
+        lies = self._lies[self.reference.clip.clip] & self.on_clip
         fallen = truth.fallen & ~self.on_clip
         astray = (np.where(self.on_clip, off | low, truth.fallen)) & ~(lies & grace)
         self._astray = np.where(astray, self._astray + 1, 0)
