@@ -90,6 +90,8 @@ class Instruction:
     obstacles: Array | None = None  # (n, 5) in the heading frame: x, y, radius m, velocity m/s; to be kept clear of
     keyframes: Keyframes | None = None
     ground: Array | None = None  # (2,) m/s over the ground in the heading frame, where the task asks for one
+    skill: str | None = None  # name of a skill, for as long as that is asked for; None: stand, or walk
+    ends: bool = False  # the run ends: come to rest
 
 
 @dataclass(frozen=True, slots=True)
