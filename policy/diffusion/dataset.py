@@ -19,7 +19,6 @@ from servoid.policy.recording import DatasetError, Recording
 from servoid.policy.text.captions import MOTIONS, mirrored, motion_of
 from servoid.policy.text.encoder import load_encoder
 
-
 HELD_OUT = 0.02
 
 

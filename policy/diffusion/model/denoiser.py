@@ -58,7 +58,8 @@ def tick_encoding(ticks: Array, width: int, slowest: float = 400.0) -> Tensor:
     """
     periods = np.geomspace(2.0, slowest, width // 2)
     angles = 2.0 * np.pi * ticks[:, None] / periods
-    return torch.from_numpy(np.concatenate([np.sin(angles), np.cos(angles), np.zeros((len(ticks), width % 2))], 1)).float()
+    waves = np.concatenate([np.sin(angles), np.cos(angles), np.zeros((len(ticks), width % 2))], axis=1)
+    return torch.from_numpy(waves).float()
 
 
 class Denoiser(nn.Module):
