@@ -77,7 +77,9 @@ def test_a_horizon_ends_at_a_tick_that_is_listed() -> None:
     plan = Runtime(model(**SHAPE), replace(SETTINGS, horizon=12), ROBOT).plan(request())
     assert plan.ticks is not None
     assert plan.ticks.tolist() == [1, 2, 3, 4, 6, 8, 12]
-    with pytest.raises(ConfigError, match=r"horizon is 10, but this checkpoint plans states at ticks 1, .* give one of"):
+    with pytest.raises(
+        ConfigError, match=r"horizon is 10, but this checkpoint plans states at ticks 1, .* give one of"
+    ):
         Runtime(model(**SHAPE), replace(SETTINGS, horizon=10), ROBOT)
 
 
