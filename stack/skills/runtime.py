@@ -75,7 +75,7 @@ class SkillPolicy(BasePolicy):
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         """Raises ConfigError for an unknown skill, and for one that nothing leads to."""
-        if instruction.ends:
+        if instruction.stand:
             self._stop()
         elif instruction.skill != self._asked:
             self._asked = instruction.skill
@@ -83,7 +83,7 @@ class SkillPolicy(BasePolicy):
         elif self._asked is None and self._down and not self._ahead:
             self._ahead.extend(way(self._pose, UPRIGHT, self._skills))
         walks = self._now is None and not self._ahead and not self._down
-        told = replace(instruction, skill=None) if walks else Instruction(np.zeros(3), ends=instruction.ends)
+        told = replace(instruction, skill=None) if walks else Instruction(np.zeros(3), stand=True)
         between = self._between.act(state, applied, told)
         if self._now is None and self._ahead and self._may_begin():
             self._perform(self._ahead.popleft())

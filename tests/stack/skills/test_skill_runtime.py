@@ -45,10 +45,10 @@ class Robot:
         self.applied, self.events = ROBOT.home.copy(), list[str]()
         self._estimator = StillEstimator(ROBOT)
 
-    def do(self, seconds: float, skill: str | None, *, velocity: float = 0.0, ends: bool = False) -> Array:
+    def do(self, seconds: float, skill: str | None, *, velocity: float = 0.0, stand: bool = False) -> Array:
         """Goals `(ticks, n_joints)` as the limits let them through; no wish is held back by them."""
         state = self._estimator.update(observation(ROBOT, 0, self.applied), self.applied)
-        instruction = Instruction(np.array([velocity, 0.0, 0.0]), skill=skill, ends=ends)
+        instruction = Instruction(np.array([velocity, 0.0, 0.0]), skill=skill, stand=stand)
         goals = []
         for _ in range(round(seconds * ROBOT.rate)):
             target = self.policy.act(state, self.applied, instruction)
@@ -111,11 +111,11 @@ def test_seated_it_stays_so_for_as_long_as_that_is_asked_for_and_rises_when_noth
 def test_when_the_run_ends_a_seated_robot_stays_where_it_is_and_one_that_waves_stands() -> None:
     robot = Robot()
     robot.do(3.0, "sit-down")
-    robot.do(1.5, None, ends=True)
+    robot.do(1.5, None, stand=True)
     np.testing.assert_allclose(robot.applied, SEATED, atol=1e-6)
     robot = Robot()
     robot.do(3.0, "wave")
-    robot.do(4.0, None, ends=True)
+    robot.do(4.0, None, stand=True)
     assert robot.events[-1] == "'wave' is interrupted: the run ends"
     np.testing.assert_allclose(robot.applied, ROBOT.home, atol=1e-6)
 
