@@ -30,7 +30,6 @@ class Verb:
 
 VERBS: dict[str, Verb] = {
     "tasks": Verb("list tasks and their settings", "servoid.tools.commands.tasks"),
-    "skills": Verb("list skills, or explain one", "servoid.tools.commands.skills"),
     "doctor": Verb("check that this machine is ready", "servoid.tools.commands.doctor"),
     "run": Verb("run a task on a robot", "servoid.tools.commands.run"),
     "rollout": Verb("run a task many times in simulation and measure it", "servoid.tools.commands.rollout"),
@@ -59,6 +58,7 @@ VERBS: dict[str, Verb] = {
             "blend": Verb("join two clips", "servoid.tools.motions.verbs.blend"),
         },
     ),
+    "skills": Verb("list skills, or explain one", "servoid.tools.commands.skills"),
     "collect": Verb("record demonstrations as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
         "train a network",

@@ -32,7 +32,7 @@ class Stands(BasePolicy):
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         self.asked.append(instruction)
-        return ROBOT.home + 0.2 * abs(instruction.velocity[0]) * np.sin(0.5 * len(self.asked))
+        return ROBOT.home + 0.4 * abs(instruction.velocity[0]) * np.sin(0.5 * len(self.asked))
 
 
 class Robot:
@@ -124,7 +124,7 @@ def test_it_walks_between_skills_and_comes_to_rest_before_one() -> None:
     robot = Robot()
     robot.do(1.0, None, velocity=0.2)
     assert robot.stands.asked[-1].velocity[0] == 0.2
-    robot.do(0.2, "wave", velocity=0.2)
+    robot.do(0.16, "wave", velocity=0.2)
     assert robot.stands.asked[-1].velocity[0] == 0.0
     assert list(begun(robot.events)) == [], "not while goals still move"
     robot.do(1.5, "wave", velocity=0.2)
