@@ -19,7 +19,7 @@ Part = Literal["feet", "hands", "knees", "trunk"]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class After:
     """What must be true when a skill is over, beside the pose that it ends in: the robot rests, has gone no further
     than this, and did what was asked."""
 
@@ -49,7 +49,7 @@ class Skill:
     end: str = UPRIGHT
     interrupted_by: Literal["anything", "nothing"] = "nothing"  # another skill, or being asked to stop, before its end
     contacts: tuple[Part, ...] = ("feet",)  # what may touch the ground or a seat
-    outcome: Outcome = field(default_factory=Outcome)
+    after: After = field(default_factory=After)
     name: str = ""  # of its file
     seconds: float = 0.0  # its clip's length
 

@@ -40,7 +40,7 @@ def _poses(skill: Skill) -> str:
 
 
 def _explained(skill: Skill) -> list[tuple[str, str]]:
-    after = skill.outcome
+    after = skill.after
     return [
         ("skill", f"{skill.name}: {skill.about}"),
         ("length", f"{skill.seconds:.1f} s"),

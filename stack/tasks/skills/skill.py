@@ -153,14 +153,14 @@ class PerformSkills(BaseTask):
             return found
         if episode.performs:
             error = self._joint_error(trace, episode)
-            found.append(Criterion("joints off the motion, root mean square", error, "rad", most=last.outcome.joints))
+            found.append(Criterion("joints off the motion, root mean square", error, "rad", most=last.after.joints))
         height = float(trace.displacement[-1, 2]) / self._robot.standing_height
         least, most = (STANDS, math.inf) if last.end == UPRIGHT else (0.0, SITS)
         found += [
             Criterion("height at the end, of the standing height", height, least=least, most=most),
             Criterion("speed of the base at the end", self._speed(trace), "m/s", most=STILL_SPEED),
-            Criterion("distance moved", self._moved(trace, episode), "m", most=last.outcome.moved),
-            Criterion("angle turned", self._turned(trace, episode), "rad", most=last.outcome.turned),
+            Criterion("distance moved", self._moved(trace, episode), "m", most=last.after.moved),
+            Criterion("angle turned", self._turned(trace, episode), "rad", most=last.after.turned),
         ]
         return found
 

@@ -32,7 +32,7 @@ def test_every_skill_lasts_as_long_as_its_clip() -> None:
         ("about: w\nclip: wav\nphrases: [w]\n", "unknown clip 'wav' in .*did you mean 'wave'"),
         ("about: w\nclip: wave\nphrases: []\n", r"w\.yaml:3: phrases: at least one is needed"),
         ("about: w\nclip: wave\nphrases: [w]\npolicy: magic\n", r"w\.yaml:4: policy"),
-        ("about: w\nclip: wave\nphrases: [w]\noutcome: {moved: 0}\n", r"w\.yaml:4: outcome.*moved: must be positive"),
+        ("about: w\nclip: wave\nphrases: [w]\nafter: {moved: 0}\n", r"w\.yaml:4: after.*moved: must be positive"),
         (
             "about: s\nclip: sit-down\nphrases: [s]\nend: sitting\ninterrupted_by: anything\n",
             r"w\.yaml:5: interrupted_by: a skill that does not stay on its feet",
