@@ -197,7 +197,8 @@ def test_a_urdf_is_the_same_robot_as_its_mjcf(tmp_path: Path) -> None:
     links = f'{torso}<link name="imu_link"/>{shank}'
     joints = """<joint name="f" type="fixed"><parent link="torso"/><child link="imu_link"/></joint>
     <joint name="knee" type="revolute"><parent link="torso"/><child link="shank"/>
-    <origin xyz="0 0.1 -0.2" rpy="0 0 1.2"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="3" velocity="2"/></joint>"""
+    <origin xyz="0 0.1 -0.2" rpy="0 0 1.2"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" effort="3" velocity="2"/></joint>"""
     (tmp_path / "own.urdf").write_text(f'<robot name="own">{links}{joints}</robot>')
     source = '<body pos="0 0.1 -0.2" euler="0 0 1.2"><joint name="knee" axis="0 1 0"/>{}</body>'
     foot = '<geom name="shank.0" type="box" pos="0.02 0 -0.1" size="0.05 0.03 0.01"/>'
