@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Reference, State
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import CheckpointError, resolve
-from servoid.policy.motion.clip import Clip
-from servoid.policy.references.either import GaitOrClip
 from servoid.policy.references.gait import Gait
 from servoid.policy.tracker.network import load_tracker
 from servoid.policy.tracker.observation import RESIDUAL, TrackerObservation
 from servoid.stack.control.base import BasePolicy
-from servoid.stack.control.clip import check_entry
 
 
 class Tracker:
@@ -54,40 +49,4 @@ class ExpertPolicy(BasePolicy):
         self._gait.command(instruction.velocity)
         target = self._tracker(state, applied, self._gait)
         self._gait.advance()
-        return target
-
-
-class TrackedClip(BasePolicy):
-    """Plays a clip once, from the pose that the robot is in, and stands, or stays as it ends; keeps its balance.
-
-    It begins after `stand_ticks` of standing. Of one robot, or of worlds of any leading `shape`. Raises ConfigError
-    for a clip that does not begin upright, and CheckpointError where the tracker does not fit.
-    """
-
-    def __init__(
-        self, robot: Robot, clip: Clip, checkpoint: str, shape: tuple[int, ...] = (), stand_ticks: int = 0
-    ) -> None:
-        check_entry(clip)
-        self._stays, self._stand_ticks = clip.about.ends != "upright", stand_ticks
-        self._tracker = Tracker(robot, checkpoint, shape, clips=True)
-        self.reference = GaitOrClip(robot, [clip], shape)
-        self._age = np.zeros(shape, int)  # ticks
-
-    def reset(self, where: Array | None, seeds: Array) -> None:
-        everywhere = np.ones_like(self._age, dtype=bool)
-        chosen = everywhere if where is None else where
-        self.reference.reset(slice(None) if where is None else where)
-        self._age = np.where(chosen, 0, self._age)
-        self._tracker.reset(where)
-
-    def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
-        begins = self._age == self._stand_ticks
-        if begins.any():
-            self.reference.play(0, applied, begins)
-        over = self.reference.ended
-        if over.any() and not self._stays:
-            self.reference.stand(applied, over)
-        target = self._tracker(state, applied, self.reference)
-        self.reference.advance()
-        self._age = self._age + 1
         return target

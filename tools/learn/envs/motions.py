@@ -123,7 +123,8 @@ class Motions:
     def enter(self, where: Array, rngs: Sequence[np.random.Generator]) -> None:
         """Begin the references of episodes that have begun in the worlds `where`."""
         self.reference.reset(where)
-        self._since[where] = self._astray[where] = self._next_command[where] = 0
+        self._astray[where] = self._next_command[where] = 0
+        self._since[where] = round(_GRACE_SECONDS * self.robot.rate)  # whoever begins standing has fallen once it falls
         self._done_at[where], self.closing[where] = -1, False
         for i in np.flatnonzero(where).tolist():
             self._next_change[i] = self._walk_ticks(rngs[i], first=True)
