@@ -128,6 +128,13 @@ class _Author:
                 break
             for number in range(1, len(seconds) + 1):
                 seconds[number - 1] *= max(1.0, 1.02 * fastest[keyframe[1:] == number].max())
+        else:
+            tick = int(fastest.argmax())
+            joint = self._robot.names[int(np.abs(goals[tick + 1] - goals[tick]).argmax())]
+            raise ConfigError(
+                f"clip '{wanted.name}', keyframe {keyframe[tick + 1]}: {joint} is too fast however long it takes: does "
+                "a foot leave the ground before the weight is off it?"
+            )
         return Clip(wanted.name, goals, *solved[1:], carries.astype(float), about).placed()
 
     def _between(self, wanted: AuthoredClip, poses: list[_Pose], seconds: Array) -> tuple[_Pose, Array]:
