@@ -90,6 +90,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     "/plan": _schema(
         {"tick": _INTEGER, "requested": _INTEGER, "adopted": _INTEGER, "first": _INTEGER, "seconds": _NUMBER}
         | _arrays({"actions": "rad", "states": "features", "path": "m, heading frame of the requested tick"})
+        | _arrays({"ticks": "of states and path, ahead of the requested tick"})
     ),
     "/event": _schema({"tick": _INTEGER, "time": _NUMBER, "kind": _TEXT, "joint": _TEXT, "text": _TEXT}),
     "/timing": _schema(
@@ -165,6 +166,7 @@ def messages(record: TickRecord) -> list[tuple[str, dict[str, Any]]]:
             tick
             | {"requested": proposal.plan.requested, "adopted": proposal.plan.adopted, "first": plan.tick}
             | {name: pack(getattr(plan, name), COMPACT) for name in ("actions", "states", "path")}
+            | ({} if plan.ticks is None else {"ticks": pack(plan.ticks, "<i4")})
             | {"seconds": plan.seconds},
         ))  # fmt: skip
     out += [("/event", event_message(event)) for event in record.events]

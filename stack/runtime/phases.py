@@ -166,7 +166,7 @@ class Phases:
     def _come_to_rest(self, state: State) -> Proposal:
         """Ask the policy to stand."""
         try:
-            target = self._policy.act(state, self._guard.applied, Instruction(np.zeros(3)))
+            target = self._policy.act(state, self._guard.applied, Instruction(np.zeros(3), stand=True))
         except Exception as error:
             self._guard.give_up(_failed("policy", error))
             return Proposal()
