@@ -59,6 +59,7 @@ VERBS: dict[str, Verb] = {
             "blend": Verb("join two clips", "servoid.tools.motions.verbs.blend"),
         },
     ),
+    "skills": Verb("list skills, or explain one", "servoid.tools.commands.skills"),
     "collect": Verb("record demonstrations as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
         "train a network",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.robot.description import Robot
@@ -19,12 +18,10 @@ class ClipPolicy(BasePolicy):
     """Plays a clip once, from the pose that the robot is in, and stays in its last pose; of one robot or of `shape`.
 
     Nothing is balanced: what the robot does between its feet and the ground is left to the clip. Raises ConfigError for
-    a clip that does not begin upright: a run begins standing.
+    a clip that leaves the joint ranges.
     """
 
     def __init__(self, robot: Robot, clip: Clip, shape: tuple[int, ...] = ()) -> None:
-        if clip.about.begins != "upright":
-            raise ConfigError(f"clip '{clip.name}' begins {clip.about.begins}, and a run begins standing")
         self._reference = ClipReference(robot, [clip], shape)
         self._entering = np.ones(shape, bool)
 
@@ -40,3 +37,8 @@ class ClipPolicy(BasePolicy):
         target = self._reference.frames(_NOW).position[..., 0, :]
         self._reference.advance()
         return target
+
+    @property
+    def ended(self) -> bool:
+        """Whether the clip is over in every world."""
+        return not self._entering.any() and bool(self._reference.ended.all())
