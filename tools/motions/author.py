@@ -102,11 +102,10 @@ class _Author:
         )
 
     def _reached(self, geom: str, target: Array, joints: Array, where: str) -> Array:
-        model = self._standing.model
-        names = [model.geom(i).name for i in range(model.ngeom)]
-        if geom not in names:
-            raise ConfigError(f"{where}: reach.{geom}: no such geom: {nearest(geom, [n for n in names if n])}")
-        joints, missed = self._standing.reach(geom, target, joints)
+        statics = self._standing.statics
+        if geom not in statics.geoms:
+            raise ConfigError(f"{where}: reach.{geom}: no such geom: {nearest(geom, statics.geoms)}")
+        joints, missed = statics.reach(geom, target, joints)
         if missed > REACHED:
             raise ConfigError(f"{where}: reach.{geom}: {1e3 * missed:.0f} mm out of reach: choose a nearer place")
         return joints

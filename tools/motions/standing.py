@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
 from servoid.hw.contracts.body import Array
@@ -13,13 +12,11 @@ from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import LegInverse, Legs
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.motion.clip import Clip
-from servoid.sim.model import build
+from servoid.sim.statics import Statics
 from servoid.tools.motions.physics import play
 
 _ROUNDS = 60  # of moving the base until the centre of mass is in its place; each leaves about half of the error
 _SETTLE_TICKS = 50
-_STEP = 0.5  # of a joint's correction at most, rad
-_DAMPING = 1e-4  # of the hands' least squares, m2
 
 
 @dataclass(frozen=True)
@@ -38,15 +35,9 @@ class Standing:
     """Solves stances of a robot. Raises ConfigError for legs of another build than `LegInverse` can bend."""
 
     def __init__(self, robot: Robot) -> None:
-        self.robot, self.legs, self.model = robot, Legs(robot), build(robot)
-        self.inverse = LegInverse(self.legs, robot.name)
-        self.data = mujoco.MjData(self.model)
-        ids = [self.model.joint(name).id for name in robot.names]
-        self._at, self._dof = self.model.jnt_qposadr[ids], self.model.jnt_dofadr[ids]
-        self._base = self.model.body(robot.base).id
-        self.mass = float(self.model.body_subtreemass[self._base])
-        self._ankles = [int(self.model.geom(foot.geoms[0]).bodyid[0]) for foot in robot.feet.values()]
-        self.stiffness = np.array([servo.stiffness for servo in robot.servos])
+        self.robot, self.legs, self.statics = robot, Legs(robot), Statics(robot)
+        self._inverse = LegInverse(self.legs, robot.name)
+        self._stiffness = np.array([servo.stiffness for servo in robot.servos])
         self._braced = np.zeros(len(robot.joints))
         self.home, self._braced = self._settled()
 
@@ -58,7 +49,7 @@ class Standing:
         tilt = np.stack([np.zeros(1), 2.0 * np.arctan2(turn[:, 2], turn[:, 0]), np.zeros(1)], -1)
         place, turn = np.stack([np.zeros(1), np.zeros(1), height], -1), quaternion(tilt)
         feet = self.soles(joints, place, turn) * [1.0, 1.0, 0.0]
-        home = Stance(height, tilt, self.centre(joints, place, turn), feet, np.zeros_like(feet), joints)
+        home = Stance(height, tilt, self.statics.centre(joints, place, turn), feet, np.zeros_like(feet), joints)
         solved = self.solve(home)
         return home, self.robot.home - self.loaded(*solved, np.ones(feet.shape[:2], bool))[0]
 
@@ -69,7 +60,7 @@ class Standing:
         place = np.concatenate([stance.centre, stance.height[:, None]], -1)
         for _ in range(_ROUNDS):
             joints[:, self.legs.index] = self._bent(stance, place, turn)
-            error = stance.centre - self.centre(joints, place, turn)
+            error = stance.centre - self.statics.centre(joints, place, turn)
             place[:, :2] += error
             if np.abs(error).max() < 1e-5:
                 break
@@ -80,63 +71,31 @@ class Standing:
         back = turn[:, None] * np.array([1.0, -1.0, -1.0, -1.0])
         rotation = matrix(back) @ matrix(quaternion(stance.turn))
         sole = rotate(back, stance.feet - place[:, None])
-        ankle = sole - np.einsum("tlij,lj->tli", rotation, self.inverse.sole - self.inverse.ankle)
-        return self.inverse(ankle, rotation)
+        ankle = sole - np.einsum("tlij,lj->tli", rotation, self._inverse.sole - self._inverse.ankle)
+        return self._inverse(ankle, rotation)
 
     def miss(self, stance: Stance, joints: Array, place: Array, turn: Array) -> Array:
         """How far each sole is from where it should be `(ticks, n_feet)` m: what is out of the legs' reach."""
         return np.linalg.norm(self.soles(joints, place, turn) - stance.feet, axis=-1)
-
-    def set(self, joints: Array, place: Array, turn: Array) -> None:
-        self.data.qpos[:3], self.data.qpos[3:7], self.data.qpos[self._at] = place, turn, joints
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_comPos(self.model, self.data)
-
-    def centre(self, joints: Array, place: Array, turn: Array) -> Array:
-        """Centre of mass on the ground `(ticks, 2)` m."""
-        out = np.empty((len(joints), 2))
-        for i in range(len(joints)):
-            self.set(joints[i], place[i], turn[i])
-            out[i] = self.data.subtree_com[self._base, :2]
-        return out
 
     def soles(self, joints: Array, place: Array, turn: Array) -> Array:
         """The soles' centres `(ticks, n_feet, 3)` m."""
         centre, _ = self.legs.soles(self.legs.pick(joints))
         return rotate(turn[:, None], centre) + place[:, None]
 
-    def torque(self, joints: Array, place: Array, turn: Array, carries: Array) -> tuple[Array, Array]:
-        """What the servos hold in still poses, `(ticks, n_joints)` N m, and each foot's share of the weight.
-
-        `carries` `(ticks, n_feet)` bool says which feet there are shares of.
-
-        Each foot pushes straight up, the centre of pressure being below the centre of mass.
-        """
-        out = np.empty_like(joints)
-        data, gravity = self.data, self.model.opt.gravity[2]
-        soles, centre = self.soles(joints, place, turn), self.centre(joints, place, turn)
-        weight = self._shares(soles[..., :2], centre, carries)
-        jacobian, force = np.zeros((3, self.model.nv)), np.zeros(self.model.nv)
-        data.qvel[:] = 0.0
-        for i in range(len(joints)):
-            self.set(joints[i], place[i], turn[i])
-            mujoco.mj_comVel(self.model, data)
-            mujoco.mj_rne(self.model, data, 0, force)
-            under = np.append(centre[i] - weight[i] @ soles[i, :, :2], 0.0)
-            for body, share, sole in zip(self._ankles, weight[i], soles[i], strict=True):
-                mujoco.mj_jac(self.model, data, jacobian, None, sole + under, body)
-                force += jacobian[2] * share * self.mass * gravity
-            out[i] = force[self._dof]
-        return out, weight
-
     def loaded(self, joints: Array, place: Array, turn: Array, carries: Array) -> Array:
         """The goals `(ticks, n_joints)` rad that servos, which give under load, hold still poses by.
 
-        Feet that both carry push against each other as much as they do in the home pose.
+        `carries` `(ticks, n_feet)` bool says which feet do. Each pushes straight up, the centre of pressure being below
+        that of mass, and against the others as much as in the home pose.
         """
-        torque, weight = self.torque(joints, place, turn, carries)
+        soles, centre = self.soles(joints, place, turn), self.statics.centre(joints, place, turn)
+        weight = shares(soles[..., :2], centre, carries)
+        off = centre - (weight[..., None] * soles[..., :2]).sum(1)
+        points = soles + np.concatenate([off, np.zeros((len(off), 1))], -1)[:, None]
+        torque = self.statics.torque(joints, place, turn, points, weight)
         both = weight.shape[1] * weight.min(-1, keepdims=True)
-        return joints + torque / self.stiffness + both * self._braced
+        return joints + torque / self._stiffness + both * self._braced
 
     def held(self, clip: Clip) -> Array:
         """The poses `(ticks, n_joints)` rad that servos hold which are told a clip's goals: what `loaded` undoes."""
@@ -148,48 +107,20 @@ class Standing:
                 break
         return joints
 
-    def _shares(self, soles: Array, centre: Array, carries: Array) -> Array:
-        """Share of the weight `(ticks, n_feet)` on each foot that carries, by where the centre of mass is between them.
 
-        The shares' mean of the soles' centres is as near to it as shares from 0 to 1 allow; without a foot on the
-        ground they are 0.
-        """
-        n = np.maximum(carries.sum(-1), 1)[:, None]
-        middle = (carries[..., None] * soles).sum(1) / n
-        arm = np.where(carries[..., None], soles - middle[:, None], 0.0)
-        spread = np.maximum((arm * arm).sum((1, 2)), 1e-9)[:, None]
-        share = np.einsum("tfi,ti->tf", arm, centre - middle) / spread + 1.0 / n
-        share = np.where(carries, np.clip(share, 0.0, 1.0), 0.0)
-        return share / np.maximum(share.sum(-1, keepdims=True), 1e-9)
+def shares(soles: Array, centre: Array, carries: Array) -> Array:
+    """Share of the weight `(ticks, n_feet)` on each foot that carries, by where the centre of mass is between them.
 
-    def reach(self, geom: str, target: Array, joints: Array) -> tuple[Array, float]:
-        """Joints of an arm bent so that `geom` is at `target` (3,) m seen from the base; and by how much it misses, m.
-
-        Damped least squares: C. W. Wampler, IEEE Trans. Systems, Man and Cybernetics 16 (1986) 93.
-        """
-        joints = joints.copy()
-        id = self.model.geom(geom).id
-        chain = self._chain(self.model.geom_bodyid[id])
-        jacobian = np.zeros((3, self.model.nv))
-        low, high = self.robot.lower + self.robot.limits.margin, self.robot.upper - self.robot.limits.margin
-        for _ in range(200):
-            self.set(joints, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-            error = target - self.data.geom_xpos[id]
-            mujoco.mj_jacGeom(self.model, self.data, jacobian, None, id)
-            j = jacobian[:, self._dof[chain]]
-            step = j.T @ np.linalg.solve(j @ j.T + _DAMPING * np.eye(3), error)
-            joints[chain] = np.clip(joints[chain] + np.clip(step, -_STEP, _STEP), low[chain], high[chain])
-        return joints, float(np.linalg.norm(error))
-
-    def _chain(self, body: int) -> list[int]:
-        """Joints between a body and the base."""
-        owner = {int(self.model.jnt_bodyid[self.model.joint(name).id]): i for i, name in enumerate(self.robot.names)}
-        found = []
-        while body not in (self._base, 0):
-            if body in owner:
-                found.append(owner[body])
-            body = int(self.model.body_parentid[body])
-        return found
+    The shares' mean of the soles' centres is as near to it as shares from 0 to 1 allow; without a foot on the
+    ground they are 0.
+    """
+    n = np.maximum(carries.sum(-1), 1)[:, None]
+    middle = (carries[..., None] * soles).sum(1) / n
+    arm = np.where(carries[..., None], soles - middle[:, None], 0.0)
+    spread = np.maximum((arm * arm).sum((1, 2)), 1e-9)[:, None]
+    share = np.einsum("tfi,ti->tf", arm, centre - middle) / spread + 1.0 / n
+    share = np.where(carries, np.clip(share, 0.0, 1.0), 0.0)
+    return share / np.maximum(share.sum(-1, keepdims=True), 1e-9)
 
 
 def quaternion(angles: Array) -> Array:

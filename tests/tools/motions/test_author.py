@@ -59,8 +59,7 @@ def test_goals_hold_a_robot_on_one_foot_though_its_servos_give(tmp_path: Path) -
 def test_a_hand_reaches_where_it_is_told_to(tmp_path: Path) -> None:
     clip = made(tmp_path, "seconds: 1, reach: {r_hand: [0.15, -0.08, 0.1]}")
     standing = Standing(ROBOT)
-    standing.set(standing.held(clip)[-1], np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-    assert standing.data.geom("r_hand").xpos == pytest.approx([0.15, -0.08, 0.1], abs=3e-3)
+    assert standing.statics.place("r_hand", standing.held(clip)[-1]) == pytest.approx([0.15, -0.08, 0.1], abs=3e-3)
 
 
 def test_a_keyframe_that_asks_too_much_speed_takes_longer(tmp_path: Path) -> None:
