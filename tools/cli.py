@@ -48,9 +48,10 @@ VERBS: dict[str, Verb] = {
         },
     ),
     "motions": Verb(
-        "import, list, play, check, mirror and blend clips",
+        "import, author, list, play, check, mirror and blend clips",
         verbs={
             "import": Verb("make clips from a file", "servoid.tools.motions.verbs.import_clip"),
+            "author": Verb("make clips from keyframes", "servoid.tools.motions.verbs.author"),
             "list": Verb("list the clips of a library", "servoid.tools.motions.verbs.list_clips"),
             "play": Verb("play a clip open loop in physics", "servoid.tools.motions.verbs.play"),
             "check": Verb("check joint ranges, speeds and feet of clips", "servoid.tools.motions.verbs.check"),
