@@ -31,7 +31,7 @@ HEAVY = {
         "policy/latent/network.py",
         "policy/latent/dataset.py",
     ),
-    "mujoco": ("sim/",),
+    "mujoco": ("sim/",),  # hw/robot/ reads the robot's body by it, when a robot is loaded
 }
 LONGEST = 400  # lines of a file
 ROOMIEST = 12  # modules of a folder beside its folders

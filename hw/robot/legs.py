@@ -5,12 +5,16 @@ Arrays carry any leading dimensions, then legs in the order of the robot's file:
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import cross
-from servoid.hw.robot.description import Robot
+
+if TYPE_CHECKING:
+    from servoid.hw.robot.description import Robot
 
 
 def _skew(axis: Array) -> Array:
@@ -18,13 +22,18 @@ def _skew(axis: Array) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+def rotations(angles: Array, axes: Array) -> Array:
+    """Turns by `angles` `(n,)` rad about `axes` `(n, 3)`, by Rodrigues' formula: `(n, 3, 3)`."""
+    skew = np.array([_skew(axis) for axis in axes])
+    sin, cos = np.sin(angles)[:, None, None], 1.0 - np.cos(angles)[:, None, None]
+    return np.eye(3) + sin * skew + cos * (skew @ skew)
+
+
 class Legs:
-    """Kinematics of the legs. Raises ConfigError when the legs are not alike in number of joints."""
+    """Kinematics of the legs, which have equally many joints."""
 
     def __init__(self, robot: Robot) -> None:
         legs = list(robot.legs.values())
-        if len({len(leg) for leg in legs}) != 1:
-            raise ConfigError(f"{robot.name}: legs: all legs need the same number of joints")
         self.index = robot.leg_index
         self.names = [[link.joint for link in leg] for leg in legs]
         self.offset = np.array([[link.offset for link in leg] for leg in legs])  # (legs, joints, 3)
@@ -32,7 +41,12 @@ class Legs:
         skew = np.array([[_skew(axis) for axis in leg] for leg in self.axis])
         self._skew, self._skew2 = skew, skew @ skew
         feet = [robot.feet[name] for name in robot.legs]
-        self.sole = np.array([foot.sole for foot in feet])  # (legs, 3) in the last link
+        # The foot's frame is at the last joint, turned as its sole.
+        body, axes = np.array([foot.body_axes for foot in feet]), np.array([foot.axes for foot in feet])
+        turn = body @ axes
+        self._foot = None if np.array_equal(turn, np.broadcast_to(np.eye(3), turn.shape)) else turn
+        at = np.array([foot.body_place for foot in feet]) + np.einsum("lij,lj->li", body, [foot.sole for foot in feet])
+        self.sole = np.einsum("lji,lj->li", turn, at)  # (legs, 3) in the foot's frame
         signs = np.array([[sx, sy, 0.0] for sx in (1, -1) for sy in (1, -1)])
         half = np.array([(*foot.half_size, 0.0) for foot in feet])
         self.corners = self.sole[:, None] + signs * half[:, None]  # (legs, 4, 3)
@@ -42,7 +56,7 @@ class Legs:
         return joints[..., self.index]
 
     def forward(self, q: Array) -> tuple[Array, Array, Array, Array]:
-        """Pose of the last link of each leg in the base frame.
+        """Pose of each foot's frame in the base frame: at the leg's last joint, turned as the sole.
 
         `q` is `(..., n_legs, joints)` rad. Returns position `(..., n_legs, 3)` m, rotation `(..., n_legs, 3, 3)`, and
         for velocities the joints' origins and axes, `(..., n_legs, joints, 3)`, all in the base frame.
@@ -57,6 +71,8 @@ class Legs:
             origins.append(position)
             axes.append(np.einsum("...ij,...j->...i", rotation, self.axis[:, j]))
             rotation = rotation @ turn[..., j, :, :]
+        if self._foot is not None:
+            rotation = rotation @ self._foot
         return position, rotation, np.stack(origins, -2), np.stack(axes, -2)
 
     def velocity(self, point: Array, origins: Array, axes: Array, dq: Array) -> tuple[Array, Array]:

@@ -85,6 +85,11 @@ class TaskEnvironment:
         """Of the terms that count."""
         return self.reward.names
 
+    @property
+    def measures(self) -> Mapping[str, float]:
+        """The prior's error in multiples of held-out data's, now."""
+        return {"prior_ratio": float(self.score.ratio.mean())}
+
     def schedule(self, progress: float) -> None:
         """The prior's reward grows sharper; start states are renewed now and then."""
         self.score.anneal(progress)
