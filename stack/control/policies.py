@@ -124,7 +124,7 @@ def make_policy(
     """A policy for a robot and a task, or for worlds of any leading `shape`.
 
     Raises ConfigError for an unknown name, or for a checkpoint that does not fit. `name` is one of `names`, the
-    .safetensors file of a diffusion model, a tracker or a clip, a .yaml file of diffusion settings, or
+    .safetensors file of a diffusion model, a tracker, a clip or a task policy, a .yaml file of diffusion settings, or
     `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is
     for. `planner` holds the settings of a recorded diffusion policy: no file is read for them then.
     """

@@ -37,8 +37,8 @@ class PriorTraining(DecayedOptimiser, PriorShape, StepRun):
 
     minutes: float = 6.0
     evaluate_every: float = 2.0
-    batch: int = 256
-    learning_rate: float = 1e-3
+    batch: int = 96
+    learning_rate: float = 3e-3
     average: Annotated[float, "decay of the averaged weights, which are the ones saved"] = 0.999
     unstyled: Annotated[float, "share of windows that are shown without their style, for guidance"] = 0.1
     standing: Annotated[bool, "learn from windows in which the robot was asked to stand, too"] = False

@@ -63,7 +63,7 @@ def measure(env: TaskEnvironment, actor: Actor) -> dict[str, float]:
             break
         walks = walk(env, actor, asked)
         up = walks.alive[-1]
-        if not up.any():
+        if not up.any() or len(walks.joints) <= settled:
             continue
         joints = np.moveaxis(walks.joints[settled:, up], 0, 1)
         speed = float(np.linalg.norm(walks.velocity[settled:, up].mean(0), axis=-1).mean())
