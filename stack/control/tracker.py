@@ -17,7 +17,7 @@ class ExpertPolicy(BasePolicy):
 
     def __init__(self, robot: Robot, checkpoint: str = "expert", shape: tuple[int, ...] = ()) -> None:
         self._gait, self._observation = Gait(robot, shape), TrackerObservation(robot, shape)
-        self._tracker, _ = Mlp.load(resolve(checkpoint), "tracker", robot, self._observation.size)
+        self._tracker, _ = Mlp.load(resolve(checkpoint, robot), "tracker", robot, self._observation.size)
 
     def reset(self, where: Array | None, seeds: Array) -> None:
         self._gait.reset(slice(None) if where is None else where)

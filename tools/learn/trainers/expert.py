@@ -49,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
     torch.manual_seed(settings.seed)
     env = Tracking(robot, settings.worlds, odometry, settings, settings.seed)
     trainer = ExpertTrainer(env, settings, args.out)
-    trainer.start(args.resume, None if args.init is None else checkpoint.resolve(args.init))
+    trainer.start(args.resume, None if args.init is None else checkpoint.resolve(args.init, robot))
     trainer.run()
     return 0
 
