@@ -90,6 +90,7 @@ class Instruction:
     obstacles: Array | None = None  # (n, 5) in the heading frame: x, y, radius m, velocity m/s; to be kept clear of
     keyframes: Keyframes | None = None
     ground: Array | None = None  # (2,) m/s over the ground in the heading frame, where the task asks for one
+    skill: str | None = None  # name of a skill, for as long as that is asked for; None: stand, or walk
     stand: bool = False  # come to rest, and stand: that is all a planner's cost is about, whatever the task wants
 
 

@@ -46,6 +46,7 @@ class Episode:
     )  # by tick: change of planar velocity (2,) m/s, world frame
     reach: float | None = None  # m from the goal that count as there, where that is judged
     path: Array | None = None  # (n, 2) m to walk along, in the frame that the robot starts in
+    low: bool = False  # the task has the robot sit, lie or touch the ground: only its tilt tells a fall then
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,11 @@ class Task(Protocol):
     @property
     def steered(self) -> bool:
         """Whether a person steers, who needs real time."""
+        ...
+
+    @property
+    def performs(self) -> bool:
+        """Whether it asks for skills."""
         ...
 
     @property

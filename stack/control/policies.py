@@ -64,7 +64,10 @@ def _clip(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[in
     from servoid.policy.motion.clip import load
     from servoid.stack.control.clip import ClipPolicy
 
-    policy: Policy = ClipPolicy(robot, load(Path(source), robot), shape)
+    clip = load(Path(source), robot)
+    if clip.about.begins != "upright":
+        raise ConfigError(f"clip '{clip.name}' begins {clip.about.begins}, and a run begins standing")
+    policy: Policy = ClipPolicy(robot, clip, shape)
     return policy
 
 

@@ -74,7 +74,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         {"tick": _INTEGER, "mode": _TEXT, "phase": _TEXT} | _arrays({"position": "rad", "gain": "of the firmware's"})
     ),
     "/instruction": _schema(
-        {"tick": _INTEGER, "source": _TEXT, "text": _TEXT}
+        {"tick": _INTEGER, "source": _TEXT, "text": _TEXT, "skill": _TEXT}
         | _arrays(
             {
                 "velocity": "m/s, m/s, rad/s",
@@ -153,6 +153,8 @@ def messages(record: TickRecord) -> list[tuple[str, dict[str, Any]]]:
         instruction: dict[str, Any] = tick | {"velocity": pack(proposal.instruction.velocity, COMPACT)}
         if proposal.instruction.text is not None:
             instruction["text"] = proposal.instruction.text
+        if proposal.instruction.skill is not None:
+            instruction["skill"] = proposal.instruction.skill
         arrays = {name: getattr(proposal.instruction, name) for name in ("goal", "path", "ground")}
         if (percept := proposal.percept) is not None:
             instruction["source"] = percept.source

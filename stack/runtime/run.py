@@ -36,6 +36,9 @@ from servoid.stack.runtime.settings import RunSettings, Script
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Guard
 from servoid.stack.safety.recovery import TRIES
+from servoid.stack.skills.runtime import SkillPolicy
+from servoid.stack.skills.skill import fingerprints as skill_fingerprints
+from servoid.stack.skills.skill import load_skills
 from servoid.stack.tasks import load_task, source
 from servoid.stack.tasks.steer import SteeredAgain
 
@@ -172,6 +175,8 @@ class Run:
             settings.policy, robot, task, self.realtime, planner=self._script.planner
         )
         self._open.callback(self.policy.close)
+        if task.performs:
+            self.policy = SkillPolicy(robot, self.policy, load_skills(robot))
         self._interrupt.check()
         self._open.callback(body.close)
         self._open.callback(setattr, self._interrupt, "eager", False)  # a second Ctrl-C must not break off the closing
@@ -262,6 +267,8 @@ class Run:
         assert settings.record is not None
         policy = policy_fingerprint(settings.policy, self.robot) if own is None else {"name": type(own).__qualname__}
         facts = header(settings, self.robot, self.assignment, source(settings.task), self.body.name, policy)
+        if self.assignment.task.performs:
+            facts["skills"] = skill_fingerprints(self.robot)
         facts["recovery"] = None if self._get_up is None else fingerprints(self.robot)
         wait = self.body.simulation is not None and not self.realtime
         self._recorder = Recorder.create(settings.record, facts, wait=wait)
