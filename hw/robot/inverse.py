@@ -123,7 +123,7 @@ class NumericInverse:
 
 
 @dataclass(frozen=True)
-class Stance:
+class HomeStance:
     """How a robot stands at home, seen from an upright frame at its base: of each leg its first joint that pitches, the
     hip, and its last joint, `(legs, 3)` m; and by how far the base leans forward [rad]."""
 
@@ -137,14 +137,14 @@ class Stance:
         return float(np.abs(self.hip[:, 2] - self.ankle[:, 2]).max()) + 1e-3
 
 
-def stance_at_home(robot: Robot, legs: Legs) -> Stance:
+def stance_at_home(robot: Robot, legs: Legs) -> HomeStance:
     """The stance at the home pose."""
     ankle, _, origins, axes = legs.forward(legs.pick(robot.home))
     turn = rotation_matrix(legs.stand(robot.home)[1])
     pitch = np.abs(axes[..., 1]) > 0.7
     first = np.where(pitch.any(-1), pitch.argmax(-1), 0)
     hip = np.take_along_axis(origins, first[:, None, None], 1)[:, 0]
-    return Stance(hip @ turn.T, ankle @ turn.T, float(np.arctan2(turn[0, 2], turn[2, 2])))
+    return HomeStance(hip @ turn.T, ankle @ turn.T, float(np.arctan2(turn[0, 2], turn[2, 2])))
 
 
 def leg_inverse(robot: Robot) -> LegInverse | NumericInverse:
