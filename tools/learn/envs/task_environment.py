@@ -12,7 +12,7 @@ from servoid.hw.geometry import turned
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.mlp import Mlp
 from servoid.policy.priors.observation import TaskObservation
-from servoid.policy.references.gait import load_gait
+from servoid.policy.references.gait import gait_of
 from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.envs.score_term import GeneratedStarts, ScoreTerm
 from servoid.tools.learn.envs.tasks import LearnedTask, TaskState
@@ -74,7 +74,7 @@ class TaskEnvironment:
         self.joints, self.ground = np.zeros((n, self.action_size)), np.zeros((n, 2))
         self.asked = np.zeros((n, task.size))
         self._next = np.zeros(n, int)
-        self._cycle = round(load_gait(robot.gait).cycle / self.dt)  # over which velocity is judged
+        self._cycle = round(gait_of(robot).cycle / self.dt)  # over which velocity is judged
         self._places = np.zeros((self._cycle + 1, n, 2))  # of the last cycle, newest first
         self._action = np.zeros((n, self.action_size))
         self.observations: dict[str, Array] = {}
