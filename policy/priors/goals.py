@@ -18,7 +18,7 @@ FARTHEST = 1.0  # m: a place farther away is seen at this distance
 
 
 @dataclass(frozen=True)
-class Goal:
+class SeenGoal:
     """A kind of goal: how it is seen `(..., size)`, and in a mirror."""
 
     name: str
@@ -54,11 +54,11 @@ def _location(instruction: Instruction, walking: Walking) -> Array:
     return goal * np.minimum(1.0, FARTHEST / distance)
 
 
-GOALS: Mapping[str, Goal] = {
+GOALS: Mapping[str, SeenGoal] = {
     goal.name: goal
     for goal in (
-        Goal("velocity", 2, Mirror.PLANAR, _velocity),
-        Goal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering),
-        Goal("location", 2, Mirror.PLANAR, _location),
+        SeenGoal("velocity", 2, Mirror.PLANAR, _velocity),
+        SeenGoal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering),
+        SeenGoal("location", 2, Mirror.PLANAR, _location),
     )
 }

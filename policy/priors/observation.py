@@ -9,7 +9,7 @@ from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.features import raw_layout, raw_row
-from servoid.policy.priors.goals import Goal
+from servoid.policy.priors.goals import SeenGoal
 
 _PAST = 4  # decisions before this one whose joints and turning rates are seen
 
@@ -17,7 +17,7 @@ _PAST = 4  # decisions before this one whose joints and turning rates are seen
 class TaskObservation:
     """Builds observations `(..., size)` float32, once a decision, and keeps the short history. `shape` leads."""
 
-    def __init__(self, robot: Robot, goal: Goal, shape: tuple[int, ...] = ()) -> None:
+    def __init__(self, robot: Robot, goal: SeenGoal, shape: tuple[int, ...] = ()) -> None:
         self._home, self._walking, n = robot.home, robot.walking, len(robot.joints)
         self._layout = raw_layout(n)
         self._past = np.zeros((*shape, _PAST, n + 3))
@@ -34,7 +34,7 @@ class TaskObservation:
         self._fresh = np.ones_like(self._fresh) if where is None else self._fresh | where
 
     def __call__(self, state: State, applied: Array, goal: Array, due: Array | None = None) -> Array:
-        """Observe; `applied` `(..., n_joints)` rad is what was commanded last, `goal` what `Goal.observe` gives.
+        """Observe; `applied` `(..., n_joints)` rad is what was commanded last, `goal` what `SeenGoal.observe` gives.
 
         Worlds that decide now are `due` (default: all); the others' history stays, and what is seen of them means
         nothing.

@@ -83,7 +83,7 @@ def test_styles_are_composed_by_the_body(prior: Prior) -> None:
 
 
 def test_an_unknown_style_is_named(prior: Prior) -> None:
-    with pytest.raises(ConfigError, match="style 'zombie'.*high, low"):
+    with pytest.raises(ConfigError, match=r"style 'zombie'.*high, low"):
         Score(prior, Style.parse("zombie"), 0)
 
 

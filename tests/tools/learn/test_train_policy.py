@@ -19,9 +19,9 @@ from servoid.policy.priors.score_matching.model import Style, load_prior
 from servoid.policy.priors.task_policy import TaskPolicy
 from servoid.policy.recording import read_recording
 from servoid.sim.kinematics import limbs_of
+from servoid.tools.learn.demonstrations import demonstrated
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
 from servoid.tools.learn.envs.tasks import LEARNED_TASKS, TaskState, load_learned_task
-from servoid.tools.learn.imitation import demonstrated
 from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.policy import PolicyTrainer, environment
 
@@ -146,7 +146,7 @@ def test_a_task_without_a_reward_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(ConfigError, match=r"mine\.py:2: Mine: .*reward"):
         load_learned_task(f"{file}:Mine", ROBOT)
-    with pytest.raises(ConfigError, match="unknown task 'sped'.*speed"):
+    with pytest.raises(ConfigError, match=r"unknown task 'sped'.*speed"):
         load_learned_task("sped", ROBOT)
 
 

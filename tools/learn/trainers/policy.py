@@ -22,9 +22,9 @@ from servoid.policy import checkpoint
 from servoid.policy.mlp import Mlp
 from servoid.policy.priors.task_policy import KIND, save_task_policy
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
+from servoid.tools.learn.envs.task_judge import measure
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.prior_settings import PolicyTraining
-from servoid.tools.learn.task_judge import measure
 from servoid.tools.learn.trainers.ppo import PpoTrainer
 from servoid.tools.learn.trainers.trainer import add_run_arguments
 
@@ -143,7 +143,7 @@ class PolicyTrainer(PpoTrainer):
         import numpy as np
 
         from servoid.policy.recording import read_recording
-        from servoid.tools.learn.imitation import demonstrated, imitate
+        from servoid.tools.learn.demonstrations import cloned, demonstrated
         from servoid.tools.learn.trainers.trainer import source_of
 
         env, seed = self.env, self.settings.seed
@@ -151,7 +151,7 @@ class PolicyTrainer(PpoTrainer):
         rng = np.random.default_rng(seed)
         seen, targets = demonstrated(recording, env.robot, env.task.seen, env.stride, rng)
         actions = (targets - env.robot.home) / env.reach
-        self.begin_with(imitate(seen, actions, self.settings.hidden, _IMITATION_STEPS, seed))
+        self.begin_with(cloned(seen, actions, self.settings.hidden, _IMITATION_STEPS, seed))
         self.begun_with = {"demonstrations": source_of(folder, recording)}
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:

@@ -10,10 +10,12 @@ from servoid.hw.robot.description import Robot
 from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
 from servoid.tools.learn.envs.tasks.location import TargetLocation
 from servoid.tools.learn.envs.tasks.speed import TargetSpeed
-from servoid.tools.learn.envs.tasks.steering import Steering
+from servoid.tools.learn.envs.tasks.steering import TargetSteering
 
 GROUP = "servoid.learned_tasks"  # of entry points
-LEARNED_TASKS: Mapping[str, type[LearnedTask]] = {cls.name: cls for cls in (TargetSpeed, Steering, TargetLocation)}
+LEARNED_TASKS: Mapping[str, type[LearnedTask]] = {
+    cls.name: cls for cls in (TargetSpeed, TargetSteering, TargetLocation)
+}
 
 
 def load_learned_task(name: str, robot: Robot) -> LearnedTask:

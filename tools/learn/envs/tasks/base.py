@@ -12,7 +12,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.geometry import turned
 from servoid.hw.robot.description import Robot
-from servoid.policy.priors.goals import GOALS, Goal
+from servoid.policy.priors.goals import GOALS, SeenGoal
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class LearnedTask(ABC):
         self.robot = robot
 
     @property
-    def seen(self) -> Goal:
+    def seen(self) -> SeenGoal:
         return GOALS[self.goal]
 
     @abstractmethod

@@ -12,7 +12,7 @@ _SHARPNESS = 0.5 * 5.0**2  # exp(-0.5 error^2) of a human who goes 5 m/s at most
 _SLOWEST = 0.5 / 5.0  # of the top speed that way
 
 
-class Steering(LearnedTask):
+class TargetSteering(LearnedTask):
     """The top speed is that of the direction relative to where it faces: this robot side-steps far slower than it
     walks."""
 

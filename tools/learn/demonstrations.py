@@ -14,7 +14,7 @@ from servoid.hw.robot.description import Robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.features import raw_layout, raw_mirror
 from servoid.policy.mlp import Mlp
-from servoid.policy.priors.goals import Goal
+from servoid.policy.priors.goals import SeenGoal
 from servoid.policy.priors.observation import TaskObservation
 from servoid.tools.learn.progress import counted
 
@@ -27,7 +27,7 @@ _EPS = 1e-2  # added to the deviation of inputs, as rsl-rl's normaliser adds it
 
 
 def demonstrated(
-    recording: Recording, robot: Robot, goal: Goal, stride: int, rng: np.random.Generator
+    recording: Recording, robot: Robot, goal: SeenGoal, stride: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Observations `(n, size)` and joint targets `(n, n_joints)` rad at the decisions of a recording and in a mirror.
 
@@ -63,7 +63,7 @@ def _hindsight(raw: Array, rows: Array, robot: Robot, rng: np.random.Generator) 
     return Instruction(np.concatenate([place / seconds, turn], -1), goal=place)
 
 
-def imitate(observations: Array, actions: Array, hidden: tuple[int, ...], steps: int, seed: int) -> Mlp:
+def cloned(observations: Array, actions: Array, hidden: tuple[int, ...], steps: int, seed: int) -> Mlp:
     """A network with so many `hidden` units, trained on the squared error of actions `(n, action_size)`."""
     import torch
     from torch import nn
