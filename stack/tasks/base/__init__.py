@@ -16,7 +16,7 @@ from servoid.hw.contracts.task import Behaviour, Criterion, Episode, Objective, 
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot, shipped_robot
 from servoid.hw.setting import Setting, asks, check, rescaled
-from servoid.policy.references.gait import load_gait
+from servoid.policy.references.gait import gait_of
 from servoid.stack.tasks.terms.guidance import Weights, total_cost
 
 T = TypeVar("T")
@@ -66,7 +66,7 @@ def fitted(settings: T, robot: Robot) -> T:
             "left": (r.walking.sideways, r.walking.sideways),
             "turning": (r.walking.turning, r.walking.turning),
             "height": (r.walking.height,),
-            "cycle": (load_gait(r.gait).cycle,),
+            "cycle": (gait_of(r).cycle,),
         }
         for r in (robot, shipped_robot())
     )
@@ -106,7 +106,7 @@ class BaseTask:
     @property
     def cycle(self) -> float:
         """Length of a cycle of the robot's gait [s]: within one, every walk sways."""
-        return load_gait((self.robot or shipped_robot()).gait).cycle
+        return gait_of(self.robot or shipped_robot()).cycle
 
     def ticks(self, seconds: float) -> int:
         """The nearest number of ticks, at least one."""
