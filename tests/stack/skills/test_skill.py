@@ -85,5 +85,5 @@ def test_a_tracker_of_clips_performs_where_the_file_says_so(tmp_path: Path) -> N
 def test_a_tracker_of_the_gait_alone_is_refused(tmp_path: Path) -> None:
     path = network(tmp_path / "gait.safetensors", {}, clips=False)
     (tmp_path / "wave.yaml").write_text(f"about: w\nclip: wave\nphrases: [w]\npolicy: tracker\ntracker: {path}\n")
-    with pytest.raises(ConfigError, match="skill 'wave': policy: tracker: .*a tracker of the gait alone"):
+    with pytest.raises(ConfigError, match=r"skill 'wave': policy: tracker: .*a tracker of the gait alone"):
         perform(load_skills(ROBOT, tmp_path)["wave"], ROBOT)
