@@ -101,6 +101,7 @@ class Instruction:
     keyframes: Keyframes | None = None
     ground: Array | None = None  # (2,) m/s over the ground in the heading frame, where the task asks for one
     distances: DistanceMap | None = None  # to the goal by a free way, where the task works that out
+    skill: str | None = None  # name of a skill, for as long as that is asked for; None: stand, or walk
     stand: bool = False  # come to rest, and stand: that is all a planner's cost is about, whatever the task wants
 
 

@@ -279,7 +279,7 @@ class Runtime:
 
 def load_runtime(robot: Robot, settings: DiffusionSettings, cost: Cost | None = None) -> Runtime:
     """The runtime of the checkpoint that `settings` name, for `robot`. Raises ConfigError."""
-    return Runtime(load(resolve(settings.checkpoint), robot), settings, robot, cost)
+    return Runtime(load(resolve(settings.checkpoint, robot), robot), settings, robot, cost)
 
 
 def _repeat(instruction: Instruction, samples: int) -> Instruction:

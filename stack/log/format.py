@@ -74,7 +74,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         {"tick": _INTEGER, "mode": _TEXT, "phase": _TEXT} | _arrays({"position": "rad", "gain": "of the firmware's"})
     ),
     "/instruction": _schema(
-        {"tick": _INTEGER, "source": _TEXT, "text": _TEXT}
+        {"tick": _INTEGER, "source": _TEXT, "text": _TEXT, "skill": _TEXT}
         | _arrays(
             {
                 "velocity": "m/s, m/s, rad/s",
@@ -84,6 +84,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
                 "place": "m, goal in the odometry frame",
                 "obstacles": "x, y, radius m, odometry frame",
                 "robots": "x, y m and heading rad, odometry frame",
+                "objects": "x, y, z m of the middle and quaternion w x y z, odometry frame",
             }
         )
     ),
@@ -153,10 +154,13 @@ def messages(record: TickRecord) -> list[tuple[str, dict[str, Any]]]:
         instruction: dict[str, Any] = tick | {"velocity": pack(proposal.instruction.velocity, COMPACT)}
         if proposal.instruction.text is not None:
             instruction["text"] = proposal.instruction.text
+        if proposal.instruction.skill is not None:
+            instruction["skill"] = proposal.instruction.skill
         arrays = {name: getattr(proposal.instruction, name) for name in ("goal", "path", "ground")}
         if (percept := proposal.percept) is not None:
             instruction["source"] = percept.source
             arrays |= {"place": percept.goal, "obstacles": percept.obstacles, "robots": percept.robots}
+            arrays |= {"objects": percept.objects}
         instruction |= {name: pack(array, COMPACT) for name, array in arrays.items() if array is not None}
         out.append(("/instruction", instruction))
     if proposal.plan is not None:
