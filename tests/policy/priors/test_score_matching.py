@@ -65,7 +65,7 @@ def test_training_makes_it_tell_data_from_noise(synthetic_dataset: Path, tmp_pat
     assert score(known).shape == (64, 3)
     assert score(known).mean() < 0.8 * score(windows(found)).mean()
     assert made.held_out()["error"] < 0.9 * first
-    assert found.header["results"]["step"] == 121
+    assert found.header["results"]["step"] == 120
 
 
 def test_styles_are_composed_by_the_body(prior: Prior) -> None:
