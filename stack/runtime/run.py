@@ -159,6 +159,12 @@ class Run:
             raise ConfigError(f"task '{name}' has {robots} robots, each with its own policy: name one instead")
         if scene is not None and scene.robots is not None and self.settings.recover:
             raise ConfigError(f"task '{name}' has several robots, and a fall of one ends it: drop --recover")
+        if scene is not None and scene.objects and simulation is None:
+            things = ", ".join(dict.fromkeys(thing.kind for thing in scene.objects))
+            raise ConfigError(
+                f"task '{name}' needs to see its {things}, and backend '{self.body.name}' shows none: "
+                "use a simulated one; servoid run skill performs the motion alone"
+            )
         if episode.pushes and simulation is None:
             raise ConfigError(f"backend '{self.body.name}' cannot push the robot: drop the task's push setting")
 
