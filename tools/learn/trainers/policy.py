@@ -31,9 +31,11 @@ from servoid.tools.learn.trainers.trainer import add_run_arguments
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
     from servoid.policy.priors.score_matching.model import Prior, Style
+    from servoid.tools.learn.envs.score_term import Rival
 
 _IMITATION_STEPS = 3000
 _JUDGED = 64  # worlds
+_DISCRIMINATOR = "discriminator.safetensors"  # beside the policy
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,6 +57,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument(
         "--demonstrations", type=Path, metavar="DIR", help="start from a network that imitates this dataset"
     )
+    run.add_argument(
+        "--adversarial",
+        type=Path,
+        metavar="DIR",
+        help="reward by a discriminator that learns from this dataset (AMP); the prior measures and starts episodes",
+    )
+    run.add_argument(
+        "--discriminator", type=Path, metavar="CHECKPOINT", help="reward by this discriminator, which stays as it is"
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -74,8 +85,10 @@ def main(args: argparse.Namespace) -> int:
     robot = load_robot(args.robot)
     prior = load_prior(args.prior, robot, limbs_of(robot))
     style = Style.parse(args.style, args.style_weight)
-    env = environment(args.task, prior, style, settings, settings.worlds, settings.seed)
+    rival = _rival(args, prior, settings)
+    env = environment(args.task, prior, style, settings, settings.worlds, settings.seed, rival)
     trainer = PolicyTrainer(env, style, settings, args.out, args.prior)
+    trainer.rival = rival
     trainer.start(args.resume, args.init)
     if args.demonstrations is not None and not trainer.begun_with:
         trainer.imitate(args.demonstrations)
@@ -83,17 +96,45 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
+def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> Rival | None:
+    """What rewards in the prior's place, where that was asked for. Raises ConfigError."""
+    from servoid.policy.priors.adversarial.discriminator import Adversary, Discriminator, load_discriminator
+    from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.tools.learn.envs.score_term import Rival
+    from servoid.tools.learn.trainers.prior import read_by_style
+
+    if args.discriminator is not None:
+        if args.adversarial is not None:
+            raise ConfigError("give --adversarial or --discriminator, not both: one that learns, or one that stays")
+        return Rival(load_discriminator(args.discriminator, prior), None)
+    if args.adversarial is None:
+        return None
+    if args.resume and (args.out / "resume.pt").exists():
+        raise ConfigError(f"{args.out}: a discriminator does not go on where it stopped: use --no-resume")
+    recordings = read_by_style(args.adversarial, prior.features.robot)
+    discriminator = Discriminator(prior)
+    data = PriorWindows(recordings, prior.features, prior.config)
+    return Rival(discriminator, Adversary(discriminator, data, settings.seed))
+
+
 def environment(
-    task: str, prior: Prior, style: Style, settings: PolicyTraining, worlds: int, seed: int
+    task: str,
+    prior: Prior,
+    style: Style,
+    settings: PolicyTraining,
+    worlds: int,
+    seed: int,
+    rival: Rival | None = None,
 ) -> TaskEnvironment:
-    """Worlds of a task under a prior. Raises ConfigError."""
+    """Worlds of a task under a prior, or under a rival of it. Raises ConfigError."""
     from servoid.stack.estimation.odometry import load_odometry
-    from servoid.tools.learn.envs.score_term import GeneratedStarts, ScoreTerm
+    from servoid.tools.learn.envs.score_term import AdversarialTerm, GeneratedStarts, ScoreTerm
     from servoid.tools.learn.envs.tasks import load_learned_task
 
     robot: Robot = prior.features.robot
     made = load_learned_task(task, robot)
-    score = ScoreTerm(prior, style, worlds, settings, seed)
+    given = prior, style, worlds, settings, seed
+    score = ScoreTerm(*given) if rival is None else AdversarialTerm(*given, rival)
     starts = GeneratedStarts(prior, style, settings, seed)
     return TaskEnvironment(made, score, starts, load_odometry(robot), settings, worlds, seed)
 
@@ -104,6 +145,7 @@ class PolicyTrainer(PpoTrainer):
     BEST = LAST = "policy.safetensors"
     env: TaskEnvironment
     settings: PolicyTraining
+    rival: Rival | None = None
 
     def __init__(self, env: TaskEnvironment, style: Style, settings: PolicyTraining, out: Path, prior: Path) -> None:
         from servoid.stack.log.provenance import sha256
@@ -120,6 +162,11 @@ class PolicyTrainer(PpoTrainer):
         measured = ("return", "falls", "prior_error", "amplitude", "amplitude_error", "cadence")
         self.columns = (*self.columns, *measured)
         self.panels = (*self.panels, ("return", "falls"), ("prior_error",), ("amplitude", "cadence"))
+
+    def learn(self) -> dict[str, float]:
+        row = super().learn()
+        self.env.score.learn()
+        return row
 
     @property
     def title(self) -> str:
@@ -171,4 +218,8 @@ class PolicyTrainer(PpoTrainer):
             "results": results,
             "training": plain(self.settings),
         }
+        if self.rival is not None and self.rival.adversary is not None:
+            from servoid.policy.priors.adversarial.discriminator import save_discriminator
+
+            save_discriminator(path.with_name(_DISCRIMINATOR), self.rival.discriminator, env.score.prior, about)
         save_task_policy(path, self.actor(), env.robot, config, about)
