@@ -24,7 +24,7 @@ RATE = 25.0  # frames a second
 
 
 @dataclass(frozen=True)
-class Motion:
+class BodyMotion:
     """Frames of a motion in a frame of its own, z up from the ground; numpy arrays or torch tensors."""
 
     place: AnyArray  # (..., frames, 3) m of the base
@@ -48,7 +48,7 @@ class Anchor:
     points: AnyArray  # (..., points, 3) m of the key points
 
     @staticmethod
-    def before(motion: Motion, frame: int = 0) -> Anchor:
+    def before(motion: BodyMotion, frame: int = 0) -> Anchor:
         """The given frame of a motion."""
         return Anchor(motion.place[..., frame, :2], motion.heading[..., frame], motion.points[..., frame, :, :])
 
@@ -84,20 +84,20 @@ class Frames:
             Mirror.feet(robot),
         )  # fmt: skip
 
-    def motion(self, place: Array, orientation: Array, joints: Array) -> Motion:
-        """A motion of given poses, with key points and contacts by kinematics; shapes as in `Motion`."""
+    def motion(self, place: Array, orientation: Array, joints: Array) -> BodyMotion:
+        """A motion of given poses, with key points and contacts by kinematics; shapes as in `BodyMotion`."""
         turn = rotation_matrix(orientation)
         points = place[..., None, :] + np.einsum("...ij,...pj->...pi", turn, self.key_points(joints))
-        return Motion(place, orientation, joints, points, self.soles(place, turn, joints))
+        return BodyMotion(place, orientation, joints, points, self.soles(place, turn, joints))
 
-    def of_states(self, raw: Array) -> Motion:
+    def of_states(self, raw: Array) -> BodyMotion:
         """The motion of raw rows `(..., frames, raw size)`, which the estimator's states are."""
         row = raw_layout(len(self.robot.joints)).split(np.asarray(raw, dtype=float))
         lean = _lean(row["gravity"])
         orientation = _headed(lean, row["yaw"][..., 0] - yaw_of(lean))
         return self.motion(row["displacement"], orientation, row["position"])
 
-    def to_relative(self, motion: Motion) -> AnyArray:
+    def to_relative(self, motion: BodyMotion) -> AnyArray:
         """Frames `(..., frames - 1, size)` of a motion, the first of whose frames is only what the second follows."""
         xp = _namespace(motion.place)
         heading = motion.heading
@@ -119,7 +119,7 @@ class Frames:
         ]
         return xp.concat(parts, -1)
 
-    def to_global(self, frames: AnyArray, before: Anchor | None = None) -> Motion:
+    def to_global(self, frames: AnyArray, before: Anchor | None = None) -> BodyMotion:
         """The motion of frames `(..., frames, size)` that follow `before`; None: a frame at the origin, along x.
 
         What the network predicts need not agree with itself: the key points are those of the frames, not those of the
@@ -134,7 +134,7 @@ class Frames:
             moved = moved + before.place[..., None, :]
         place = xp.concat([moved, feature["height"]], -1)
         points = feature["points"].reshape(*turn.shape, -1, 3)
-        return Motion(
+        return BodyMotion(
             place,
             _headed(_lean(feature["gravity"]), heading),
             feature["position"],

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import headed, yaw_of
 from servoid.hw.robot.description import load_robot
-from servoid.policy.diffusion.prefix.frames import Anchor, Frames, Motion, wrapped
+from servoid.policy.diffusion.prefix.frames import Anchor, Frames, BodyMotion, wrapped
 from servoid.policy.features import raw_layout
 from servoid.policy.motion.library import Library
 from servoid.sim.model import build
@@ -23,7 +23,7 @@ ROBOT = load_robot("op3")
 FRAMES = Frames(ROBOT)
 
 
-def _motion(seed: int, frames: int = 12, lean: float = 1.2) -> Motion:
+def _motion(seed: int, frames: int = 12, lean: float = 1.2) -> BodyMotion:
     """A motion that wanders, turns and leans as far as lying."""
     rng = np.random.default_rng(seed)
     place = np.cumsum(0.03 * rng.standard_normal((frames, 3)), 0) + np.array([0.0, 0.0, 0.3])
@@ -36,17 +36,17 @@ def _motion(seed: int, frames: int = 12, lean: float = 1.2) -> Motion:
     return FRAMES.motion(place, orientation, joints)
 
 
-def _same(a: Motion, b: Motion) -> None:
-    for field in fields(Motion):
+def _same(a: BodyMotion, b: BodyMotion) -> None:
+    for field in fields(BodyMotion):
         left, right = np.asarray(getattr(a, field.name)), np.asarray(getattr(b, field.name))
         if field.name == "orientation":  # of either sign
             left = left * np.sign((left * right).sum(-1, keepdims=True))
         np.testing.assert_allclose(left, right, atol=1e-6, err_msg=field.name)
 
 
-def _after(motion: Motion) -> Motion:
-    return Motion(*(getattr(motion, field.name)[..., 1:, :] if field.name != "points" else motion.points[..., 1:, :, :]
-                    for field in fields(Motion)))  # fmt: skip
+def _after(motion: BodyMotion) -> BodyMotion:
+    return BodyMotion(*(getattr(motion, field.name)[..., 1:, :] if field.name != "points" else motion.points[..., 1:, :, :]
+                    for field in fields(BodyMotion)))  # fmt: skip
 
 
 @settings(max_examples=30, deadline=None)
@@ -54,14 +54,14 @@ def _after(motion: Motion) -> Motion:
 def test_either_conversion_undoes_the_other(seed: int, tensors: bool) -> None:
     motion = _motion(seed)
     if tensors:
-        motion = Motion(*(torch.from_numpy(getattr(motion, field.name)) for field in fields(Motion)))
+        motion = BodyMotion(*(torch.from_numpy(getattr(motion, field.name)) for field in fields(BodyMotion)))
     relative = FRAMES.to_relative(motion)
     assert relative.shape == (11, FRAMES.layout.size)
     back = FRAMES.to_global(relative, Anchor.before(motion))
     _same(back, _after(motion))
-    first = Motion(*(getattr(motion, field.name)[:1] for field in fields(Motion)))
-    joined = Motion(*(
-        np.concatenate([np.asarray(getattr(first, f.name)), np.asarray(getattr(back, f.name))]) for f in fields(Motion)
+    first = BodyMotion(*(getattr(motion, field.name)[:1] for field in fields(BodyMotion)))
+    joined = BodyMotion(*(
+        np.concatenate([np.asarray(getattr(first, f.name)), np.asarray(getattr(back, f.name))]) for f in fields(BodyMotion)
     ))  # fmt: skip
     np.testing.assert_allclose(FRAMES.to_relative(joined), np.asarray(relative), atol=1e-5)
 
@@ -113,9 +113,11 @@ def test_states_of_the_estimator_are_a_motion() -> None:
     _same(FRAMES.of_states(raw), motion)
 
 
-def _doubled(motion: Motion) -> Motion:
+def _doubled(motion: BodyMotion) -> BodyMotion:
     """The same with its first frame twice, so that every frame has one before it."""
-    return Motion(*(np.concatenate([x[:1], x]) for x in (getattr(motion, field.name) for field in fields(Motion))))
+    return BodyMotion(
+        *(np.concatenate([x[:1], x]) for x in (getattr(motion, field.name) for field in fields(BodyMotion)))
+    )
 
 
 def test_the_heading_is_smooth_while_the_robot_lies_down() -> None:
