@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import headed, yaw_of
 from servoid.hw.robot.description import load_robot
-from servoid.policy.diffusion.prefix.frames import Anchor, Frames, BodyMotion, wrapped
+from servoid.policy.diffusion.prefix.frames import Anchor, BodyMotion, Frames, wrapped
 from servoid.policy.features import raw_layout
 from servoid.policy.motion.library import Library
 from servoid.sim.model import build
@@ -44,9 +45,8 @@ def _same(a: BodyMotion, b: BodyMotion) -> None:
         np.testing.assert_allclose(left, right, atol=1e-6, err_msg=field.name)
 
 
-def _after(motion: BodyMotion) -> BodyMotion:
-    return BodyMotion(*(getattr(motion, field.name)[..., 1:, :] if field.name != "points" else motion.points[..., 1:, :, :]
-                    for field in fields(BodyMotion)))  # fmt: skip
+def _parts(motion: BodyMotion) -> list[Any]:
+    return [getattr(motion, field.name) for field in fields(BodyMotion)]
 
 
 @settings(max_examples=30, deadline=None)
@@ -54,16 +54,13 @@ def _after(motion: BodyMotion) -> BodyMotion:
 def test_either_conversion_undoes_the_other(seed: int, tensors: bool) -> None:
     motion = _motion(seed)
     if tensors:
-        motion = BodyMotion(*(torch.from_numpy(getattr(motion, field.name)) for field in fields(BodyMotion)))
+        motion = BodyMotion(*map(torch.from_numpy, _parts(motion)))
     relative = FRAMES.to_relative(motion)
     assert relative.shape == (11, FRAMES.layout.size)
     back = FRAMES.to_global(relative, Anchor.before(motion))
-    _same(back, _after(motion))
-    first = BodyMotion(*(getattr(motion, field.name)[:1] for field in fields(BodyMotion)))
-    joined = BodyMotion(*(
-        np.concatenate([np.asarray(getattr(first, f.name)), np.asarray(getattr(back, f.name))]) for f in fields(BodyMotion)
-    ))  # fmt: skip
-    np.testing.assert_allclose(FRAMES.to_relative(joined), np.asarray(relative), atol=1e-5)
+    _same(back, BodyMotion(*(x[1:] for x in _parts(motion))))
+    joined = [np.concatenate([a[:1], b]) for a, b in zip(_parts(motion), _parts(back), strict=True)]
+    np.testing.assert_allclose(FRAMES.to_relative(BodyMotion(*joined)), np.asarray(relative), atol=1e-5)
 
 
 def test_frames_do_not_say_where_the_motion_was() -> None:
