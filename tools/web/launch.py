@@ -14,8 +14,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from servoid.hw.config import ConfigError
-from servoid.tools.web.access import Access
-from servoid.tools.web.link import PageLink
+from servoid.tools.web.browser.access import Access
+from servoid.tools.web.line.link import PageLink
 
 START_SECONDS = 120.0  # for the page to come up on a busy machine
 END_SECONDS = 10.0  # for it to go away when its program is done
@@ -88,7 +88,7 @@ def open_page(view: View, robot: str, tasks: Sequence[dict[str, str]] = ()) -> I
     }
     with theirs:
         process = subprocess.Popen(
-            [sys.executable, "-m", "servoid.tools.web.process", json.dumps(settings)],
+            [sys.executable, "-m", "servoid.tools.web.browser.process", json.dumps(settings)],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,

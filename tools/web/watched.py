@@ -10,8 +10,8 @@ from servoid.stack.runtime.result import Result
 from servoid.stack.runtime.run import Confirm, RunSettings, prepare, run
 from servoid.stack.tasks import find
 from servoid.tools.common.exit_codes import explain
-from servoid.tools.web.link import PageLink
-from servoid.tools.web.snapshot import RunInfo
+from servoid.tools.web.line.link import PageLink
+from servoid.tools.web.line.snapshot import RunInfo
 
 _OUTCOMES = {
     "succeeded": "The task succeeded.",

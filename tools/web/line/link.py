@@ -1,7 +1,7 @@
 """The loop's end of the line to the page's process: it publishes copies, and hears what people ask.
 
 Nothing here waits. A snapshot that the page does not take is dropped, its events kept for the next one; when the page
-dies, nothing is sent any more and the run goes on. What a page sends is data (tools/web/messages.py), checked again
+dies, nothing is sent any more and the run goes on. What a page sends is data (tools/web/line/messages.py), checked again
 here: a page that is not itself any more cannot do more than a person at it.
 """
 
@@ -21,8 +21,8 @@ from servoid.hw.contracts.operator import Halt, Intent
 from servoid.hw.contracts.world import Truth
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.event import Event
-from servoid.tools.web.messages import HALTS, LONGEST, OPEN, Request, parse_request
-from servoid.tools.web.snapshot import RunInfo, Snapshots
+from servoid.tools.web.line.messages import HALTS, LONGEST, OPEN, Request, parse_request
+from servoid.tools.web.line.snapshot import RunInfo, Snapshots
 
 ROOM = 1 << 20  # bytes on the way to the page: some hundred ticks
 MOST = 64  # requests that are read in one tick: a page that floods waits its turn

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from servoid.tools.web.messages import OPEN, Request, parse_request
+from servoid.tools.web.line.messages import OPEN, Request, parse_request
 
 LATE = 0.3  # s that a request may have been on its way longer than the quickest of its sender: then nobody is there now
 LOST = 2.0  # s without a word from whoever is in control, until somebody else may take it

@@ -1,4 +1,4 @@
-"""The page's process: `python -m servoid.tools.web.process SETTINGS`, JSON, started by `servoid.tools.web.launch`.
+"""The page's process: `python -m servoid.tools.web.browser.process SETTINGS`, JSON, started by `servoid.tools.web.launch`.
 
 It reads what the loop publishes and passes on what people ask. The loop never waits for it; when the loop's program has
 ended, or died, pages are told so, and this ends a little later. First it prints one line of JSON: `url`, or `error`.
@@ -24,14 +24,14 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
 from servoid.stack.safety.guard import Phase
-from servoid.tools.web.access import Access
-from servoid.tools.web.control import Control
-from servoid.tools.web.gate import Gate
-from servoid.tools.web.messages import HALTS, Request
-from servoid.tools.web.scene import Scene3D
-from servoid.tools.web.server import PageServer
-from servoid.tools.web.snapshot import Snapshot
-from servoid.tools.web.telemetry import ENDING, Telemetry
+from servoid.tools.web.browser.access import Access
+from servoid.tools.web.browser.control import Control
+from servoid.tools.web.browser.gate import Gate
+from servoid.tools.web.browser.scene import Scene3D
+from servoid.tools.web.browser.server import PageServer
+from servoid.tools.web.browser.telemetry import ENDING, Telemetry
+from servoid.tools.web.line.messages import HALTS, Request
+from servoid.tools.web.line.snapshot import Snapshot
 
 LONGEST = 1 << 20  # bytes of a message of the loop
 NICE = 10  # the loop goes first where they share a core

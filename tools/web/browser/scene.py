@@ -20,8 +20,8 @@ from servoid.hw.robot.description import Robot
 from servoid.sim.marks import GOAL_COLOUR, PATH_COLOUR, PLAN_COLOUR, TRAIL_COLOUR
 from servoid.sim.scene import PILLAR_COLOUR, PILLAR_HEIGHT, SPHERE_COLOUR
 from servoid.sim.shapes import Figure
-from servoid.tools.web.meshes import meshes
-from servoid.tools.web.snapshot import Pose, RunInfo, Snapshot
+from servoid.tools.web.browser.meshes import meshes
+from servoid.tools.web.line.snapshot import Pose, RunInfo, Snapshot
 
 WORLD = "/world"
 TRUTH_COLOUR, TRUTH_OPACITY = (60, 110, 220), 0.35

@@ -20,9 +20,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
 
-from servoid.tools.web.control import Control, Refused
-from servoid.tools.web.messages import LONGEST, Request
-from servoid.tools.web.telemetry import Telemetry
+from servoid.tools.web.browser.control import Control, Refused
+from servoid.tools.web.browser.telemetry import Telemetry
+from servoid.tools.web.line.messages import LONGEST, Request
 
 STATIC = Path(__file__).with_name("static")
 FILES = {

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 from pathlib import Path
 
-from servoid.tools.web.access import Access
+from servoid.tools.web.browser.access import Access
 
 HEAD_SECONDS = 5.0  # for a request: whoever is slower is gone
 LONGEST_HEAD = 16384  # bytes

@@ -16,7 +16,7 @@ from servoid.hw.robot.description import Robot
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import ENDED, Phase
 from servoid.stack.safety.health import FULL
-from servoid.tools.web.snapshot import RunInfo, Snapshot
+from servoid.tools.web.line.snapshot import RunInfo, Snapshot
 
 FINE, NEAR, OVER = 0, 1, 2  # nothing, yellow, red
 COLUMNS = ("position", "target", "effort", "temperature", "voltage", "age", "gain")
