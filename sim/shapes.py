@@ -16,7 +16,7 @@ _GEOM = mujoco.mjtGeom
 
 
 @dataclass(frozen=True)
-class Shape:
+class BodyShape:
     """Something that hangs on a body. `kind` is box, sphere, ellipsoid, cylinder, capsule or mesh."""
 
     body: str
@@ -74,7 +74,7 @@ class Figure:
         colour = model.mat_rgba[material] if material >= 0 else model.geom_rgba[number]
         return np.array(colour, dtype=float)
 
-    def _shape(self, number: int) -> Shape:
+    def _shape(self, number: int) -> BodyShape:
         model = self._model
         kind = _NAMES[int(model.geom_type[number])]
         vertices = faces = None
@@ -84,7 +84,7 @@ class Figure:
             vertices = model.mesh_vert[first : first + count].copy()
             first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
             faces = model.mesh_face[first : first + count].copy()
-        return Shape(
+        return BodyShape(
             body=model.body(int(model.geom_bodyid[number])).name,
             kind=kind,
             size=model.geom_size[number].copy(),

@@ -16,7 +16,7 @@ from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, prepare, run
 from servoid.stack.safety.event import Event
 from servoid.tools.web.line.link import PageLink
-from servoid.tools.web.line.messages import Request
+from servoid.tools.web.line.messages import PageRequest
 from servoid.tools.web.line.snapshot import RunInfo
 
 INFO = RunInfo("op3", "walk", "sim", "gait", simulated=True)
@@ -42,7 +42,7 @@ class Line:
 
     def ask(self, kind: str, **fields: object) -> None:
         self._sequence += 1
-        self.page.send(Request(kind, self._sequence, 0.0, **fields).encode())  # type: ignore[arg-type]
+        self.page.send(PageRequest(kind, self._sequence, 0.0, **fields).encode())  # type: ignore[arg-type]
 
     def told(self) -> list[tuple[str, object]]:
         """All that has arrived."""

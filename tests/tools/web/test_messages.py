@@ -8,8 +8,8 @@ import random
 
 import pytest
 
-from servoid.tools.web.browser.control import LATE, LOST, Control, Refused
-from servoid.tools.web.line.messages import KINDS, LONGEST, OPEN, Request, parse_request
+from servoid.tools.web.browser.rights import LATE, LOST, NotHeeded, Rights
+from servoid.tools.web.line.messages import KINDS, LONGEST, OPEN, PageRequest, parse_request
 
 EXAMPLES = {
     "way": [0.5, 0.0, -1.0],
@@ -49,7 +49,7 @@ def test_a_request_is_read_as_it_was_written(kind: str) -> None:
     ],
 )
 def test_what_is_not_quite_a_request_is_none(change: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="."):
+    with pytest.raises(ValueError, match=r".+"):
         parse_request(json.dumps(message("beat") | change))
 
 
@@ -57,7 +57,7 @@ def test_what_is_not_quite_a_request_is_none(change: dict[str, object]) -> None:
     "data", ["", "[]", "null", "{", "9" * (LONGEST + 1), "[" * 2000, b"\xff\xfe", '{"kind":"beat"}']
 )
 def test_what_is_no_json_of_a_request_is_none(data: str | bytes) -> None:
-    with pytest.raises(ValueError, match="."):
+    with pytest.raises(ValueError, match=r".+"):
         parse_request(data)
 
 
@@ -69,15 +69,15 @@ def test_without_the_token_nobody_is_heard() -> None:
 
 
 def test_one_person_is_in_control_and_anyone_may_stop() -> None:
-    control = Control(None)
+    control = Rights(None)
     control.come(0)
     control.come(1)
     assert hear(control, 0, message("take")) is None
     assert hear(control, 0, message("beat", 2)) is not None
     for kind in KINDS.keys() - OPEN:
-        with pytest.raises(Refused, match="take control first"):
+        with pytest.raises(NotHeeded, match="take control first"):
             hear(control, 1, message(kind, hear.count))
-    with pytest.raises(Refused, match="somebody else"):
+    with pytest.raises(NotHeeded, match="somebody else"):
         hear(control, 1, message("take", hear.count))
     for kind in ("stop", "off"):
         request = hear(control, 1, message(kind, hear.count))
@@ -89,7 +89,7 @@ def test_one_person_is_in_control_and_anyone_may_stop() -> None:
 
 
 def test_control_of_somebody_who_is_silent_can_be_taken() -> None:
-    control = Control(None)
+    control = Rights(None)
     control.come(0)
     control.come(1)
     hear(control, 0, message("take", 1, 0.0), now=10.0)
@@ -99,26 +99,26 @@ def test_control_of_somebody_who_is_silent_can_be_taken() -> None:
 
 def test_what_was_too_long_on_its_way_is_no_heartbeat() -> None:
     """A network that hangs delivers old wishes in a burst: nobody may be there any more."""
-    control = Control(None)
+    control = Rights(None)
     control.come(0)
     hear(control, 0, message("take", 1, 100.0), now=5.0)
     hear(control, 0, message("beat", 2, 101.0), now=6.0 + LATE - 0.01)
-    with pytest.raises(Refused, match="too long"):
+    with pytest.raises(NotHeeded, match="too long"):
         hear(control, 0, message("beat", 3, 102.0), now=7.0 + LATE + 0.01)
     assert hear(control, 0, message("stop", 4, 103.0), now=20.0) is not None
 
 
 def test_an_older_request_never_follows_a_newer_one() -> None:
-    control = Control(None)
+    control = Rights(None)
     control.come(0)
     hear(control, 0, message("take", 5))
     for sequence in (5, 4):
-        with pytest.raises(Refused, match="older"):
+        with pytest.raises(NotHeeded, match="older"):
             hear(control, 0, message("beat", sequence))
 
 
 def test_requests_of_several_people_go_on_in_one_order() -> None:
-    control = Control(None)
+    control = Rights(None)
     control.come(0)
     control.come(1)
     numbers = [hear(control, who, message("truth", 1)) for who in (0, 1)]
@@ -128,7 +128,7 @@ def test_requests_of_several_people_go_on_in_one_order() -> None:
 def test_nothing_that_arrives_breaks_the_page_or_gains_control() -> None:
     """A hundred thousand messages that are nearly right, from somebody without control."""
     rng = random.Random(1)
-    control = Control("secret")
+    control = Rights("secret")
     control.come(0)
     control.come(1)
     hear(control, 0, message("take", 1, token="secret"))
@@ -137,7 +137,7 @@ def test_nothing_that_arrives_breaks_the_page_or_gains_control() -> None:
         data = mutated(rng, json.dumps(message(rng.choice(list(KINDS)), number, token=rng.choice(["secret", "x", ""]))))
         try:
             passed.append(control.hear(1, data, 0.0))
-        except Refused:
+        except NotHeeded:
             continue
     assert control.holder == 0
     assert {request.kind for request in passed if request is not None} <= {"stop", "off", "truth"}
@@ -156,7 +156,7 @@ def mutated(rng: random.Random, text: str) -> str:
     return text
 
 
-def hear(control: Control, who: int, values: dict[str, object], now: float = 0.0) -> Request | None:
+def hear(control: Rights, who: int, values: dict[str, object], now: float = 0.0) -> PageRequest | None:
     hear.count += 1  # type: ignore[attr-defined]
     return control.hear(who, json.dumps(values), now)
 

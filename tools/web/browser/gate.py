@@ -56,7 +56,7 @@ class Gate:
         line, *lines = head.decode("latin-1").split("\r\n")
         words = line.split(" ")
         if len(words) != 3 or words[0] not in ("GET", "HEAD"):
-            await _refuse(writer, "400 Bad Request", "the page only answers GET")
+            await _refuse(writer, "400 Bad PageRequest", "the page only answers GET")
             return
         headers = {name.strip().lower(): value.strip() for name, _, value in (text.partition(":") for text in lines)}
         try:

@@ -10,7 +10,7 @@ import trimesh
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import rotate
-from servoid.sim.shapes import Shape
+from servoid.sim.shapes import BodyShape
 
 SECTIONS = 24  # of a circle
 
@@ -24,9 +24,9 @@ class Mesh:
     faces: Array  # (m, 3) int
 
 
-def meshes(shapes: Sequence[Shape]) -> list[Mesh]:
+def meshes(shapes: Sequence[BodyShape]) -> list[Mesh]:
     """The triangles of shapes, by body and colour."""
-    groups: dict[tuple[str, tuple[float, ...]], list[Shape]] = {}
+    groups: dict[tuple[str, tuple[float, ...]], list[BodyShape]] = {}
     for shape in shapes:
         groups.setdefault((shape.body, tuple(shape.colour.tolist())), []).append(shape)
     made = []
@@ -43,7 +43,7 @@ def meshes(shapes: Sequence[Shape]) -> list[Mesh]:
     return made
 
 
-def triangulated(shape: Shape) -> tuple[Array, Array]:
+def triangulated(shape: BodyShape) -> tuple[Array, Array]:
     """Corners `(n, 3)` m and triangles `(m, 3)` of a shape, about its own middle."""
     size = shape.size
     if shape.kind == "mesh":

@@ -1,4 +1,4 @@
-"""The page's process: `python -m servoid.tools.web.browser.process SETTINGS`, JSON, started by `servoid.tools.web.launch`.
+"""The page's process: `python -m servoid.tools.web.browser.process SETTINGS`, which are JSON.
 
 It reads what the loop publishes and passes on what people ask. The loop never waits for it; when the loop's program has
 ended, or died, pages are told so, and this ends a little later. First it prints one line of JSON: `url`, or `error`.
@@ -25,12 +25,12 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
 from servoid.stack.safety.guard import Phase
 from servoid.tools.web.browser.access import Access
-from servoid.tools.web.browser.control import Control
 from servoid.tools.web.browser.gate import Gate
+from servoid.tools.web.browser.rights import Rights
 from servoid.tools.web.browser.scene import Scene3D
 from servoid.tools.web.browser.server import PageServer
 from servoid.tools.web.browser.telemetry import ENDING, Telemetry
-from servoid.tools.web.line.messages import HALTS, Request
+from servoid.tools.web.line.messages import HALTS, PageRequest
 from servoid.tools.web.line.snapshot import Snapshot
 
 LONGEST = 1 << 20  # bytes of a message of the loop
@@ -41,7 +41,7 @@ FAREWELL_SECONDS = 0.5  # that pages stay after the loop's program has ended
 
 
 @dataclass(frozen=True)
-class Settings:
+class PageSettings:
     """What the process is started with. `fd` is its end of the line to the loop."""
 
     fd: int
@@ -52,18 +52,18 @@ class Settings:
     tasks: list[dict[str, str]]  # that may be started from the page: name, description
 
 
-class Page:
+class PageProcess:
     """Joins the loop, the numbers, the picture and the browsers."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: PageSettings) -> None:
         """Raises ConfigError for a robot that cannot be drawn."""
         robot = load_robot(settings.robot)
         self._settings = settings
         self._stream = socket.socket(fileno=settings.fd)
         self._stream.setblocking(False)
-        self._telemetry, self._control = Telemetry(robot), Control(settings.token)
+        self._telemetry, self._rights = Telemetry(robot), Rights(settings.token)
         self._scene = Scene3D(robot, self._switch_truth)
-        self._server = PageServer(self._telemetry, self._control, self._pass)
+        self._server = PageServer(self._telemetry, self._rights, self._pass)
         self._server.tasks = settings.tasks
         self._newest: Snapshot | None = None
         self._plan: Array | None = None  # (n, 2) m: the newest one's path
@@ -131,7 +131,7 @@ class Page:
             self._phase = self._halted = None
             self._server.renew()
 
-    def _pass(self, request: Request) -> None:
+    def _pass(self, request: PageRequest) -> None:
         """Send a request on to the loop. A full line means that the loop reads nothing."""
         with contextlib.suppress(OSError):
             self._stream.send(request.encode())
@@ -140,8 +140,8 @@ class Page:
 
     def _switch_truth(self, on: bool) -> None:
         """Called by viser, in a thread of its own."""
-        request = Request("truth", 0, 0.0, on=on)
-        self._loop.call_soon_threadsafe(lambda: self._pass(self._control.numbered(request)))
+        request = PageRequest("truth", 0, 0.0, on=on)
+        self._loop.call_soon_threadsafe(lambda: self._pass(self._rights.numbered(request)))
 
     async def _draw(self) -> None:
         """Draw the newest tick, as often as a picture is due, and see to it that a wish to stop is heeded."""
@@ -162,8 +162,8 @@ class Page:
             os.kill(self._parent, signal.SIGINT)
 
 
-async def _main(settings: Settings) -> None:
-    await Page(settings).run()
+async def _main(settings: PageSettings) -> None:
+    await PageProcess(settings).run()
 
 
 def main() -> int:
@@ -171,7 +171,7 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP, signal.SIGQUIT):
         signal.signal(number, signal.SIG_IGN)  # those of the terminal are the loop's, which hangs up when it is done
     try:
-        asyncio.run(_main(Settings(**json.loads(sys.argv[1]))))
+        asyncio.run(_main(PageSettings(**json.loads(sys.argv[1]))))
     except ConfigError as error:
         print(json.dumps({"error": str(error)}), flush=True)
         return 2

@@ -21,7 +21,7 @@ from servoid.sim.marks import GOAL_COLOUR, PATH_COLOUR, PLAN_COLOUR, TRAIL_COLOU
 from servoid.sim.scene import PILLAR_COLOUR, PILLAR_HEIGHT, SPHERE_COLOUR
 from servoid.sim.shapes import Figure
 from servoid.tools.web.browser.meshes import meshes
-from servoid.tools.web.line.snapshot import Pose, RunInfo, Snapshot
+from servoid.tools.web.line.snapshot import BodyPose, RunInfo, Snapshot
 
 WORLD = "/world"
 TRUTH_COLOUR, TRUTH_OPACITY = (60, 110, 220), 0.35
@@ -77,7 +77,7 @@ class Scene3D:
         self._truth_parts = self._add_robot("truth", TRUTH_COLOUR)
         self._contacts = [self._add_contact(name) for name in robot.feet]
         up = np.array([0.0, 0.0, robot.standing_height])
-        self._put(self._robot_parts, Pose(up, np.array([1.0, 0.0, 0.0, 0.0]), robot.home))
+        self._put(self._robot_parts, BodyPose(up, np.array([1.0, 0.0, 0.0, 0.0]), robot.home))
 
     @property
     def port(self) -> int:
@@ -133,7 +133,7 @@ class Scene3D:
         name = f"{WORLD}/contact/{foot}"
         return self._server.scene.add_cylinder(name, 0.05, 0.002, color=CONTACT_COLOUR, opacity=0.6, visible=False)
 
-    def _put(self, parts: list[Any], pose: Pose) -> None:
+    def _put(self, parts: list[Any], pose: BodyPose) -> None:
         if not (np.isfinite(pose.place).all() and np.isfinite(pose.orientation).all()):
             return
         positions, orientations = self._figure.pose(pose.place, pose.orientation, pose.joints)

@@ -20,9 +20,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
 
-from servoid.tools.web.browser.control import Control, Refused
+from servoid.tools.web.browser.rights import NotHeeded, Rights
 from servoid.tools.web.browser.telemetry import Telemetry
-from servoid.tools.web.line.messages import LONGEST, Request
+from servoid.tools.web.line.messages import LONGEST, PageRequest
 
 STATIC = Path(__file__).with_name("static")
 FILES = {
@@ -38,8 +38,8 @@ SILENT_SECONDS = 60.0  # without a word from a browser, until its connection is 
 class PageServer:
     """Serves at the socket `path`. `passed` gets each request that is to go on to the loop."""
 
-    def __init__(self, telemetry: Telemetry, control: Control, passed: Callable[[Request], None]) -> None:
-        self._telemetry, self._control, self._passed = telemetry, control, passed
+    def __init__(self, telemetry: Telemetry, control: Rights, passed: Callable[[PageRequest], None]) -> None:
+        self._telemetry, self._rights, self._passed = telemetry, control, passed
         self._numbers = count()
         self._frame, self._version = "", 0  # the newest frame, and how many there were
         self._begun = 0  # how many runs have begun or ended
@@ -82,14 +82,14 @@ class PageServer:
 
     async def _serve(self, connection: ServerConnection) -> None:
         who = next(self._numbers)
-        self._control.come(who)
+        self._rights.come(who)
         telling = asyncio.create_task(self._tell(who, connection))
         try:
             while True:
                 data = await asyncio.wait_for(connection.recv(), SILENT_SECONDS)
                 try:
-                    request = self._control.hear(who, data, time.monotonic())
-                except Refused as error:
+                    request = self._rights.hear(who, data, time.monotonic())
+                except NotHeeded as error:
                     await connection.send(json.dumps({"kind": "refused", "text": str(error)}))
                     continue
                 if request is not None:
@@ -97,7 +97,7 @@ class PageServer:
         except (ConnectionClosed, TimeoutError):
             pass
         finally:
-            self._control.leave(who)
+            self._rights.leave(who)
             telling.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
                 await telling
@@ -123,7 +123,7 @@ class PageServer:
 
     def _standing(self, who: int) -> str:
         """How a browser stands towards the others, and its robot's program."""
-        control = self._control
+        control = self._rights
         held = "nobody" if control.holder is None else "you" if control.holder == who else "other"
         return json.dumps(
             {"kind": "control", "holder": held, "people": control.people, "tasks": self.tasks, "gone": self.gone}

@@ -1,8 +1,8 @@
 """The loop's end of the line to the page's process: it publishes copies, and hears what people ask.
 
 Nothing here waits. A snapshot that the page does not take is dropped, its events kept for the next one; when the page
-dies, nothing is sent any more and the run goes on. What a page sends is data (tools/web/line/messages.py), checked again
-here: a page that is not itself any more cannot do more than a person at it.
+dies, nothing is sent any more and the run goes on. What a page sends is data (tools/web/line/messages.py), checked once
+more here: a page that is not itself any more cannot do more than a person at it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from servoid.hw.contracts.operator import Halt, Intent
 from servoid.hw.contracts.world import Truth
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.event import Event
-from servoid.tools.web.line.messages import HALTS, LONGEST, OPEN, Request, parse_request
+from servoid.tools.web.line.messages import HALTS, LONGEST, OPEN, PageRequest, parse_request
 from servoid.tools.web.line.snapshot import RunInfo, Snapshots
 
 ROOM = 1 << 20  # bytes on the way to the page: some hundred ticks
@@ -48,7 +48,7 @@ class PageLink:
         self._shows_truth = False
         self._intent = Intent()
         self._heard_ns: int | None = None
-        self._start: Request | None = None
+        self._start: PageRequest | None = None
 
     @property
     def alive(self) -> bool:
@@ -86,7 +86,7 @@ class PageLink:
         age = math.inf if self._heard_ns is None else (self._clock() - self._heard_ns) * 1e-9
         return replace(self._intent, age=age)
 
-    def take_start(self) -> Request | None:
+    def take_start(self) -> PageRequest | None:
         """The newest wish to start a task, once. With it, what was asked before is forgotten, and from now on a wish to
         stop holds for the run to come."""
         self._receive()
@@ -140,7 +140,7 @@ class PageLink:
             with contextlib.suppress(ValueError):  # of a page that is not itself: nobody was heard
                 self._heed(parse_request(data))
 
-    def _heed(self, request: Request) -> None:
+    def _heed(self, request: PageRequest) -> None:
         """Take a request up, unless it is older than the newest one: a wish to stop never is too old."""
         wish = self._intent
         if request.kind in HALTS:
@@ -165,7 +165,7 @@ class PageLink:
         self._stream = None
 
 
-def _after(wish: Intent, request: Request) -> Intent:
+def _after(wish: Intent, request: PageRequest) -> Intent:
     """What is wanted after a request of the person in control."""
     if request.kind == "beat":
         way = np.array(request.way)

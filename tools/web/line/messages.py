@@ -36,7 +36,7 @@ OPEN = HALTS | {"look", "take", "truth"}  # which ask for nothing that moves the
 
 
 @dataclass(frozen=True)
-class Request:
+class PageRequest:
     """What somebody at a page asks. A field that its kind does not have is empty."""
 
     kind: str
@@ -56,7 +56,7 @@ class Request:
         return json.dumps({name: values[name] for name in names}).encode()
 
 
-def parse_request(data: bytes | str, *, token: str | None = None) -> Request:
+def parse_request(data: bytes | str, *, token: str | None = None) -> PageRequest:
     """The request in a message; with a `token`, it must bear that. Raises ValueError for anything else."""
     if len(data) > LONGEST:
         raise ValueError(f"longer than {LONGEST} bytes")
@@ -75,7 +75,7 @@ def parse_request(data: bytes | str, *, token: str | None = None) -> Request:
     if values.keys() != wanted.keys():
         raise ValueError(f"'{kind}' has {', '.join(wanted)} and nothing else")
     read: dict[str, Any] = {name: _READ[what](values[name]) for name, what in wanted.items()}
-    return Request(kind, **read)
+    return PageRequest(kind, **read)
 
 
 def _same(given: Any, token: str) -> bool:

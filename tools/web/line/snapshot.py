@@ -34,7 +34,7 @@ class RunInfo:
 
 
 @dataclass(frozen=True)
-class Pose:
+class BodyPose:
     """A robot somewhere."""
 
     place: Array  # (3,) m of the base
@@ -60,7 +60,7 @@ class Snapshot:
     late: float  # ms that the tick began late
     busy: float  # ms that it took
     missed: int  # ticks that were skipped before it
-    pose: Pose | None = None  # the estimate
+    pose: BodyPose | None = None  # the estimate
     velocity: Array | None = None  # (3,) m/s forward, m/s left, rad/s: the estimate
     tilt: float = float("nan")  # rad
     contact: Array | None = None  # (n_feet,) 0..1
@@ -71,7 +71,7 @@ class Snapshot:
     obstacles: Array | None = None  # (n, 3) m: x, y, radius
     robots: Array | None = None  # (n, 3): x, y m and heading rad
     plan: Array | None = None  # (n, 2) m: where the robot means to go, where a plan was adopted at this tick
-    truth: Pose | None = None
+    truth: BodyPose | None = None
     events: tuple[Event, ...] = field(default=())
 
 
@@ -104,7 +104,7 @@ class Snapshots:
             late=timing.late * 1e-6,
             busy=(timing.read + timing.estimate + timing.act + timing.guard + timing.write + timing.record) * 1e-6,
             missed=timing.missed,
-            pose=None if state is None else Pose(state.displacement, state.orientation, state.position),
+            pose=None if state is None else BodyPose(state.displacement, state.orientation, state.position),
             velocity=None if state is None else np.array([*state.velocity[:2], state.angular_velocity[2]]),
             tilt=np.nan if state is None else float(np.arccos(np.clip(-state.gravity[2], -1.0, 1.0))),
             contact=None if state is None else state.contact,
@@ -115,7 +115,7 @@ class Snapshots:
             obstacles=None if percept is None else percept.obstacles,
             robots=None if percept is None else percept.robots,
             plan=self._plan(record),
-            truth=None if truth is None else Pose(*(np.array(part[0]) for part in _parts(truth))),
+            truth=None if truth is None else BodyPose(*(np.array(part[0]) for part in _parts(truth))),
             events=events,
         )
 

@@ -248,8 +248,8 @@ function showTick() {
     frame.plans ? `${frame.plans} notes on plans` : null,
     frame.unread ? `${frame.unread} joint samples lost` : null,
     frame.contact ? hello.feet.map((name, i) => `${name} ${frame.contact[i] > 0.5 ? "●" : "○"}`).join(" ") : null,
-    frame.text ? `“${frame.text}”` : null,
   ];
+  byId("asked").textContent = asked();
   byId("numbers").textContent = parts.filter(Boolean).join("  ·  ");
   [...byId("joints").tBodies[0].rows].forEach((row, i) => {
     hello.columns.forEach((_, column) => {
@@ -261,6 +261,16 @@ function showTick() {
     row.cells[hello.columns.length + 1].textContent = faults;
     row.cells[hello.columns.length + 1].className = faults ? "over" : "";
   });
+}
+
+function asked() {
+  const part = (value) => (value < 0 ? "−" : "+") + Math.abs(value).toFixed(2);
+  if (frame.text) return `“${frame.text}”`;
+  if (frame.goal && frame.place) {
+    const [x, y] = frame.goal, far = Math.hypot(x - frame.place[0], y - frame.place[1]);
+    return `a goal ${far.toFixed(2)} m away`;
+  }
+  return frame.asked ? `${part(frame.asked[0])} ${part(frame.asked[1])} m/s, ${part(frame.asked[2])} rad/s` : "nothing";
 }
 
 const plots = {

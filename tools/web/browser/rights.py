@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from servoid.tools.web.line.messages import OPEN, Request, parse_request
+from servoid.tools.web.line.messages import OPEN, PageRequest, parse_request
 
 LATE = 0.3  # s that a request may have been on its way longer than the quickest of its sender: then nobody is there now
 LOST = 2.0  # s without a word from whoever is in control, until somebody else may take it
 
 
-class Refused(ValueError):
+class NotHeeded(ValueError):
     """A request that is not heeded; the text tells its sender why."""
 
 
 @dataclass
-class Person:
+class Visitor:
     """Somebody at a page."""
 
     sequence: int = -1  # of the newest request
@@ -24,12 +24,12 @@ class Person:
     heard: float = -math.inf  # s, our clock
 
 
-class Control:
+class Rights:
     """Hears what people at pages ask, and lets through what they may. Times are s of a clock that never goes back."""
 
     def __init__(self, token: str | None) -> None:
         self._token = token
-        self._people: dict[int, Person] = {}
+        self._people: dict[int, Visitor] = {}
         self._sequence = 0
         self.holder: int | None = None
 
@@ -39,7 +39,7 @@ class Control:
         return len(self._people)
 
     def come(self, who: int) -> None:
-        self._people[who] = Person()
+        self._people[who] = Visitor()
 
     def leave(self, who: int) -> None:
         """Their connection is gone."""
@@ -47,24 +47,24 @@ class Control:
         if self.holder == who:
             self.holder = None
 
-    def hear(self, who: int, data: bytes | str, now: float) -> Request | None:
-        """What is to be passed on of a message that came at `now`; None: nothing. Raises Refused."""
+    def hear(self, who: int, data: bytes | str, now: float) -> PageRequest | None:
+        """What is to be passed on of a message that came at `now`; None: nothing. Raises NotHeeded."""
         person = self._people[who]
         try:
             request = parse_request(data, token=self._token)
         except ValueError as error:
-            raise Refused(str(error)) from None
+            raise NotHeeded(str(error)) from None
         if request.sequence <= person.sequence:
-            raise Refused("older than the request before")
+            raise NotHeeded("older than the request before")
         person.sequence = request.sequence
         delay = now - request.time
         person.quickest = min(person.quickest, delay)
         if request.kind not in OPEN and delay - person.quickest > LATE:
-            raise Refused("too long on its way")
+            raise NotHeeded("too long on its way")
         if request.kind == "take":
             self._take(who, now)
         elif request.kind not in OPEN and self.holder != who:
-            raise Refused("take control first")
+            raise NotHeeded("take control first")
         elif request.kind == "release":
             self.holder = None
         person.heard = now
@@ -72,7 +72,7 @@ class Control:
             return None
         return self.numbered(request)
 
-    def numbered(self, request: Request) -> Request:
+    def numbered(self, request: PageRequest) -> PageRequest:
         """A request as it goes on to the loop: with the next number of all that do."""
         self._sequence += 1
         return replace(request, sequence=self._sequence)
@@ -80,5 +80,5 @@ class Control:
     def _take(self, who: int, now: float) -> None:
         holder = None if self.holder is None else self._people[self.holder]
         if holder is not None and self.holder != who and now - holder.heard < LOST:
-            raise Refused("somebody else is in control")
+            raise NotHeeded("somebody else is in control")
         self.holder = who
