@@ -50,6 +50,17 @@ def rotate(quaternion: Array, vector: Array) -> Array:
     return vector + w * t + cross(u, t)
 
 
+def rotation_matrix(quaternion: Array) -> Array:
+    """Rotation `(..., 3, 3)` of unit quaternions `(..., 4)`."""
+    w, x, y, z = split(quaternion)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([joined(*row) for row in rows], -2)
+
+
 def up_vector(quaternion: Array) -> Array:
     """Upward unit vector seen from the body `(..., 3)`."""
     w, x, y, z = split(quaternion)

@@ -247,11 +247,28 @@ class Trajectory:
     yaw_rate: AnyArray  # (batch, horizon) rad/s
     height: AnyArray  # (batch, horizon) m
     joints: AnyArray  # (batch, horizon, n_joints) rad
-    dt: float  # s between ticks; the first is one tick from now
+    ticks: Array  # (horizon,) int, ahead of now: at least 1, and rising
+    dt: float  # s, length of a tick
+
+    @property
+    def times(self) -> Array:
+        """Of the predicted states, `(horizon,)` s from now."""
+        return self.dt * self.ticks
+
+    def mean(self, values: AnyArray, axis: int = -1) -> AnyArray:
+        """Mean over time of `values` of the horizon along `axis`, or of its first part.
+
+        Each state stands for the time since the one before it.
+        """
+        spans = np.diff(self.ticks[: values.shape[axis]], prepend=0)
+        if (spans == spans[0]).all():
+            return values.mean(axis)
+        weights = values.new_tensor(spans / spans.sum())
+        return (values * weights.reshape(-1, *[1] * (-1 - axis))).sum(axis)
 
     @classmethod
-    def of(cls, tokens: AnyArray, n_joints: int, dt: float) -> Trajectory:
-        """From tokens `(batch, horizon, token size)` in physical units."""
+    def of(cls, tokens: AnyArray, n_joints: int, dt: float, ticks: Array | None = None) -> Trajectory:
+        """From tokens `(batch, horizon, token size)` in physical units, at `ticks`; None: at 1, 2, ..."""
         xp = _namespace(tokens)
         token = token_layout(n_joints).split(tokens)
         return cls(
@@ -261,5 +278,6 @@ class Trajectory:
             yaw_rate=token["angular_velocity"][..., 2],
             height=token["height"][..., 0],
             joints=token["position"],
+            ticks=np.arange(1, tokens.shape[-2] + 1) if ticks is None else ticks,
             dt=dt,
         )

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from difflib import get_close_matches
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.world import Scene
-from servoid.hw.robot.description import Robot, Servo
+from servoid.hw.robot.description import Axes, Robot, Servo
+from servoid.hw.robot.mjcf import EXPECTED, compiled, heard, read_body
 from servoid.sim.multi_robot import ADDED, prefix, tell_apart
 from servoid.sim.scene import FOUND, SCENE, add_scene, count_robots
 
 TIMESTEP = 0.004  # s
 FLOOR = f"{ADDED}floor"
-# MuJoCo warns that such a model cannot be saved, which nobody does, and that options differ, which are left out.
-_EXPECTED = "Attaching a spec with an empty prefix|Attach conflict"
 _FORCE, _NET = 2, 3  # data bit beside FOUND, and reduction, of MuJoCo's contact sensor
 
 
@@ -32,22 +30,14 @@ def build(robot: Robot, scene: Scene | None = None) -> mujoco.MjModel:
     """
     result = spec(robot, robots := count_robots(scene))
     if scene is not None:
-        if robots > 1 and len(scene.pillars) + len(scene.spheres):
-            raise ConfigError("a scene has other robots, or pillars and spheres, but not yet both")
+        if robots > 1 and len(scene.pillars) + len(scene.spheres) + len(scene.objects):
+            raise ConfigError("a scene has other robots, or pillars, spheres and objects, but not yet both")
         add_scene(result, scene)
-    model = compiled(result, robot)
+    model = compiled(result, robot.mjcf)
     _check_soles(model, robot)
+    for number in range(robots):
+        _align_imu(model, robot, number)
     return model
-
-
-def compiled(model: mujoco.MjSpec, robot: Robot) -> mujoco.MjModel:
-    """The model that `spec` made. Raises ConfigError where MuJoCo cannot compile the body."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", _EXPECTED)
-        try:
-            return model.compile()
-        except ValueError as error:
-            raise ConfigError(f"{robot.mjcf}: MuJoCo cannot compile it: {' '.join(str(error).split())}") from error
 
 
 def spec(robot: Robot, robots: int = 1) -> mujoco.MjSpec:
@@ -79,72 +69,17 @@ def spec(robot: Robot, robots: int = 1) -> mujoco.MjSpec:
 def _add_body(model: mujoco.MjSpec, robot: Robot, number: int) -> None:
     """Put the body of the robot with this number into the world. Raises ConfigError."""
     path = Path(robot.mjcf)
-    if not path.is_file():
-        raise ConfigError(f"{robot.name}: mjcf: no such file: {path}")
-    try:
-        body = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise ConfigError(f"{path}: not a valid MJCF: {error}") from error
-    _check(body, robot, path)
+    body = read_body(robot)
     for element in [*body.actuators, *body.sensors, *body.keys]:
         body.delete(element)
-    with _heard() as warned:
+    with heard() as warned:
         model.worldbody.add_frame().attach_body(body.body(robot.base), prefix(number), "")
     for text in warned:
-        if not re.match(_EXPECTED, text):
+        if not re.match(EXPECTED, text):
             warnings.warn(f"{path}: {text}", stacklevel=2)
     base = model.body(prefix(number) + robot.base)
     for part in [base, *base.find_all("body")]:
         part.gravcomp = 0.0
-
-
-@contextmanager
-def _heard() -> Iterator[list[str]]:
-    """What MuJoCo warns of meanwhile, instead of its standard error and a file in whatever folder this is."""
-    warned: list[str] = []
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(warned.append)
-    try:
-        yield warned
-    finally:
-        mujoco.set_mju_user_warning(before)
-
-
-def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
-    """Refuse a model that lacks what the robot's file names, or whose base and joints are of another kind."""
-
-    def need(kind: str, wanted: str, present: list[str]) -> None:
-        if wanted not in present:
-            near = get_close_matches(wanted, present, 1)
-            hint = f"; nearest: {near[0]}" if near else ""
-            raise ConfigError(f"{path}: no {kind} named {wanted!r}, which robot {robot.name!r} needs{hint}")
-
-    need("body", robot.base, [body.name for body in model.bodies])
-    base = model.body(robot.base)
-    if base.parent.name != "world":
-        raise ConfigError(
-            f"{path}: body {robot.base!r} is a child of {base.parent.name!r}: "
-            "a robot's base must be a child of <worldbody>"
-        )
-    if [joint.type for joint in base.joints] != [mujoco.mjtJoint.mjJNT_FREE]:
-        raise ConfigError(
-            f"{path}: body {robot.base!r} needs <freejoint/> as its only joint: "
-            f"it has {', '.join(repr(joint.name) for joint in base.joints) or 'none'}"
-        )
-    kinds = {joint.name: joint.type for joint in base.find_all("joint")}
-    for joint in robot.joints:
-        need("joint", joint.name, list(kinds))
-        if kinds[joint.name] != mujoco.mjtJoint.mjJNT_HINGE:
-            raise ConfigError(f"{path}: joint {joint.name!r} is not a hinge, but a servo turns")
-    need("site (the IMU's)", robot.imu_site, [site.name for site in base.find_all("site")])
-    geoms = [geom.name for geom in base.find_all("geom")]
-    for foot in robot.feet.values():
-        for geom in foot.geoms:
-            need("geom (of a sole)", geom, geoms)
-    own = [joint.name for joint in base.joints]
-    extra = [name for name in kinds if name not in robot.names and name not in own]
-    if extra:
-        raise ConfigError(f"{path}: joints that robot {robot.name!r} does not list: {', '.join(extra)}")
 
 
 def _check_soles(model: mujoco.MjModel, robot: Robot) -> None:
@@ -155,6 +90,19 @@ def _check_soles(model: mujoco.MjModel, robot: Robot) -> None:
                 f"{robot.mjcf}: geom {geom.name!r}, of a sole, passes through the floor: "
                 "give its contype or conaffinity the bit 1"
             )
+
+
+def _align_imu(model: mujoco.MjModel, robot: Robot, number: int) -> None:
+    """Turn the IMU's site as the base is, whatever its axes in the file: what an IMU says is in the base's frame, as
+    `imu.signs` and `imu.mounting` make it on a robot."""
+    site = model.site(prefix(number) + robot.imu_site)
+    turn, body = np.array([1.0, 0.0, 0.0, 0.0]), int(site.bodyid[0])
+    while model.body(body).name != prefix(number) + robot.base:  # fixed to it: `load_robot` has checked
+        mujoco.mju_mulQuat(turn, model.body_quat[body].copy(), turn.copy())
+        body = int(model.body_parentid[body])
+    mujoco.mju_negQuat(turn, turn.copy())
+    if not np.allclose(site.quat, turn, atol=1e-9):
+        site.quat[:], model.site_sameframe[site.id] = turn, mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
 def _check_delays(robot: Robot) -> None:
@@ -221,6 +169,7 @@ def _add_servo(model: mujoco.MjSpec, name: str, servo: Servo) -> None:
     joint.stiffness, joint.springref = [0, 0, 0], 0.0
     joint.limited = joint.actfrclimited = False
     joint.range = joint.actfrcrange = [0, 0]
+    joint.ref = 0.0  # zero is the pose that the file draws
     joint.actgravcomp = False
     k = servo.voltage / servo.no_load_speed
     r = k * servo.voltage / servo.stall_torque
@@ -248,7 +197,7 @@ def _add_sensors(model: mujoco.MjSpec, robot: Robot, number: int, robots: int) -
     for name, foot in robot.feet.items():
         body = model.geom(own + foot.geoms[0]).parent
         site = f"{own}{ADDED}{name}_foot"
-        body.add_site(name=site, pos=foot.sole, group=4)
+        body.add_site(name=site, pos=foot.sole, quat=_quaternion(foot.axes), group=4)
         sole = {"reftype": obj.mjOBJ_BODY, "refname": body.name}
         add(
             f"{ADDED}{name}_contact",
@@ -264,3 +213,10 @@ def _add_sensors(model: mujoco.MjSpec, robot: Robot, number: int, robots: int) -
     for other in (i for i in range(robots) if i != number):  # of the scene's sensors: what it touches beside the floor
         base = prefix(other) + robot.base
         add(f"{SCENE}robot{other}", kind.mjSENS_CONTACT, obj.mjOBJ_XBODY, base, intprm=[FOUND, 0, 1], **whole)
+
+
+def _quaternion(axes: Axes) -> Array:
+    """A rotation, given by its rows, as a unit quaternion w x y z `(4,)`."""
+    result = np.zeros(4)
+    mujoco.mju_mat2Quat(result, np.array(axes).ravel())
+    return result

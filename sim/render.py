@@ -13,8 +13,9 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
+from servoid.hw.robot.mjcf import compiled
 from servoid.sim.marks import Frame, draw
-from servoid.sim.model import compiled, spec
+from servoid.sim.model import spec
 from servoid.sim.multi_robot import prefix
 
 AZIMUTH, ELEVATION, DISTANCE = 140.0, -20.0, 1.3  # degrees and m, of the camera that follows the robot
@@ -40,7 +41,7 @@ def render(
     `shadows` None: where drawing is quick enough. Raises RenderError when there is no way to draw.
     """
     others = 0 if not frames or frames[0].robots is None else len(frames[0].robots)
-    model = compiled(spec(robot, 1 + others), robot)
+    model = compiled(spec(robot, 1 + others), robot.mjcf)
     model.vis.quality.offsamples = 0  # in software, smoothing takes as long again
     model.vis.quality.shadowsize, model.vis.map.shadowclip = SHADOW_SIZE, SHADOW_REACH
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height

@@ -48,9 +48,10 @@ VERBS: dict[str, Verb] = {
         },
     ),
     "motions": Verb(
-        "import, list, play, check, mirror and blend clips",
+        "import, author, list, play, check, mirror and blend clips",
         verbs={
             "import": Verb("make clips from a file", "servoid.tools.motions.verbs.import_clip"),
+            "author": Verb("make clips from keyframes", "servoid.tools.motions.verbs.author"),
             "list": Verb("list the clips of a library", "servoid.tools.motions.verbs.list_clips"),
             "play": Verb("play a clip open loop in physics", "servoid.tools.motions.verbs.play"),
             "check": Verb("check joint ranges, speeds and feet of clips", "servoid.tools.motions.verbs.check"),
@@ -58,11 +59,12 @@ VERBS: dict[str, Verb] = {
             "blend": Verb("join two clips", "servoid.tools.motions.verbs.blend"),
         },
     ),
+    "skills": Verb("list skills, or explain one", "servoid.tools.commands.skills"),
     "collect": Verb("record demonstrations as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
         "train a network",
         verbs={
-            "expert": Verb("train the tracker of references with PPO", "servoid.tools.learn.trainers.expert"),
+            "tracker": Verb("train the tracker of gait and clips with PPO", "servoid.tools.learn.trainers.tracker"),
             "odometry": Verb("train the correction of leg odometry", "servoid.tools.learn.trainers.odometry"),
             "latent": Verb(
                 "train latent actions for a diffusion model to plan in", "servoid.tools.learn.trainers.latent"

@@ -90,6 +90,8 @@ class Instruction:
     obstacles: Array | None = None  # (n, 5) in the heading frame: x, y, radius m, velocity m/s; to be kept clear of
     keyframes: Keyframes | None = None
     ground: Array | None = None  # (2,) m/s over the ground in the heading frame, where the task asks for one
+    skill: str | None = None  # name of a skill, for as long as that is asked for; None: stand, or walk
+    stand: bool = False  # come to rest, and stand: that is all a planner's cost is about, whatever the task wants
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +124,7 @@ class Plan:
     path: Array  # (..., horizon, 2) m: predicted displacement in the heading frame of `tick`, to be drawn and logged
     seconds: float  # how long planning took
     error: str = ""  # why there is no plan, where there is none: its arrays are NaN then
+    ticks: Array | None = None  # (horizon,) int, of states and path, ahead of `tick`; None: 1, 2, ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,6 +33,7 @@ class Trace:
     goal: Array | None = None  # (ticks, 2) m, where the robot saw it; None: where the task has it
     obstacles: Array | None = None  # (ticks, n, 3) m: x, y, radius
     robots: Array | None = None  # (ticks, n, 3) the others: x, y m and heading rad
+    objects: Array | None = None  # (ticks, n, 7): x, y, z m of the middle, quaternion w x y z
     touched: bool | None = None  # whether the robot touched an obstacle or another robot; None: it cannot know
 
 
@@ -47,6 +48,7 @@ class Episode:
     )  # by tick: change of planar velocity (2,) m/s, world frame
     reach: float | None = None  # m from the goal that count as there, where that is judged
     path: Array | None = None  # (n, 2) m to walk along, in the frame that the robot starts in
+    low: bool = False  # the task has the robot sit, lie or touch the ground: only its tilt tells a fall then
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,11 @@ class Task(Protocol):
     @property
     def steered(self) -> bool:
         """Whether a person steers, who needs real time: `steered_behaviour` then takes the place of `behaviour`."""
+        ...
+
+    @property
+    def performs(self) -> bool:
+        """Whether it asks for skills."""
         ...
 
     @property

@@ -22,7 +22,7 @@ def check_robot(robot: Robot, marks: Marks) -> None:
     _check_identity(robot, marks)
     _check_angles(robot, marks)
     _check_mirror(robot, marks)
-    _check_legs(robot, marks)
+    _check_feet(robot, marks)
 
 
 def check_bus_port(robot: Robot, port: str) -> None:
@@ -52,7 +52,8 @@ def check_servo(servo: Servo, marks: Marks) -> None:
 
 def _check_numbers(robot: Robot, marks: Marks) -> None:
     _require_positive(robot.rate, "rate", marks)
-    _require_positive(robot.standing_height, "standing_height", marks)
+    if robot.standing_height <= 0:  # not so if it is left out
+        raise marks.error("standing_height", f"must be positive, not {robot.standing_height:g}")
     _require_positive(robot.bus.baud, "bus.baud", marks)
     _require_id(robot.bus.board_id, "bus.board_id", marks)
     for key in ("joint_speed", "homing_speed", "tilt", "stale", "temperature"):
@@ -168,31 +169,10 @@ def _check_mirror(robot: Robot, marks: Marks) -> None:
             raise marks.error(f"{key}_sign", f"{joint.name} and {other.name} must have the same sign")
 
 
-def _check_legs(robot: Robot, marks: Marks) -> None:
-    names = set(robot.names)
-    if not robot.legs:
-        raise marks.error("legs", "a robot needs at least one leg")
-    length = len(next(iter(robot.legs.values())))
-    used: set[str] = set()
-    for side, leg in robot.legs.items():
-        if side not in robot.feet:
-            raise marks.error(f"legs.{side}", f"no foot of that name; {nearest(side, robot.feet)}")
-        if len(leg) != length or not leg:
-            raise marks.error(f"legs.{side}", f"has {len(leg)} joints; every leg needs as many as the first ({length})")
-        for i, link in enumerate(leg):
-            key = f"legs.{side}[{i}]"
-            if link.joint not in names:
-                raise marks.error(f"{key}.joint", f"unknown joint '{link.joint}'; {nearest(link.joint, names)}")
-            if link.joint in used:
-                raise marks.error(f"{key}.joint", f"'{link.joint}' is in the legs twice")
-            used.add(link.joint)
-            if abs(math.hypot(*link.axis) - 1.0) > 1e-6:
-                raise marks.error(f"{key}.axis", f"{link.joint}: must be a unit vector, its length is not 1")
-            if max(map(abs, link.offset)) > 2.0:
-                raise marks.error(f"{key}.offset", f"{link.joint}: lengths are in m, {list(link.offset)} is too far")
+def _check_feet(robot: Robot, marks: Marks) -> None:
+    if not robot.feet:
+        raise marks.error("feet", "a robot needs at least one foot")
     for side, foot in robot.feet.items():
-        if side not in robot.legs:
-            raise marks.error(f"feet.{side}", f"no leg of that name; {nearest(side, robot.legs)}")
         if not foot.geoms:
             raise marks.error(f"feet.{side}.geoms", "name at least one collision geom of the MJCF")
         if min(foot.half_size) <= 0.0:

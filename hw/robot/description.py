@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Literal
@@ -13,10 +13,12 @@ import yaml
 
 from servoid.hw.config import ConfigError, load_marked, resolve
 from servoid.hw.contracts.body import Array
+from servoid.hw.robot.body import with_body
 from servoid.hw.robot.checks import check_robot, check_servo
-from servoid.hw.robot.plausible import check_plausible
+from servoid.hw.robot.plausible import check_geometry, check_plausible
 
 _GRAVITY = 9.81  # m/s2
+GAIT = "gait.yaml"  # in a robot's own folder
 
 
 @dataclass(frozen=True)
@@ -63,20 +65,33 @@ class Joint:
 
 @dataclass(frozen=True)
 class Link:
-    """A joint of a leg: its offset [m] from the joint before it, in that joint's frame, and its axis."""
+    """A joint on the way from the base to a foot: its offset [m] from the joint before it, and its axis, both in the
+    frame of that joint, which is the base's at zero angles."""
 
     joint: str
     offset: tuple[float, float, float]
     axis: tuple[float, float, float]
 
 
+Axes = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+_UNTURNED: Axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
 @dataclass(frozen=True)
 class Foot:
-    """A foot: its collision geoms and its sole's centre and half size [m] in the last leg link."""
+    """A foot: its collision geoms, and its sole's centre [m] in the frame of their body and half length and width.
+
+    What a file leaves out of these is NaN until `load_robot` reads it from the MJCF; so are the last three, rotations
+    being rows of a matrix: the sole's axes (forward, left, up) as columns in the body's frame, and where the body is in
+    the frame of the leg's last joint.
+    """
 
     geoms: tuple[str, ...]
-    sole: tuple[float, float, float]
-    half_size: tuple[float, float]
+    sole: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    half_size: tuple[float, float] = (math.nan, math.nan)
+    axes: Axes = _UNTURNED
+    body_place: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m
+    body_axes: Axes = _UNTURNED
 
 
 @dataclass(frozen=True)
@@ -186,23 +201,32 @@ class BusSettings:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot, as its file describes it. Joint arrays below are `(n_joints,)` in the file's order."""
+    """A robot, as its file and its MJCF describe it. Joint arrays below are `(n_joints,)` in the file's order.
+
+    `legs` and a standing height that the file leaves out are read from the MJCF by `load_robot`.
+    """
 
     name: str
     mjcf: str  # relative to the robot's file; absolute once loaded
     base: str
     imu_site: str
     rate: int
-    standing_height: float
     bus: BusSettings
     limits: Limits
     imu: Imu
     feet: dict[str, Foot]
-    legs: dict[str, tuple[Link, ...]]
     joints: tuple[Joint, ...]
+    standing_height: float = math.nan  # m of the base above the ground at the home pose
+    legs: dict[str, tuple[Link, ...]] = field(default_factory=dict)  # of each foot, from the base on
     walking: Walking = Walking()
+    passive: tuple[str, ...] = ()  # joints that no servo drives: not commanded, not read
     weight: float | None = None  # N; None: the file does not say it
-    gait: str = "gait"  # settings of its gait: a name in configs/policies/, or a .yaml file beside the robot's
+    # Settings of its gait: a name in configs/policies/, or a .yaml file beside the robot's; empty: none of its own.
+    gait: str = ""
+    folder: str = ""  # of its networks and its gait; absolute once loaded
+    arms: dict[str, float] = field(
+        default_factory=dict
+    )  # joints that swing arms, and the sign of swinging the left back
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -251,7 +275,7 @@ def load_servo(name: str) -> Servo:
 
 
 def load_robot(name: str | Path = "op3") -> Robot:
-    """Load a robot by name or file, checked. Raises ConfigError naming file, line and key."""
+    """Load a robot by name or file, with what its MJCF says, checked. Raises ConfigError naming file, line and key."""
     path = resolve("robots", name)
     robot, marks = load_marked(path, Robot)
     check_robot(robot, marks)
@@ -260,11 +284,15 @@ def load_robot(name: str | Path = "op3") -> Robot:
         replace(joint, servo=str(folder / joint.servo)) if joint.servo.endswith((".yaml", ".yml")) else joint
         for joint in robot.joints
     )
-    walking = robot.walking.derived(robot.standing_height)
+    own = (folder / (robot.folder or path.stem)).resolve()
     gait = str(folder / robot.gait) if robot.gait.endswith((".yaml", ".yml")) else robot.gait
-    robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints, walking=walking, gait=gait)
+    if not gait and (own / GAIT).is_file():
+        gait = str(own / GAIT)
+    robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints, gait=gait, folder=str(own))
     check_plausible(robot, marks)  # loads the servos' files: one that cannot be used is found now
-    return robot
+    robot = with_body(robot, marks)
+    check_geometry(robot, marks)
+    return replace(robot, walking=robot.walking.derived(robot.standing_height))
 
 
 @cache

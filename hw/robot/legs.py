@@ -5,12 +5,16 @@ Arrays carry any leading dimensions, then legs in the order of the robot's file:
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import cross
-from servoid.hw.robot.description import Robot
+
+if TYPE_CHECKING:
+    from servoid.hw.robot.description import Robot
 
 
 def _skew(axis: Array) -> Array:
@@ -18,13 +22,18 @@ def _skew(axis: Array) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+def rotations(angles: Array, axes: Array) -> Array:
+    """Turns by `angles` `(n,)` rad about `axes` `(n, 3)`, by Rodrigues' formula: `(n, 3, 3)`."""
+    skew = np.array([_skew(axis) for axis in axes])
+    sin, cos = np.sin(angles)[:, None, None], 1.0 - np.cos(angles)[:, None, None]
+    return np.eye(3) + sin * skew + cos * (skew @ skew)
+
+
 class Legs:
-    """Kinematics of the legs. Raises ConfigError when the legs are not alike in number of joints."""
+    """Kinematics of the legs, which have equally many joints."""
 
     def __init__(self, robot: Robot) -> None:
         legs = list(robot.legs.values())
-        if len({len(leg) for leg in legs}) != 1:
-            raise ConfigError(f"{robot.name}: legs: all legs need the same number of joints")
         self.index = robot.leg_index
         self.names = [[link.joint for link in leg] for leg in legs]
         self.offset = np.array([[link.offset for link in leg] for leg in legs])  # (legs, joints, 3)
@@ -32,7 +41,13 @@ class Legs:
         skew = np.array([[_skew(axis) for axis in leg] for leg in self.axis])
         self._skew, self._skew2 = skew, skew @ skew
         feet = [robot.feet[name] for name in robot.legs]
-        self.sole = np.array([foot.sole for foot in feet])  # (legs, 3) in the last link
+        # The foot's frame is at the last joint, turned as its sole.
+        body, axes = np.array([foot.body_axes for foot in feet]), np.array([foot.axes for foot in feet])
+        turn = body @ axes
+        self._foot = None if np.array_equal(turn, np.broadcast_to(np.eye(3), turn.shape)) else turn
+        self.level = self._foot is None  # whether soles are along the base's axes at zero angles
+        at = np.array([foot.body_place for foot in feet]) + np.einsum("lij,lj->li", body, [foot.sole for foot in feet])
+        self.sole = np.einsum("lji,lj->li", turn, at)  # (legs, 3) in the foot's frame
         signs = np.array([[sx, sy, 0.0] for sx in (1, -1) for sy in (1, -1)])
         half = np.array([(*foot.half_size, 0.0) for foot in feet])
         self.corners = self.sole[:, None] + signs * half[:, None]  # (legs, 4, 3)
@@ -42,7 +57,7 @@ class Legs:
         return joints[..., self.index]
 
     def forward(self, q: Array) -> tuple[Array, Array, Array, Array]:
-        """Pose of the last link of each leg in the base frame.
+        """Pose of each foot's frame in the base frame: at the leg's last joint, turned as the sole.
 
         `q` is `(..., n_legs, joints)` rad. Returns position `(..., n_legs, 3)` m, rotation `(..., n_legs, 3, 3)`, and
         for velocities the joints' origins and axes, `(..., n_legs, joints, 3)`, all in the base frame.
@@ -57,6 +72,8 @@ class Legs:
             origins.append(position)
             axes.append(np.einsum("...ij,...j->...i", rotation, self.axis[:, j]))
             rotation = rotation @ turn[..., j, :, :]
+        if self._foot is not None:
+            rotation = rotation @ self._foot
         return position, rotation, np.stack(origins, -2), np.stack(axes, -2)
 
     def velocity(self, point: Array, origins: Array, axes: Array, dq: Array) -> tuple[Array, Array]:
@@ -99,14 +116,24 @@ class LegInverse:
 
     ORDER = np.array([2, 0, 1, 1, 1, 0])  # coordinate axis of each joint: z x y y y x
 
-    def __init__(self, legs: Legs, name: str) -> None:
+    @classmethod
+    def misfit(cls, legs: Legs) -> str | None:
+        """Why it does not hold for these legs; None if it does."""
         axis, offset = legs.axis, legs.offset
-        if axis.shape[1] != 6 or not np.array_equal(np.abs(axis).argmax(-1), np.tile(self.ORDER, (len(axis), 1))):
-            raise ConfigError(f"{name}: legs: the gait needs legs of yaw, roll, pitch, knee, ankle pitch, ankle roll")
+        if axis.shape[1] != 6 or not np.array_equal(np.abs(axis).argmax(-1), np.tile(cls.ORDER, (len(axis), 1))):
+            return "legs are not of yaw, roll, pitch, knee, ankle pitch, ankle roll"
+        if np.abs(axis).max(-1).min() < 1 - 1e-6 or not legs.level:
+            return "an axis or a sole is not along the base's axes at zero angles"
         hip = [offset[:, 1, 1], offset[:, 1, 0] + offset[:, 2, 0], offset[:, 2, 2]]  # between the axes
         leg = [offset[:, 3, 0], offset[:, 4, 0], offset[:, 5, 2], offset[:, 2:, 1].sum(-1)]  # off the straight line
         if np.abs([*hip, *leg]).max() > 1e-3:
-            raise ConfigError(f"{name}: legs: the gait needs axes that meet in a point at the hip and at the ankle")
+            return "the axes do not meet in a point at the hip and at the ankle"
+        return None
+
+    def __init__(self, legs: Legs, name: str) -> None:
+        axis, offset = legs.axis, legs.offset
+        if (why := self.misfit(legs)) is not None:
+            raise ConfigError(f"{name}: {why}")
         self.sign = np.take_along_axis(axis, np.tile(self.ORDER, (len(axis), 1))[..., None], -1)[..., 0]
         self.thigh, self.shank = -offset[:, 3, 2], -offset[:, 4, 2]
         # The pitch joints lie beside the leg's plane: their sideways offset is undone at the ankle.

@@ -47,7 +47,7 @@ class Mirror:
     @staticmethod
     def feet(robot: Robot) -> Mirror:
         """Of one number a foot: the foot at the end of the mirrored leg."""
-        legs, index = robot.leg_index[:, 0].tolist(), robot.mirror[0]
+        legs, index = robot.leg_index[:, -1].tolist(), robot.mirror[0]
         return Mirror(np.array([legs.index(index[joint]) for joint in legs]), np.ones(len(legs), np.float32))
 
     @staticmethod

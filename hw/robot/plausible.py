@@ -29,7 +29,7 @@ def check_plausible(robot: Robot, marks: Marks) -> None:
     _check_bus(robot, marks)
     _check_speeds(robot, marks)
     _check_protections(robot, marks)
-    _check_geometry(robot, marks)
+    _check_angles(robot, marks)
 
 
 def cycle_seconds(servos: int, baud: int, *, board: bool = True, return_delay: float = 0.0) -> float:
@@ -94,12 +94,21 @@ def _check_protections(robot: Robot, marks: Marks) -> None:
             )
 
 
-def _check_geometry(robot: Robot, marks: Marks) -> None:
+def _check_angles(robot: Robot, marks: Marks) -> None:
     limits = robot.limits
     if limits.tilt > math.pi / 2:
         raise marks.error(
             "limits.tilt", f"{limits.tilt:g} rad is more than lying down: the robot has fallen long before"
         )
+    for i, (joint, servo) in enumerate(zip(robot.joints, robot.servos, strict=True)):
+        turn = math.tau * (servo.ticks_per_turn - 1) / servo.ticks_per_turn
+        if joint.range[1] - joint.range[0] > turn:
+            raise marks.error(f"joints[{i}].range", f"{joint.name}: wider than the one turn that its servo has")
+
+
+def check_geometry(robot: Robot, marks: Marks) -> None:
+    """Raise ConfigError for what does not go with legs that were read from the MJCF."""
+    limits = robot.limits
     falls = math.sqrt(robot.standing_height / GRAVITY)
     if limits.stale * robot.dt > falls:
         raise marks.error(
@@ -108,14 +117,10 @@ def _check_geometry(robot: Robot, marks: Marks) -> None:
             f"topples in about {falls:.2f}: at most {int(falls / robot.dt)}",
         )
     reach = max(
-        sum(math.hypot(*link.offset) for link in leg) + math.hypot(*robot.feet[side].sole)
-        for side, leg in robot.legs.items()
+        sum(math.hypot(*at) for at in (*(link.offset for link in leg), foot.body_place, foot.sole))
+        for leg, foot in zip(robot.legs.values(), robot.feet.values(), strict=True)
     )
     if robot.standing_height > reach:
         raise marks.error(
             "standing_height", f"{robot.standing_height:g} m is more than its legs reach ({reach:.3f} m, in metres)"
         )
-    for i, (joint, servo) in enumerate(zip(robot.joints, robot.servos, strict=True)):
-        turn = math.tau * (servo.ticks_per_turn - 1) / servo.ticks_per_turn
-        if joint.range[1] - joint.range[0] > turn:
-            raise marks.error(f"joints[{i}].range", f"{joint.name}: wider than the one turn that its servo has")

@@ -29,8 +29,22 @@ class Previous:
     """Plans that were made `age` ticks before now."""
 
     age: int
-    states: Array  # (batch, horizon, raw size), the first one a tick ahead of those plans
+    states: Array  # (batch, horizon, raw size)
     actions: Array  # (batch, actions, action size) as plans have them, the first one of those plans' tick
+    ticks: Array  # (horizon,) of the states, ahead of those plans
+
+    def states_at(self, ticks: Array) -> Array:
+        """States `(batch, k, raw size)` float64 `ticks` `(k,)` ahead of now, between those planned where need be.
+
+        There are `k` of them as long as the plans last: later ticks are left out.
+        """
+        wanted = ticks[ticks + self.age <= self.ticks[-1]] + self.age
+        before = np.searchsorted(self.ticks, wanted, side="right") - 1
+        after = np.minimum(before + 1, len(self.ticks) - 1)
+        share = (wanted - self.ticks[before]) / np.maximum(self.ticks[after] - self.ticks[before], 1)
+        states = self.states.astype(float)
+        mixed: Array = states[:, before] + share[:, None] * (states[:, after] - states[:, before])
+        return mixed
 
 
 def clean_start(
@@ -41,30 +55,33 @@ def clean_start(
     `present` `(batch, raw size)` is now; the plan is seen from there.
     """
     batch, age = len(present), previous.age
-    rows = to_tokens(previous.states[:, age:].astype(float), np.asarray(present, dtype=float), joints_seen(states))
+    kept = previous.states_at(config.future_ticks)
+    rows = to_tokens(kept, np.asarray(present, dtype=float), joints_seen(states))
     clean_states = torch.zeros(batch, len(config.state_ticks), config.state_size)
     clean_actions = torch.zeros(batch, len(config.action_ticks), config.action_size)
     first = config.history
     clean_states[:, first : first + rows.shape[1]] = states.encode(torch.from_numpy(rows.astype(np.float32)))
     now = first - 1
-    kept = torch.from_numpy(previous.actions[:, age:].astype(np.float32))
-    clean_actions[:, now : now + kept.shape[1]] = actions.encode(kept)
+    going_on = torch.from_numpy(previous.actions[:, age:].astype(np.float32))
+    clean_actions[:, now : now + going_on.shape[1]] = actions.encode(going_on)
     return clean_states, clean_actions
 
 
 def frame_noise(config: DenoiserConfig, seeds: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
     """Noise `(batch, state tokens, features)` and `(batch, action tokens, features)` that belongs to the frames.
 
-    Each of `seeds` is a seed, the tick of now, and further numbers: a frame keeps its noise when the tick goes on.
+    Each of `seeds` is a seed, the tick of now, and further numbers. A frame is an action and the state after it; it
+    keeps its noise when the tick goes on.
     """
+
+    def noise(frame: int, seed: int, tick: int, *more: int) -> tuple[Tensor, Tensor]:
+        numbers = seed, tick + frame + config.history, *more, _FRAME
+        return _noise_of_frame(config.state_size, config.action_size, *numbers)
+
     states, actions = [], []
-    for seed, tick, *more in seeds:
-        for frame in range(-config.history, config.horizon):  # a frame is an action and the state after it
-            numbers = seed, tick + frame + config.history, *more, _FRAME
-            state, action = _noise_of_frame(config.state_size, config.action_size, *numbers)
-            states.append(state)
-            if -config.history < frame < config.action_horizon:
-                actions.append(action)
+    for numbers in seeds:
+        states += [noise(int(tick) - 1, *numbers)[0] for tick in config.state_ticks]
+        actions += [noise(int(tick), *numbers)[1] for tick in config.action_ticks]
     shape = (len(seeds), -1)
     return torch.stack(states).view(*shape, config.state_size), torch.stack(actions).view(*shape, config.action_size)
 

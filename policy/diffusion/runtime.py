@@ -62,8 +62,9 @@ class Runtime:
         self.cost = cost if settings.guidance.weight > 0 else None
         self.engine = engine or load_engine(settings.engine, model.denoiser)
         self.samples = settings.guidance.samples if self.cost else 1
-        self.horizon = settings.horizon or config.horizon  # ticks that are planned,
-        self.actions = min(self.horizon, config.action_horizon)  # and those with actions
+        self.horizon = settings.horizon or config.horizon  # ticks that are planned
+        self.ticks = config.future_ticks[config.future_ticks <= self.horizon]  # those of them with states,
+        self.actions = min(self.horizon, config.action_horizon)  # and how many have actions
         self.matrix = settings.matrix(config)
         self._warm: dict[int, DenoisingMatrix] = {}  # rolling, by the number of fresh frames
         self._signal = cosine_signal(config.levels)
@@ -75,7 +76,7 @@ class Runtime:
 
     def plan(self, request: PlanRequest) -> Plan:
         """The plan of one robot's request, or of many at once. Raises ValueError when it does not fit, and Diverged."""
-        start, lead = time.perf_counter(), request.states.shape[:-2]
+        start, lead, config = time.perf_counter(), request.states.shape[:-2], self.model.config
 
         def rows(x: Array) -> Array:
             return x.reshape(-1, *x.shape[len(lead) :])
@@ -83,7 +84,10 @@ class Runtime:
         ages = request.tick if request.ages is None else request.ages
         seeds, ticks = (np.broadcast_to(x, lead).ravel() for x in (request.seeds, ages))
         last = request.previous
-        previous = Previous(request.tick - last.tick, rows(last.states), rows(last.actions)) if last else None
+        previous = None
+        if last:
+            ticks_then = np.arange(1, last.states.shape[-2] + 1) if last.ticks is None else last.ticks
+            previous = Previous(request.tick - last.tick, rows(last.states), rows(last.actions), ticks_then)
         states = rows(request.states)
         actions, predicted = self.plan_batch(
             states,
@@ -97,8 +101,9 @@ class Runtime:
             tick=request.tick,
             actions=actions.reshape(*lead, *actions.shape[1:]),
             states=predicted.reshape(*lead, *predicted.shape[1:]),
-            path=tokens[..., :2].astype(float).reshape(*lead, self.horizon, 2),
+            path=tokens[..., :2].astype(float).reshape(*lead, len(self.ticks), 2),
             seconds=time.perf_counter() - start,
+            ticks=self.ticks if config.ticks else None,
         )
 
     def plan_batch(
@@ -115,8 +120,8 @@ class Runtime:
         action size)`: those applied, then those that will run anyway, as the model has actions (`Model.space`).
         `previous` are the plans that run, None at first; only the rolling schedule reads them. Returns actions
         `(batch, actions, action size)` from the present tick on, joint targets [rad] or latents that are decoded with
-        the state of their own tick; and predicted raw rows `(batch, horizon, raw size)`, the first one tick ahead, in
-        the odometry frame.
+        the state of their own tick; and predicted raw rows `(batch, horizon, raw size)` at `ticks` ahead, in the
+        odometry frame.
         Batches of different size may differ in the last bits. Raises ValueError like `plan`.
         """
         self._check(states, actions)
@@ -142,7 +147,7 @@ class Runtime:
             if not reach < BOUND:
                 raise Diverged(f"the plan leaves all bounds ({reach:.3g} deviations); lower the weight of guidance")
             chosen = self._choose(clean[0], guidance)
-            future, now = slice(history, history + self.horizon), slice(history - 1, history - 1 + self.actions)
+            future, now = slice(history, history + len(self.ticks)), slice(history - 1, history - 1 + self.actions)
             tokens = self.model.states.decode(clean[0][chosen, future])
             predicted = to_raw(tokens, raw[:, -1], self._joints)
             planned = self.model.actions.decode(clean[1][chosen, now])
@@ -173,7 +178,10 @@ class Runtime:
             raise ValueError("plan request: states or actions are not finite; was every sensor read?")
 
     def _known(self, states: Array, actions: Array, instruction: Instruction) -> Known:
-        """Past states and past and committed actions, clean and normalised, and keyframes; `samples` of each window."""
+        """Past states and past and committed actions, clean and normalised, and keyframes; `samples` of each window.
+
+        A keyframe counts when it comes to a tick that has a token: those further ahead will come in later.
+        """
         config, batch = self.model.config, len(states)
         present = np.asarray(states[:, -1], dtype=float)
         # Differences of a long walk's displacements want more than float32.
@@ -184,8 +192,8 @@ class Runtime:
         if instruction.keyframes is not None and len(instruction.keyframes.ticks):
             ticks, given = keyframe_tokens(instruction.keyframes, present, self._joints)
             tokens = torch.from_numpy(given.astype(np.float32))
-            index, whole = torch.from_numpy(config.history - 1 + ticks), tokens.isfinite().all(2).all(0)
-            inside = torch.from_numpy(ticks <= self.horizon)  # those further ahead will come in later
+            index = torch.from_numpy(np.searchsorted(config.state_ticks, ticks))
+            whole, inside = tokens.isfinite().all(2).all(0), torch.from_numpy(np.isin(ticks, self.ticks))
             exact, partly = inside & whole, inside & ~whole
             filled[:, index[exact]] = self.model.states.encode(tokens[:, exact])
             state_mask = state_mask.index_fill(0, index[exact], True)
@@ -250,8 +258,8 @@ class Runtime:
         history, normaliser = self.model.config.history, self.model.states
 
         def of_states(states: Tensor) -> Tensor:
-            tokens = normaliser.decode(states[:, history : history + self.horizon])
-            value: Tensor = cost(Trajectory.of(tokens, self._joints, self._dt), instruction)
+            tokens = normaliser.decode(states[:, history : history + len(self.ticks)])
+            value: Tensor = cost(Trajectory.of(tokens, self._joints, self._dt, self.ticks), instruction)
             return value
 
         settings = self.settings.guidance
@@ -261,7 +269,7 @@ class Runtime:
 
 def load_runtime(robot: Robot, settings: DiffusionSettings, cost: Cost | None = None) -> Runtime:
     """The runtime of the checkpoint that `settings` name, for `robot`. Raises ConfigError."""
-    return Runtime(load(resolve(settings.checkpoint), robot), settings, robot, cost)
+    return Runtime(load(resolve(settings.checkpoint, robot), robot), settings, robot, cost)
 
 
 def _repeat(instruction: Instruction, samples: int) -> Instruction:

@@ -138,6 +138,12 @@ class DiffusionSettings:
                     f"diffusion policy: {name} is {ours}, but this checkpoint takes 1 to {most} ticks; "
                     f"lower it, or train a model with --{name} {ours}"
                 )
+        if self.horizon is not None and self.horizon not in network.future_ticks:
+            known = ", ".join(map(str, network.future_ticks))
+            raise ConfigError(
+                f"diffusion policy: horizon is {self.horizon}, but this checkpoint plans states at ticks {known}: "
+                "give one of these"
+            )
         training, needed = training or {}, self.execution_horizon + self.delay
         if needed > (horizon := min(self.horizon or network.horizon, network.action_horizon)):
             raise ConfigError(

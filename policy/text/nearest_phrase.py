@@ -37,7 +37,7 @@ class Phrasebook:
         pairs = [(index, text) for index, motion in enumerate(MOTIONS) for text in motion.phrasings]
         self.motions = np.array([index for index, _ in pairs])  # (phrasings,)
         self.texts = tuple(text for _, text in pairs)
-        self._sides = np.array([_side(text) for text in self.texts])
+        self._sides = np.array([side_of(text) for text in self.texts])
 
     @cached_property
     def codes(self) -> Array:
@@ -63,19 +63,11 @@ class Phrasebook:
         distance = _distances(code, self.codes)[0]
         nearest = int(self.motions[distance.argmin()])
         hint = f"the nearest known motion is '{NAMES[nearest]}': '{MOTIONS[nearest].phrasings[0]}'"
-        if _NEGATION.search(text.lower()):
-            raise ConfigError(f"the instruction '{text}' says what not to do; say what to do, such as 'stand still'")
-        if _SEQUENCE.search(text.lower()):
-            raise ConfigError(f"the instruction '{text}' says one thing after another; give one instruction at a time")
-        if _QUANTITY.search(text.lower()):
-            raise ConfigError(f"the instruction '{text}' says how much; that is not understood: say only what to do")
+        refuse_untold(text)
         marked = flags(text)
-        for one, other in _CONFLICTS:
-            if {one, other} <= marked:
-                raise ConfigError(f"the instruction '{text}' asks for both {one} and {other}; ask for one at a time")
-        if _similarity(code, self.codes).max() < FAMILIAR:
+        if similarity(code, self.codes).max() < FAMILIAR:
             raise ConfigError(f"the instruction '{text}' asks for no motion that is known; {hint}")
-        side = _side(text)
+        side = side_of(text)
         if side == "" and marked & _SIDED:
             raise ConfigError(f"the instruction '{text}' does not say to which side; add 'left' or 'right'")
         # The side is as it was said. Standing has none: "stand on your left foot" stays standing.
@@ -91,7 +83,23 @@ class Phrasebook:
         return NAMES.index(motion)
 
 
-def _side(text: str) -> str:
+def refuse_untold(text: str) -> None:
+    """Raise ConfigError for what no instruction can be told: what not to do, one thing after another, how much, or two
+    opposite things."""
+    if _NEGATION.search(text.lower()):
+        raise ConfigError(f"the instruction '{text}' says what not to do; say what to do, such as 'stand still'")
+    if _SEQUENCE.search(text.lower()):
+        raise ConfigError(f"the instruction '{text}' says one thing after another; give one instruction at a time")
+    if _QUANTITY.search(text.lower()):
+        raise ConfigError(f"the instruction '{text}' says how much; that is not understood: say only what to do")
+    marked = flags(text)
+    for one, other in _CONFLICTS:
+        if {one, other} <= marked:
+            raise ConfigError(f"the instruction '{text}' asks for both {one} and {other}; ask for one at a time")
+
+
+def side_of(text: str) -> str:
+    """The side that a text names, left or right; else nothing."""
     marked = flags(text)
     return next((side for side in ("left", "right") if side in marked), "")
 
@@ -102,7 +110,7 @@ def _distances(codes: Array, others: Array) -> Array:
     return distances
 
 
-def _similarity(codes: Array, others: Array) -> Array:
+def similarity(codes: Array, others: Array) -> Array:
     """Cosines `(n, m)`."""
     a, b = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in (codes, others))
     return a @ b.T

@@ -32,6 +32,7 @@ from servoid.stack.control.plan_buffer import History, Pace, PlanBuffer
 from servoid.stack.control.planner import Answer, InlinePlanner, Planner, ProcessPlanner
 from servoid.stack.control.trim import Trim
 from servoid.stack.safety.min_jerk import MinJerk
+from servoid.stack.tasks.terms.guidance import Stopping
 
 if TYPE_CHECKING:
     from servoid.policy.diffusion.runtime import Cost, Runtime
@@ -151,12 +152,14 @@ def diffusion_policy(
 ) -> DiffusionPolicy:
     """The diffusion policy for `robot`, by default as configs/policies/diffusion.yaml says; `shape`: of many worlds.
 
-    `cost` guides its plans, `Task.objective` for one; with `process`, which is for real time, it must be picklable and
-    depend on nothing but its arguments. Raises ConfigError, also where checkpoint, settings and robot do not fit.
+    `cost` guides its plans until the robot shall stand, `Task.objective` for one; with `process`, which is for real
+    time, it must be picklable and depend on nothing but its arguments. Raises ConfigError, also where checkpoint,
+    settings and robot do not fit.
     """
     settings = settings or load_settings()
-    path = resolve(settings.checkpoint)
+    path = resolve(settings.checkpoint, robot)
     settings = replace(settings, checkpoint=str(path))
+    cost = None if cost is None else Stopping(cost)
     head = read_header(path)
     config = check_fit(path, head, robot)
     settings.check(config, head.get("training"))  # here, with a plain error, rather than in the planner's process

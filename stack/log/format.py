@@ -75,7 +75,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         {"tick": _INTEGER, "mode": _TEXT, "phase": _TEXT} | _arrays({"position": "rad", "gain": "of the firmware's"})
     ),
     "/instruction": _schema(
-        {"tick": _INTEGER, "source": _TEXT, "text": _TEXT}
+        {"tick": _INTEGER, "source": _TEXT, "text": _TEXT, "skill": _TEXT}
         | _arrays(
             {
                 "velocity": "m/s, m/s, rad/s",
@@ -85,6 +85,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
                 "place": "m, goal in the odometry frame",
                 "obstacles": "x, y, radius m, odometry frame",
                 "robots": "x, y m and heading rad, odometry frame",
+                "objects": "x, y, z m of the middle and quaternion w x y z, odometry frame",
             }
         )
     ),
@@ -96,6 +97,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     "/plan": _schema(
         {"tick": _INTEGER, "requested": _INTEGER, "adopted": _INTEGER, "first": _INTEGER, "seconds": _NUMBER}
         | _arrays({"actions": "rad", "states": "features", "path": "m, heading frame of the requested tick"})
+        | _arrays({"ticks": "of states and path, ahead of the requested tick"})
     ),
     "/event": _schema({"tick": _INTEGER, "time": _NUMBER, "kind": _TEXT, "joint": _TEXT, "text": _TEXT}),
     "/timing": _schema(
@@ -158,10 +160,13 @@ def messages(record: TickRecord) -> list[tuple[str, dict[str, Any]]]:
         instruction: dict[str, Any] = tick | {"velocity": pack(proposal.instruction.velocity, COMPACT)}
         if proposal.instruction.text is not None:
             instruction["text"] = proposal.instruction.text
+        if proposal.instruction.skill is not None:
+            instruction["skill"] = proposal.instruction.skill
         arrays = {name: getattr(proposal.instruction, name) for name in ("goal", "path", "ground")}
         if (percept := proposal.percept) is not None:
             instruction["source"] = percept.source
             arrays |= {"place": percept.goal, "obstacles": percept.obstacles, "robots": percept.robots}
+            arrays |= {"objects": percept.objects}
         instruction |= {name: pack(array, COMPACT) for name, array in arrays.items() if array is not None}
         out.append(("/instruction", instruction))
     if record.intent is not None:
@@ -173,6 +178,7 @@ def messages(record: TickRecord) -> list[tuple[str, dict[str, Any]]]:
             tick
             | {"requested": proposal.plan.requested, "adopted": proposal.plan.adopted, "first": plan.tick}
             | {name: pack(getattr(plan, name), COMPACT) for name in ("actions", "states", "path")}
+            | ({} if plan.ticks is None else {"ticks": pack(plan.ticks, "<i4")})
             | {"seconds": plan.seconds},
         ))  # fmt: skip
     out += [("/event", event_message(event)) for event in record.events]

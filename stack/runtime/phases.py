@@ -53,9 +53,11 @@ class Phases:
         self._seconds, self._pushes = assignment.task.seconds, assignment.episode.pushes
         surroundings = None if simulation is None else simulation.surroundings
         self._look = behaviour.percept if surroundings is None else surroundings.look
+        self._kind = "skill" if assignment.task.performs else "plan"  # of events that the policy tells
         self._steered, self._recovering = assignment.task.steered, recovering
         self._before = Phase.LIMP  # the guard's phase at the last tick
         self._settled = 0
+        self._lost: str | None = None  # a skill that was asked for while the robot was down, and still is
         self._buffer = TraceBuffer(len(self._robot.joints), round(self._seconds / self._robot.dt))
         self.ended: str | None = None  # "done" or "time", if the task ended by itself
 
@@ -100,12 +102,24 @@ class Phases:
         try:
             percept = self._look(state)
             instruction = self._behaviour.instruct(self.task_ticks, state, percept)
+            if instruction.skill is not None:
+                instruction = replace(instruction, skill=self._possible(instruction.skill))
+            else:
+                self._lost = None
             self._buffer.add(state, instruction, percept)
             done = self._behaviour.done(state)
         except Exception as error:  # whatever a task raises, the robot must end safe
             self._guard.give_up(_failed("task", error))
             return None
         return instruction, percept, done
+
+    def _possible(self, skill: str) -> str | None:
+        """A skill that may be performed: none while the robot is down, nor the one that it fell with or was asked for
+        then, until that is asked for anew."""
+        if self._guard.down and skill != self._lost:
+            self._lost = skill
+            self._guard.note("skill", f"'{skill}' is refused: the robot lies; ask again when it stands")
+        return None if skill == self._lost else skill
 
     def _do_task(self, state: State) -> Proposal:
         tick = self.task_ticks
@@ -166,7 +180,7 @@ class Phases:
     def _come_to_rest(self, state: State) -> Proposal:
         """Ask the policy to stand."""
         try:
-            target = self._policy.act(state, self._guard.applied, Instruction(np.zeros(3)))
+            target = self._policy.act(state, self._guard.applied, Instruction(np.zeros(3), stand=True))
         except Exception as error:
             self._guard.give_up(_failed("policy", error))
             return Proposal()
@@ -176,7 +190,7 @@ class Phases:
     def _tell(self) -> None:
         """What the policy wants a person to know, as events."""
         for text in self._policy.take_events():
-            self._guard.note("plan", text)
+            self._guard.note(self._kind, text)
 
     def _end(self, how: str, text: str, shown: Proposal, state: State) -> Proposal:
         """End the task. The policy is asked at this tick too: a walking robot has no time for a tick without."""

@@ -13,7 +13,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
-from servoid.hw.robot.description import Robot
+from servoid.hw.robot.description import Robot, shipped_robot
 from servoid.hw.setting import Setting
 from servoid.policy.references.gait import load_gait
 from servoid.policy.text.captions import MOTIONS, followed, twist_of
@@ -120,8 +120,13 @@ def understood(name: str, sentence: str) -> int:
     """Number of the motion that the setting `name` asks for. Raises ConfigError where that is in no known words."""
     from servoid.policy.text.encoder import load_encoder
     from servoid.policy.text.nearest_phrase import Phrasebook
+    from servoid.stack.skills.skill import load_skills
+    from servoid.stack.skills.words import SkillWords
 
     try:
-        return Phrasebook(load_encoder()).understand(sentence)
+        encoder = load_encoder()
+        if SkillWords(encoder, load_skills(shipped_robot())).about_skill(sentence):
+            raise ConfigError(f"'{sentence}' asks for a skill: use servoid run skill --set text='{sentence}'")
+        return Phrasebook(encoder).understand(sentence)
     except ConfigError as error:
         raise ConfigError(f"--set {name}={sentence}: {error}") from None

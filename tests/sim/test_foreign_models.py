@@ -112,14 +112,13 @@ def test_no_name_of_the_file_collides_with_one_that_is_added(make: Make) -> None
             "geom 'l_sole_long', of a sole, passes through the floor: give its contype or conaffinity the bit 1",
         ),
         ([('mass="0.01176" pos="0.00233 0 0.00823"', 'mass="0" pos="0 0 0"')], "MuJoCo cannot compile it: "),
-        ([("</worldbody>", "")], "not a valid MJCF: "),
+        ([("</worldbody>", "")], "not a valid MJCF or URDF: "),
         ([("<worldbody>", '<asset><mesh name="m" file="no.stl"/></asset><worldbody>')], "cannot compile it: .*no.stl"),
     ],
 )
 def test_what_is_wrong_is_named_with_the_file(make: Make, changes: list[tuple[str, str]], said: str) -> None:
-    robot = make(*changes)
     with pytest.raises(ConfigError, match=rf"own\.xml: .*{said}"):
-        build(robot)
+        build(make(*changes))
 
 
 def test_building_says_nothing_and_leaves_no_file(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import torch
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
+from servoid.policy.features import Trajectory
 
 DT = 0.02
 
@@ -30,13 +30,24 @@ def state(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> State:
     )
 
 
-def moves(places: Array, yaw: float = 0.0, velocity: tuple[float, float] = (0.0, 0.0)) -> SimpleNamespace:
+def moves(
+    places: Array, yaw: float = 0.0, velocity: tuple[float, float] = (0.0, 0.0), ticks: Array | None = None
+) -> Trajectory:
     """A predicted trajectory through `places` `(horizon, 2)`; `velocity` m/s is as a trajectory has it."""
     displacement = torch.tensor(np.asarray(places, dtype=float))[None].requires_grad_()
     horizon = displacement.shape[1]
     zeros = torch.zeros(1, horizon, dtype=torch.float64)
     moving = torch.zeros(1, horizon, 2, dtype=torch.float64) + torch.tensor(velocity, dtype=torch.float64)
-    return SimpleNamespace(displacement=displacement, yaw=zeros + yaw, velocity=moving, yaw_rate=zeros, dt=DT)
+    return Trajectory(
+        displacement=displacement,
+        yaw=zeros + yaw,
+        velocity=moving,
+        yaw_rate=zeros,
+        height=zeros,
+        joints=torch.zeros(1, horizon, 20, dtype=torch.float64),
+        ticks=np.arange(1, horizon + 1) if ticks is None else ticks,
+        dt=DT,
+    )
 
 
 class Drawn:

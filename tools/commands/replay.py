@@ -128,13 +128,15 @@ def changes(log: FlightLog) -> list[str]:
     from servoid.policy.checkpoint import git_commit, resolve
     from servoid.stack.control.get_up import fingerprints
     from servoid.stack.control.policies import policy_fingerprint
+    from servoid.stack.log.format import plain
     from servoid.stack.log.provenance import fingerprint, sha256, versions
+    from servoid.stack.skills.skill import fingerprints as skill_fingerprints
 
     settings = _settings(log)
     robot = load_robot(settings.robot)
     planner, header = _planner(log), {**log.header, **_part("policy", log.header["policy"])}
     try:
-        policy = policy_fingerprint(settings.policy, robot.gait)
+        policy = policy_fingerprint(settings.policy, robot)
     except ConfigError:
         if planner is None:
             raise
@@ -144,6 +146,8 @@ def changes(log: FlightLog) -> list[str]:
     policy["name"] = log.header["settings"]["policy"]  # as it was typed
     now = fingerprint(robot) | _part("policy", policy)
     now["recovery"] = fingerprints(robot) if settings.recover else None
+    if "skills" in header:
+        now["skills"] = plain(skill_fingerprints(robot))
     now |= _task(settings) | {"versions": versions(), "git_commit": git_commit()}
     names = {
         "robot": "the robot's file",
@@ -158,6 +162,7 @@ def changes(log: FlightLog) -> list[str]:
         "task_files": "a file that the task's settings name",
         "task_source": "the task's file",
         "recovery": "a clip that it gets up by",
+        "skills": "a skill or its clip",
         "policy.source": "the policy's file",
         "versions": "installed packages",
         "git_commit": "the source",

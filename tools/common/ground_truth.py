@@ -5,12 +5,15 @@ With other robots it is the frame of the scene, in which their goals are.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Trace
-from servoid.hw.geometry import turned
+from servoid.hw.geometry import headed, turned
+from servoid.sim.truth import FALL_TILT
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.guard import Phase
 from servoid.tools.common.motion_quality import Poses
@@ -48,13 +51,15 @@ class GroundTruth:
     a fall whether the robot is down at the end.
     """
 
-    def __init__(self, simulation: Simulation, dt: float, *, recover: bool = False) -> None:
+    def __init__(self, simulation: Simulation, dt: float, *, recover: bool = False, low: bool = False) -> None:
         self._truth, self._surroundings, self._dt = simulation.truth, simulation.surroundings, dt
         self._rows: list[tuple[Array, float, Array, float, Array]] = []
         self._joints: list[Array] = []
         self._up: list[Array] = []
         self._obstacles: list[Array] = []
         self._robots: list[Array] = []
+        self._objects: list[Array] = []
+        self._low = low
         self._fallen = self._touched = self.fell_ending = False
         self._ever = False  # whether it has fallen
         self.falls = Falls(dt) if recover else None
@@ -63,13 +68,13 @@ class GroundTruth:
     def __call__(self, record: TickRecord) -> None:
         instruction, truth = record.proposal.instruction, self._truth
         if self.falls is not None:
-            self.falls.watch(record, not truth.fallen[0])
+            self.falls.watch(record, not self._down[0])
         if instruction is None:
             if self._rows and not self._fallen:
-                self.fell_ending |= record.phase in (Phase.STOPPING, Phase.LOWERING) and bool(truth.fallen[0])
+                self.fell_ending |= record.phase in (Phase.STOPPING, Phase.LOWERING) and bool(self._down[0])
                 self.fell_ending |= any(event.kind == "fall" for event in record.events)
             return
-        fallen = bool(truth.fallen.any())
+        fallen = bool(self._down.any())
         self._ever |= fallen
         self._fallen = self._ever if self.falls is None else fallen
         self.upright += not self._ever
@@ -78,11 +83,17 @@ class GroundTruth:
         if self._surroundings is not None:
             self._touched |= bool(truth.touching.any())
             self._obstacles.append(self._surroundings.obstacles)
+            self._objects.append(truth.objects[0])
             self._robots.append(np.column_stack([truth.position[1:, :2], truth.yaw[1:]]))
         rate = -float(truth.gravity[0] @ truth.angular_velocity[0])
         self._rows.append(
             (truth.position[0].copy(), float(truth.yaw[0]), truth.velocity[0], rate, instruction.velocity)
         )
+
+    @property
+    def _down(self) -> Array:
+        """Whether each robot has fallen; one that may be `low` by its tilt alone."""
+        return -self._truth.gravity[:, 2] < math.cos(FALL_TILT) if self._low else self._truth.fallen
 
     def trace(self) -> Trace:
         """The run by the truth; without rows if the guard never let the task begin."""
@@ -106,8 +117,16 @@ class GroundTruth:
             goal=goal,
             obstacles=turned(np.array(self._obstacles) - origin, -heading) if self._obstacles else None,
             robots=turned(np.array(self._robots) - [*origin[:2], heading], -heading) if self._others() else None,
+            objects=self._seen_objects(origin, heading),
             touched=self._touched if self._obstacles else None,
         )
+
+    def _seen_objects(self, origin: Array, heading: float) -> Array | None:
+        if not self._objects or not len(self._objects[0]):
+            return None
+        poses = np.array(self._objects)
+        turn = np.full(poses.shape[:2], -heading)
+        return np.concatenate([turned(poses[..., :3] - origin, -heading), headed(poses[..., 3:], turn)], -1)
 
     def _others(self) -> bool:
         return bool(self._robots) and len(self._robots[0]) > 0

@@ -35,6 +35,7 @@ ABOUT = {
     "homing": "homing",
     "policy": "policy",
     "plan": "planner",
+    "skill": "skill",
     "record": "flight log",
     "interrupt": "interrupt",
     "system": "machine",

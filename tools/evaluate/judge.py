@@ -41,7 +41,8 @@ def judge(job: RunSettings) -> Judged:
     from servoid.tools.common.ground_truth import GroundTruth
 
     assignment, backend = prepare(job)
-    ground_truth = GroundTruth(simulation(backend), load_robot(job.robot).dt, recover=job.recover)
+    dt, low = load_robot(job.robot).dt, assignment.episode.low
+    ground_truth = GroundTruth(simulation(backend), dt, recover=job.recover, low=low)
     result = run(job, backend=backend, on_tick=ground_truth)
     _give_memory_back()
     if result.interrupted:

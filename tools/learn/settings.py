@@ -110,6 +110,7 @@ class DiffusionNetwork(DenoiserShape):
 
     text: Annotated[str, "encoder of instructions; empty: a model without instructions"] = "words"
     emphasis: Annotated[float, "emphasis of global states; 0: no projection"] = 5.0
+    changes: Annotated[bool, "learn from windows over which the command changes too, which are told nothing"] = False
 
 
 @dataclass(frozen=True)
@@ -219,6 +220,14 @@ class TrackingSettings:
     backward: Annotated[
         float, "share of commands that walk backward while turning and side-stepping, where falls were most frequent"
     ] = 0.25
+    clips: Annotated[tuple[str, ...], "clips of the library to learn; none: all that are of this robot"] = ()
+    clip_share: Annotated[float, "share of episodes that begin with a clip, and of walks that lead to one"] = 0.5
+    rates: Annotated[Range, "how fast clips are played, of their own speed; the fastest grows over the first half"] = (
+        0.9,
+        1.2,
+    )
+    get_up_rates: Annotated[Range, "the same of clips that begin lying"] = (0.9, 1.6)
+    walk_seconds: Annotated[Range, "seconds of walking between two clips"] = (1.5, 6.0)
     rewards: Annotated[dict[str, float], "weights of reward terms, per tick (policy/tracker/rewards.py)"] = field(
         default_factory=lambda: {
             "velocity": 3.0,
@@ -239,11 +248,33 @@ class TrackingSettings:
             "fall": -10.0,
         }
     )
+    clip_rewards: Annotated[dict[str, float], "the same, while a clip is followed"] = field(
+        default_factory=lambda: {
+            "joints": 1.0,
+            "orientation": 2.0,
+            "base_height": 1.5,
+            "travel": 1.0,
+            "slip": -0.3,
+            "impact": -0.1,
+            "residual": -0.01,
+            "residual_rate": -0.3,
+            "residual_acceleration": -0.1,
+            "effort": -0.005,
+            "fall": -10.0,
+        }
+    )
 
     def __post_init__(self) -> None:
-        for name in self.rewards:
-            if name not in TERMS:
-                raise ValueError(f"rewards.{name}: no such reward term; {nearest(name, TERMS)}")
+        for table in ("rewards", "clip_rewards"):
+            for name in getattr(self, table):
+                if name not in TERMS:
+                    raise ValueError(f"{table}.{name}: no such reward term; {nearest(name, TERMS)}")
+        if not 0.0 <= self.clip_share <= 1.0:
+            raise ValueError(f"clip_share must be 0 to 1, not {self.clip_share:g}")
+        for name in ("rates", "get_up_rates", "walk_seconds"):
+            low, high = getattr(self, name)
+            if not 0.0 < low <= high:
+                raise ValueError(f"{name} must be positive and rising, not {low:g} {high:g}")
         if min(self.stand, self.forward, self.single, self.backward) < 0 or (
             self.stand + self.forward + self.single + self.backward > 1.0
         ):
@@ -251,8 +282,8 @@ class TrackingSettings:
 
 
 @dataclass(frozen=True)
-class ExpertTraining(TrackingSettings, Ppo):
-    """`servoid train expert`."""
+class TrackerTraining(TrackingSettings, Ppo):
+    """`servoid train tracker`."""
 
     plain_odometry: Annotated[bool, "estimate without the learned correction of odometry"] = False
 
@@ -304,5 +335,5 @@ TITLES: Mapping[type, str] = {  # of the help, in its order
     DenoiserShape: "network", DiffusionNetwork: "network", LatentConfig: "network", Layers: "network",
     TrainingObjective: "objective", LatentTraining: "objective", OdometryTraining: "objective", Ppo: "objective (PPO)",
     Optimiser: "optimiser", DecayedOptimiser: "optimiser", DiffusionTraining: "optimiser",
-    TrackingSettings: "episodes and rewards", ExpertTraining: "episodes and rewards",
+    TrackingSettings: "episodes and rewards", TrackerTraining: "episodes and rewards",
 }  # fmt: skip

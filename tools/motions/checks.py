@@ -11,8 +11,10 @@ from servoid.hw.geometry import rotate
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
 from servoid.policy.motion.clip import Clip, velocities
+from servoid.tools.motions.standing import Standing
 
-# What each figure may be at most. A clip that was made in physics has soft contacts: its soles give a little.
+# What each figure may be at most. Soles are where servos that give under the robot's weight hold them, which a clip's
+# goals allow for; what they give when the robot moves fast is not in it.
 LIMITS = {
     "beyond_range_rad": 0.0,  # of the joints
     "speed_share": 1.0,  # of the speed that the guard allows
@@ -33,7 +35,7 @@ def check(clip: Clip, robot: Robot) -> dict[str, Any]:
 
 
 def _feet(clip: Clip, robot: Robot) -> dict[str, float]:
-    corners = sole_corners(clip, robot)
+    corners = sole_corners(clip, robot, Standing(robot).held(clip))
     carries = clip.contact > 0.5
     lowest = corners[..., 2].min(-1)
     flat = carries & (np.ptp(corners[..., 2], axis=-1) < FLAT)
@@ -46,9 +48,9 @@ def _feet(clip: Clip, robot: Robot) -> dict[str, float]:
     }
 
 
-def sole_corners(clip: Clip, robot: Robot) -> Array:
-    """Corners of the soles `(ticks, n_feet, 4, 3)` m in the clip's frame."""
+def sole_corners(clip: Clip, robot: Robot, joints: Array) -> Array:
+    """Corners of the soles `(ticks, n_feet, 4, 3)` m in the clip's frame, at the poses `joints` `(ticks, n_joints)`."""
     legs = Legs(robot)
-    _, corners = legs.soles(legs.pick(clip.joints))
+    _, corners = legs.soles(legs.pick(joints))
     turn = clip.root_orientation[:, None, None, :]
     return rotate(turn, corners) + clip.root_position[:, None, None, :]

@@ -36,6 +36,7 @@ class DenoiserShape:
     levels: Annotated[int, "noise levels"] = 20
     mask: Annotated[str, "attention mask (docs/diffusion.md)"] = "state_full_action_causal"
     actions: Annotated[int, "ticks to come that have actions; 0: the whole horizon"] = 0
+    ticks: Annotated[tuple[int, ...], "ticks to come that have states, the horizon last; none given: all of them"] = ()
 
     def __post_init__(self) -> None:
         for name in ("layers", "width", "heads", "history", "horizon", "levels"):
@@ -48,6 +49,10 @@ class DenoiserShape:
         if not 0 <= self.actions <= self.horizon:
             raise ValueError(
                 f"actions must be 1 to the horizon of {self.horizon} ticks, or 0 for all, not {self.actions}"
+            )
+        if self.ticks and (self.ticks[0] != 1 or (np.diff(self.ticks) < 1).any() or self.ticks[-1] != self.horizon):
+            raise ValueError(
+                f"ticks must rise from 1 to the horizon of {self.horizon}, not {', '.join(map(str, self.ticks))}"
             )
         if self.width % self.heads:
             raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
@@ -109,8 +114,13 @@ class DenoiserConfig(DenoiserShape):
 
     @property
     def state_ticks(self) -> Array:
-        """Ticks of the state tokens, `(history + horizon,)`."""
-        return np.arange(1 - self.history, self.horizon + 1)
+        """Ticks of the state tokens, `(history + ticks to come,)`."""
+        return np.concatenate([np.arange(1 - self.history, 1), self.future_ticks])
+
+    @property
+    def future_ticks(self) -> Array:
+        """Ticks to come that have state tokens: all up to the horizon, or those that are listed."""
+        return np.array(self.ticks) if self.ticks else np.arange(1, self.horizon + 1)
 
     @property
     def action_ticks(self) -> Array:
@@ -134,7 +144,7 @@ def check_fit(path: Path, head: Mapping[str, Any], robot: Robot) -> DenoiserConf
     for name, ours in (("raw", raw_layout(n)), ("token", token_layout(n))):
         checkpoint.check_layout(path, name, head.get(f"{name}_layout", []), ours.to_header())
     try:
-        config = DenoiserConfig(**head["config"])
+        config = DenoiserConfig(**head["config"] | {"ticks": tuple(head["config"].get("ticks", ()))})
         size = code_size(config.text) if config.text else 0
     except (TypeError, ConfigError) as error:
         raise CheckpointError(f"{path}: the network's config in its header cannot be used: {error}") from error

@@ -2,7 +2,7 @@
 
 Tokens of a window around the present tick 0, with `history` ticks known and `horizon` to come:
 
-    states   -history+1 .. 0 (past and present), 1 .. horizon
+    states   -history+1 .. 0 (past and present), 1 .. horizon, or some of them: `DenoiserConfig.ticks`
     actions  -history+1 .. -1 (past), 0 .. horizon-1, or fewer: `DenoiserConfig.actions`
 
 An action of tick t is decided on the state of tick t and leads to the state of tick t + 1.
@@ -10,10 +10,12 @@ An action of tick t is decided on the state of tick t and leads to the state of 
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from servoid.hw.contracts.body import Array
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.masks import attention_mask
 
@@ -49,10 +51,23 @@ class Block(nn.Module):
         return x + self.feed(self.norm_feed(x))
 
 
+def tick_encoding(ticks: Array, width: int, slowest: float = 400.0) -> Tensor:
+    """Sines and cosines `(ticks, width)` of ticks, with periods from 2 to `slowest` ticks in even ratios.
+
+    Ticks far apart differ at once, where positions learned from small random numbers take long to come apart.
+    """
+    periods = np.geomspace(2.0, slowest, width // 2)
+    angles = 2.0 * np.pi * ticks[:, None] / periods
+    waves = np.concatenate([np.sin(angles), np.cos(angles), np.zeros((len(ticks), width % 2))], axis=1)
+    return torch.from_numpy(waves).float()
+
+
 class Denoiser(nn.Module):
     """Predicts the clean window (x0) from a noisy one. Inputs and outputs are normalised."""
 
     mask: Tensor
+    state_places: Tensor
+    action_places: Tensor
 
     def __init__(self, config: DenoiserConfig) -> None:
         super().__init__()
@@ -62,7 +77,12 @@ class Denoiser(nn.Module):
         self.embed_state = nn.Sequential(nn.Linear(config.state_size, width), nn.GELU(), nn.Linear(width, width))
         self.embed_action = nn.Linear(config.action_size, width)
         self.level = nn.Embedding(config.levels + 1, width)
-        self.position = nn.Parameter(0.02 * torch.randn(config.history + config.horizon, width))
+        if config.ticks:
+            self.place = nn.Linear(width, width)
+            for name, ticks in (("state_places", config.state_ticks), ("action_places", config.action_ticks)):
+                self.register_buffer(name, tick_encoding(ticks, width), persistent=False)
+        else:
+            self.position = nn.Parameter(0.02 * torch.randn(config.history + config.horizon, width))
         self.kind = nn.Parameter(0.02 * torch.randn(2, width))
         if config.text_size:
             self.embed_text = nn.Sequential(nn.Linear(config.text_size, width), nn.GELU(), nn.Linear(width, width))
@@ -91,9 +111,9 @@ class Denoiser(nn.Module):
         instruction, None for a window without one; `text_mask` `(batch,)` bool says which windows of a batch have one.
         """
         n = states.shape[1]
-        at_state = self.embed_state(states) + self.level(state_levels) + self.position + self.kind[0]
-        place = self.position[: actions.shape[1]]
-        at_action = self.embed_action(actions) + self.level(action_levels) + place + self.kind[1]
+        state_place, action_place = self._places(actions.shape[1])
+        at_state = self.embed_state(states) + self.level(state_levels) + state_place + self.kind[0]
+        at_action = self.embed_action(actions) + self.level(action_levels) + action_place + self.kind[1]
         x = torch.cat([at_state, at_action], 1)
         if self.config.text_size:
             x = x + self._instruction(text, text_mask)
@@ -101,6 +121,12 @@ class Denoiser(nn.Module):
             x = block(x, self.mask)
         x = self.norm(x)
         return self.head_state(x[:, :n]), self.head_action(x[:, n:])
+
+    def _places(self, actions: int) -> tuple[Tensor, Tensor]:
+        """What says at which tick a token is, `(tokens, width)` of states and of `actions` actions."""
+        if self.config.ticks:
+            return self.place(self.state_places), self.place(self.action_places)
+        return self.position, self.position[:actions]
 
     def _instruction(self, text: Tensor | None, text_mask: Tensor | None) -> Tensor:
         """What is added to every token: `(batch, 1, width)` or, without an instruction, `(width,)`."""

@@ -44,9 +44,13 @@ def causal(state_ticks: Array, action_ticks: Array) -> Array:
 
 
 def diffuser_local(state_ticks: Array, action_ticks: Array) -> Array:
-    """The local attention of Diffuser (arXiv:2205.09991), as Diffuse-CLoC ablates it: a tick sees its neighbours."""
+    """The local attention of Diffuser (arXiv:2205.09991), as Diffuse-CLoC ablates it: a tick sees its neighbours.
+
+    Where not all ticks have tokens, they are the next ones that have.
+    """
     ticks = np.concatenate([state_ticks, action_ticks])
-    mask: Array = np.abs(ticks[None, :] - ticks[:, None]) <= 1
+    number = np.searchsorted(np.unique(ticks), ticks)
+    mask: Array = np.abs(number[None, :] - number[:, None]) <= 1
     return mask
 
 

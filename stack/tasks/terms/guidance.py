@@ -5,6 +5,7 @@ Works on torch tensors through their own methods, so that tasks load without tor
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -50,6 +51,9 @@ class Weights:
         return any((self.velocity, self.yaw_rate, self.displacement, self.yaw, self.stand))
 
 
+_STAND = Weights()
+
+
 def total_cost(trajectory: Trajectory, instruction: Instruction, weights: Weights) -> Any:
     """Sum `(batch,)` of the terms of everything that the instruction holds.
 
@@ -67,6 +71,21 @@ def total_cost(trajectory: Trajectory, instruction: Instruction, weights: Weight
     return cost
 
 
+@dataclass(frozen=True)
+class Stopping:
+    """A task's cost, until the robot shall stand: then standing is all that counts.
+
+    With a cost of places alone nothing else asks for it, and a robot walks on while it is lowered.
+    """
+
+    cost: Callable[[Trajectory, Instruction], Any]
+
+    def __call__(self, trajectory: Trajectory, instruction: Instruction) -> Any:
+        if instruction.stand:
+            return twist_cost(trajectory, np.zeros(3), _STAND)
+        return self.cost(trajectory, instruction)
+
+
 def goal_cost(trajectory: Trajectory, goal: Array, weights: Weights) -> Any:
     """Of each tick, for a goal `(2,)` or `(batch, 2)` m: `(batch,)`.
 
@@ -78,7 +97,7 @@ def goal_cost(trajectory: Trajectory, goal: Array, weights: Weights) -> Any:
     distance = _norm(way)
     ahead = way[..., 0] * trajectory.yaw.cos() + way[..., 1] * trajectory.yaw.sin()
     turned = distance * (distance - ahead) / (distance**2 + _NEAR**2)
-    return (weights.goal * distance + weights.facing * turned + weights.waypoint * distance**2).mean(-1)
+    return trajectory.mean(weights.goal * distance + weights.facing * turned + weights.waypoint * distance**2)
 
 
 def ground_cost(trajectory: Trajectory, asked: Array, weights: Weights) -> Any:
@@ -89,14 +108,14 @@ def ground_cost(trajectory: Trajectory, asked: Array, weights: Weights) -> Any:
     """
     cos, sin = trajectory.yaw.cos(), trajectory.yaw.sin()
     forward, left = trajectory.velocity[..., 0], trajectory.velocity[..., 1]
-    along, across = (cos * forward - sin * left).mean(-1), (sin * forward + cos * left).mean(-1)
+    along, across = trajectory.mean(cos * forward - sin * left), trajectory.mean(sin * forward + cos * left)
     squared, wanted = along**2 + across**2, float(np.linalg.norm(asked))
     cost = weights.speed * ((squared + 1e-9).sqrt() - wanted) ** 2
     if wanted < _STANDING:
         return cost
     x, y = (float(part) / wanted for part in asked)
     cost = cost + weights.steering * (1.0 - (along * x + across * y) / (squared + _SLOW**2).sqrt())
-    return cost + weights.heading * (1.0 - (cos * x + sin * y)).mean(-1)
+    return cost + weights.heading * trajectory.mean(1.0 - (cos * x + sin * y))
 
 
 def path_cost(trajectory: Trajectory, path: Array, weights: Weights) -> Any:
@@ -104,9 +123,10 @@ def path_cost(trajectory: Trajectory, path: Array, weights: Weights) -> Any:
 
     Ticks beyond the end of the path are not compared.
     """
-    places = trajectory.displacement.new_tensor(np.asarray(path, dtype=float))
-    ticks = min(len(places), trajectory.displacement.shape[-2])
-    return weights.path * ((trajectory.displacement[..., :ticks, :] - places[:ticks]) ** 2).sum(-1).mean(-1)
+    places = np.asarray(path, dtype=float)
+    ticks = trajectory.ticks[trajectory.ticks <= len(places)]
+    wanted = trajectory.displacement.new_tensor(places[ticks - 1])
+    return weights.path * trajectory.mean(((trajectory.displacement[..., : len(ticks), :] - wanted) ** 2).sum(-1))
 
 
 def obstacle_cost(trajectory: Trajectory, obstacles: Array, weights: Weights) -> Any:
@@ -117,13 +137,12 @@ def obstacle_cost(trajectory: Trajectory, obstacles: Array, weights: Weights) ->
     """
     as_tensor = trajectory.displacement.new_tensor
     centre, radius, velocity = np.split(np.asarray(obstacles, dtype=float), [2, 3], axis=-1)
-    times = trajectory.dt * np.arange(1, trajectory.displacement.shape[-2] + 1)
-    centres = as_tensor(centre + times[:, None, None] * velocity)  # (horizon, n, 2)
+    centres = as_tensor(centre + trajectory.times[:, None, None] * velocity)  # (horizon, n, 2)
     distance = _norm(trajectory.displacement[..., None, :] - centres) - as_tensor(radius[:, 0])
     cost = weights.repulsion * (-weights.sharpness * distance).exp()
     if weights.avoidance > 0.0:
         cost = cost + weights.avoidance * (1.0 + (1.0 - distance / weights.margin).exp()).log()
-    return cost.sum(-1).mean(-1)
+    return trajectory.mean(cost.sum(-1))
 
 
 def _norm(vectors: Any) -> Any:
@@ -153,15 +172,14 @@ def twist_cost(trajectory: Trajectory, velocity: Array, weights: Weights) -> Any
     Velocities are compared by their means over the horizon, displacement and yaw at its end. Tick by tick, the sway of
     every walk would be an error, least for a robot that stands. Differentiable with respect to the trajectory.
     """
-    end = np.array([trajectory.dt * trajectory.yaw.shape[-1]])
-    place, yaw = integrate_twist(velocity, end)
+    place, yaw = integrate_twist(velocity, trajectory.times[-1:])
     as_tensor = trajectory.displacement.new_tensor
     twist = as_tensor(np.asarray(velocity, dtype=float))
-    cost = weights.velocity * ((trajectory.velocity.mean(-2) - twist[..., :2]) ** 2).sum(-1)
-    cost = cost + weights.yaw_rate * (trajectory.yaw_rate.mean(-1) - twist[..., 2]) ** 2
+    cost = weights.velocity * ((trajectory.mean(trajectory.velocity, -2) - twist[..., :2]) ** 2).sum(-1)
+    cost = cost + weights.yaw_rate * (trajectory.mean(trajectory.yaw_rate) - twist[..., 2]) ** 2
     short = trajectory.displacement[..., -1, :] - as_tensor(place[..., 0, :])
     cost = cost + weights.displacement * (short**2).sum(-1)
     cost = cost + weights.yaw * (trajectory.yaw[..., -1] - as_tensor(yaw[..., 0])) ** 2
     # Stepping on the spot has no mean velocity either: who is told to stand shall not sway.
     stand = as_tensor((np.abs(np.asarray(velocity, dtype=float)).max(-1) < _STANDING).astype(float))
-    return cost + stand * weights.stand * (trajectory.velocity**2).sum(-1).mean(-1)
+    return cost + stand * weights.stand * trajectory.mean((trajectory.velocity**2).sum(-1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from shutil import copy
 
 import pytest
 
@@ -48,6 +49,7 @@ def test_a_limit_that_cannot_be_meant_is_refused(tmp_path: Path, old: str, new: 
     assert old in text
     path = tmp_path / "op3.yaml"
     path.write_text(text.replace(old, new, 1))
+    copy(CONFIGS / "robots" / "op3.xml", tmp_path)
     with pytest.raises(ConfigError, match=re.escape(words)) as caught:
         load_robot(path)
     assert re.match(rf"{re.escape(str(path))}:\d+: ", str(caught.value))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from shutil import copy
 
 import numpy as np
 import pytest
@@ -111,6 +112,7 @@ def edited(tmp_path: Path, kind: str, name: str, old: str, new: str) -> tuple[Pa
     assert old in text
     path = tmp_path / name
     path.write_text(text.replace(old, new, 1))
+    copy(CONFIGS / "robots" / "op3.xml", tmp_path)
     return path, text[: text.index(old)].count("\n") + 1
 
 
@@ -135,8 +137,6 @@ ROLL = "{name: l_sho_roll, servo: xm430-w350, id: 4, direction: 1, zero: 0.0, ra
         ("mirror: r_knee", "mirror: r_ank_roll", "l_knee names r_ank_roll as its mirror, but r_ank_roll names"),
         ("mirror: r_knee, mirror_sign: -1", "mirror: r_knee, mirror_sign: 2", "must be 1 or -1, not 2"),
         ("mirror: r_knee, mirror_sign: -1", "mirror: r_knee, mirror_sign: 1", "must have the same sign"),
-        ("{joint: l_knee, ", "{joint: l_kneee, ", "legs.left[3].joint: unknown joint 'l_kneee'; did you mean 'l_knee'"),
-        ("axis: [0, 0, -1]", "axis: [0, 0, -2]", "must be a unit vector"),
         ("rate: 50 ", "rate: 0 ", "rate: must be positive, not 0"),
         ("joint_speed: 4.5", "joint_speed: -4.5", "limits.joint_speed: must be positive"),
         ("forward: 0.5", "forward: -0.5", "walking.forward: must be positive, not -0.5"),
@@ -188,17 +188,11 @@ def test_a_robot_file_that_says_nothing_of_it_has_the_boards_imu_and_any_button_
     kept = [line for line in lines if not line.strip().startswith(new)]
     assert len(kept) == len(lines) - 7
     (tmp_path / "old.yaml").write_text("\n".join(kept))
+    copy(CONFIGS / "robots" / "op3.xml", tmp_path)
     robot = load_robot(tmp_path / "old.yaml")
     assert (robot.imu.kind, robot.imu.port, robot.imu.signs) == ("opencr", None, (1.0, 1.0, 1.0))
     assert robot.bus.stop_buttons == ("mode", "start", "user")
     assert (robot.limits.derate_temperature, robot.limits.voltage, robot.limits.derate_voltage) == (None, None, None)
-
-
-def test_a_missing_leg_joint_is_noticed(tmp_path: Path) -> None:
-    knee = "    - {joint: r_knee, offset: [0, 0, -0.11015], axis: [0, -1, 0]}\n"
-    path, _ = edited(tmp_path, "robots", "op3.yaml", knee, "")
-    with pytest.raises(ConfigError, match=r"legs\.right: has 5 joints"):
-        load_robot(path)
 
 
 @pytest.mark.parametrize(
@@ -264,6 +258,8 @@ def test_what_a_robot_may_be_asked_is_derived_from_its_height(tmp_path: Path) ->
     text = (CONFIGS / "robots" / "op3.yaml").read_text()
     section = re.search(r"^walking:.*\n(  .*\n)+", text, re.MULTILINE)
     assert section
+
+    copy(CONFIGS / "robots" / "op3.xml", tmp_path)
 
     def loaded(walking: str, height: float) -> Walking:
         path = tmp_path / "own.yaml"

@@ -32,7 +32,8 @@ def previous_plan(tick: int) -> Plan:
 def test_a_warm_start_is_the_earlier_plan_moved_on_and_seen_from_now() -> None:
     made, asked, plan = model(), request(), previous_plan(37)
     age = asked.tick - plan.tick
-    previous = Previous(age, plan.states[None], plan.actions[None])
+    ticks = np.arange(1, len(plan.states) + 1)
+    previous = Previous(age, plan.states[None], plan.actions[None], ticks)
     states, actions = clean_start(made.config, made.states, made.actions, previous, asked.states[None, -1])
     # Frame t of now is frame t + age of then; the last ones are new.
     np.testing.assert_allclose(made.actions.decode(actions)[0, 3:16].numpy(), plan.actions[age:], atol=1e-5)
@@ -41,7 +42,7 @@ def test_a_warm_start_is_the_earlier_plan_moved_on_and_seen_from_now() -> None:
     assert not states[0, 4 + 16 - age :].any()
     heights = made.states.decode(states)[0, 4:17, 4].numpy()
     np.testing.assert_allclose(heights, plan.states[age:, 2], atol=1e-5)
-    far = Previous(age, moved(plan.states, 5.0, -3.0, 1.0)[None], plan.actions[None])
+    far = Previous(age, moved(plan.states, 5.0, -3.0, 1.0)[None], plan.actions[None], ticks)
     there, _ = clean_start(made.config, made.states, made.actions, far, moved(asked.states, 5.0, -3.0, 1.0)[None, -1])
     torch.testing.assert_close(there, states, atol=1e-3, rtol=1e-3)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,8 +12,17 @@ import torch
 from task_bodies import DT, moves
 
 from servoid.hw.contracts.control import Instruction
+from servoid.policy.features import Trajectory
 from servoid.stack.tasks import load_settings, load_task
-from servoid.stack.tasks.terms.guidance import Weights, goal_cost, ground_cost, obstacle_cost, path_cost, total_cost
+from servoid.stack.tasks.terms.guidance import (
+    Stopping,
+    Weights,
+    goal_cost,
+    ground_cost,
+    obstacle_cost,
+    path_cost,
+    total_cost,
+)
 
 TWIST = tuple(f"cost.{name}" for name in ("velocity", "yaw_rate", "displacement", "yaw", "stand"))
 
@@ -61,8 +72,8 @@ def pull(distance: float, weights: Weights, bearing: float = 1.0) -> tuple[float
 def test_each_robot_of_a_batch_may_have_a_goal_of_its_own() -> None:
     goals, weights = np.array([[1.0, 0.0], [0.0, 2.0]]), Weights(goal=2.0, facing=3.0)
     for ticks in (2, 3):  # as many as robots, or more
-        one, two = moves(np.zeros((ticks, 2))), moves(np.zeros((ticks, 2)))
-        two.displacement, two.yaw = (torch.cat([part, part]) for part in (one.displacement, one.yaw))
+        one = moves(np.zeros((ticks, 2)))
+        two = replace(one, **{name: torch.cat([getattr(one, name)] * 2) for name in ("displacement", "yaw")})
         alone = [value(goal_cost(one, goal, weights)) for goal in goals]
         np.testing.assert_allclose(goal_cost(two, goals, weights).detach().numpy(), alone, rtol=1e-6)
 
@@ -75,6 +86,44 @@ def test_facing_a_near_goal_does_not_outweigh_being_there() -> None:
     # Who faces it is not pushed off, and further away facing is the paper's: 1 - cos, turned by 1 / distance.
     assert pull(0.02, facing, bearing=0.0)[1] == pytest.approx(0.0, abs=1e-3)
     assert pull(1.0, facing) == pytest.approx((1.0 - np.cos(1.0), np.sin(1.0)), rel=0.02)
+
+
+def test_costs_take_the_times_of_the_states_that_they_are_given() -> None:
+    """States are further apart the further ahead they are: the index of one says nothing of its time."""
+    even, uneven = np.arange(1, 33), np.array([1, 2, 4, 8, 16, 24, 32])
+
+    def walk(ticks: np.ndarray) -> Trajectory:
+        return moves(
+            np.stack([0.3 * DT * ticks, 0.02 * np.sin(0.1 * ticks)], axis=-1), velocity=(0.3, 0.0), ticks=ticks
+        )
+
+    dense, sparse = walk(even), walk(uneven)
+    coming = np.array([[0.5, 0.0, 0.05, -0.2, 0.0]])
+    path = np.stack([0.25 * DT * even, np.zeros(32)], axis=-1)
+    for asked in (
+        Instruction(np.array([0.1, 0.0, 0.3])),
+        Instruction(np.zeros(3), goal=np.array([1.0, 0.5])),
+        Instruction(np.zeros(3), obstacles=coming),
+        Instruction(np.zeros(3), path=path),
+    ):
+        weights = Weights(goal=1.0, repulsion=1.0, sharpness=3.0)
+        assert value(total_cost(sparse, asked, weights)) == pytest.approx(
+            value(total_cost(dense, asked, weights)), rel=0.1
+        )
+    np.testing.assert_allclose(dense.mean(dense.velocity, -2).numpy(), [[0.3, 0.0]])
+    np.testing.assert_allclose(sparse.mean(sparse.velocity, -2).numpy(), [[0.3, 0.0]])
+
+
+def test_a_robot_that_shall_stand_is_guided_to_stand_whatever_the_task_wants() -> None:
+    weights = replace(Weights(), velocity=0, yaw_rate=0, displacement=0, yaw=0, stand=0, goal=1.0)
+    walking = moves(np.stack([0.1 * np.arange(5), np.zeros(5)], axis=-1), velocity=(0.3, 0.0))
+    standing = moves(np.zeros((5, 2)))
+    cost = Stopping(partial(total_cost, weights=weights))
+    asked = Instruction(np.zeros(3), goal=np.array([1.0, 0.0]))
+    assert cost(walking, asked) < cost(standing, asked)
+    asked = replace(asked, stand=True)
+    assert cost(walking, asked) > cost(standing, asked)
+    assert pickle.loads(pickle.dumps(cost))(walking, asked) == cost(walking, asked)
 
 
 def test_a_waypoint_costs_the_square_of_its_distance() -> None:

@@ -105,7 +105,7 @@ def test_check_sees_a_servo_of_nobody_on_the_robots_bus(rig: RigProcess, bringup
     """All registers of the joints may be right, and what is written to one moves the stranger too."""
     text = (CONFIGS / "robots" / "op3.yaml").read_text().replace("op3.xml", str(CONFIGS / "robots" / "op3.xml"))
     lines = [line for line in text.splitlines() if "name: head_" not in line]  # a robot without a head, on this rig
-    (tmp_path / "headless.yaml").write_text("\n".join(lines))
+    (tmp_path / "headless.yaml").write_text("\n".join([*lines, "passive: [head_pan, head_tilt]"]))
     write(rig, 20, secondary_id=14)
     code, found, _ = bringup("check", *VIRTUAL, "--robot", str(tmp_path / "headless.yaml"))
     assert (code, found["differences"], found["ready"]) == (1, [], False)

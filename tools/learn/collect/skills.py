@@ -28,7 +28,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Skill:
+class Drill:
     """`text` is the dataset's task; one of the boxes is drawn, then a velocity in it. `weight`: how often."""
 
     name: str
@@ -47,25 +47,25 @@ class Skill:
 # Boxes are shares: of the top speed forward, whatever the direction, and of that of turning. The skills' numbers are
 # the dataset's task indices. Turning and walking mixed weigh more: they are most of what steering to a goal asks for,
 # and so does straight ahead, up to more than the expert can. Creeping covers the slow end, where a robot arrives.
-SKILLS: tuple[Skill, ...] = (
-    Skill("stand", "stand still", (Box(),), 2.5, (1.0, 3.0)),
-    Skill("forward", "walk forward", (Box(forward=(0.1, 1.0)),), 2.5),
-    Skill("slow", "walk forward slowly", (Box(forward=(0.06, 0.24)),)),
-    Skill("backward", "walk backward", (Box(forward=(-0.24, -0.06)),)),
-    Skill("side", "step sideways", (Box(left=(0.08, 0.24)), Box(left=(-0.24, -0.08)))),
-    Skill("turn", "turn on the spot", (Box(turn=(0.2, 1.0)), Box(turn=(-1.0, -0.2))), 1.5),
-    Skill("arc", "walk along an arc", (Box(forward=(0.1, 0.8), turn=(-0.8, 0.8)),), 2.0),
-    Skill("diagonal", "walk diagonally", (Box((0.1, 0.3), (0.08, 0.2)), Box((0.1, 0.3), (-0.2, -0.08))), 0.8),
-    Skill("reverse", "walk backward along an arc", (Box((-0.24, -0.08), turn=(-0.6, 0.6)),), 0.6),
-    Skill("any", "walk and turn in any direction", (Box((-0.24, 0.6), (-0.2, 0.2), (-0.8, 0.8)),), 2.0),
-    Skill("creep", "creep slowly in any direction", (Box((-0.12, 0.12), (-0.12, 0.12), (-0.2, 0.2)),)),
+SKILLS: tuple[Drill, ...] = (
+    Drill("stand", "stand still", (Box(),), 2.5, (1.0, 3.0)),
+    Drill("forward", "walk forward", (Box(forward=(0.1, 1.0)),), 2.5),
+    Drill("slow", "walk forward slowly", (Box(forward=(0.06, 0.24)),)),
+    Drill("backward", "walk backward", (Box(forward=(-0.24, -0.06)),)),
+    Drill("side", "step sideways", (Box(left=(0.08, 0.24)), Box(left=(-0.24, -0.08)))),
+    Drill("turn", "turn on the spot", (Box(turn=(0.2, 1.0)), Box(turn=(-1.0, -0.2))), 1.5),
+    Drill("arc", "walk along an arc", (Box(forward=(0.1, 0.8), turn=(-0.8, 0.8)),), 2.0),
+    Drill("diagonal", "walk diagonally", (Box((0.1, 0.3), (0.08, 0.2)), Box((0.1, 0.3), (-0.2, -0.08))), 0.8),
+    Drill("reverse", "walk backward along an arc", (Box((-0.24, -0.08), turn=(-0.6, 0.6)),), 0.6),
+    Drill("any", "walk and turn in any direction", (Box((-0.24, 0.6), (-0.2, 0.2), (-0.8, 0.8)),), 2.0),
+    Drill("creep", "creep slowly in any direction", (Box((-0.12, 0.12), (-0.12, 0.12), (-0.2, 0.2)),)),
 )
 FIRST_SECONDS: Range = (0.1, 0.6)  # of standing that an episode begins with: a run starts from rest
 
 _SHARES = np.cumsum([skill.weight for skill in SKILLS]) / sum(skill.weight for skill in SKILLS)
 
 
-def skills_of(robot: Robot) -> tuple[Skill, ...]:
+def skills_of(robot: Robot) -> tuple[Drill, ...]:
     """The skills with what this robot is asked, in m/s and rad/s."""
     return tuple(replace(skill, boxes=tuple(box.of(robot.walking) for box in skill.boxes)) for skill in SKILLS)
 

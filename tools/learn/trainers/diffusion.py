@@ -72,7 +72,15 @@ def main(args: argparse.Namespace) -> int:
 
         planning(config, asdict(settings))
     recording = read_recording(args.data, robot)
-    windows = Windows(recording, robot, config, emphasis=settings.emphasis, seed=settings.seed, latents=latents)
+    windows = Windows(
+        recording,
+        robot,
+        config,
+        emphasis=settings.emphasis,
+        seed=settings.seed,
+        latents=latents,
+        changes=settings.changes,
+    )
     trainer = DiffusionTrainer(windows, robot, settings, args.out, source_of(args.data, recording), judge)
     trainer.start(args.resume, args.init)
     trainer.run()
@@ -248,7 +256,7 @@ class DiffusionTrainer(Trainer):
         ours = self.windows.latents.to_tensors() if self.windows.latents else {}
         if ours.keys() != latents.keys() or any((ours[name] != latents[name]).any() for name in ours):
             raise ConfigError(f"{path}: trained with other latents; use --no-resume or another --out")
-        require_same(path, "another network", asdict(self.config), saved["config"])
+        require_same(path, "another network", asdict(self.config), {"ticks": ()} | saved["config"])
         self.windows.states, self.windows.actions = (
             Normaliser.from_numpy(_arrays(saved[name])).to_torch() for name in ("states", "actions")
         )

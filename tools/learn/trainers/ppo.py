@@ -58,6 +58,11 @@ class Environment(Protocol):
         ...
 
     @property
+    def measures(self) -> Mapping[str, float]:
+        """What else of the last episodes is logged, by column."""
+        ...
+
+    @property
     def term_names(self) -> tuple[str, ...]: ...
 
     def reset(self) -> None:
@@ -85,8 +90,8 @@ class PpoTrainer(Trainer):
         terms = [f"term/{name}" for name in env.term_names]
         losses = [f"loss/{name}" for name in _LOSSES]
         measured = ("episode_ticks", "reward", "std", "learning_rate", "samples_per_s", "collect_share")
-        self.columns = (*measured, *losses, *terms)
-        self.panels = (("episode_ticks",), ("reward",), ("std", "learning_rate"), terms)
+        self.columns = (*measured, *losses, *terms, *env.measures)
+        self.panels = (("episode_ticks",), ("reward",), ("std", "learning_rate"), terms, tuple(env.measures))
 
     @property
     def progress(self) -> dict[str, Any]:
@@ -163,6 +168,7 @@ class PpoTrainer(Trainer):
             "collect_share": (collected - begun) / (time.monotonic() - begun),
             **{f"loss/{name}": float(losses[name]) for name in _LOSSES},
             **{f"term/{name}": float(np.mean([t[name] for t in terms])) for name in env.term_names},
+            **env.measures,
         }
 
     def shown(self, means: Mapping[str, float], steps_per_s: float) -> tuple[dict[str, float], str]:

@@ -17,7 +17,7 @@ from servoid.hw.contracts.task import Behaviour, Criterion, Episode, Objective, 
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot, shipped_robot
 from servoid.hw.setting import Setting, asks, check, rescaled
-from servoid.policy.references.gait import load_gait
+from servoid.policy.references.gait import gait_of
 from servoid.stack.tasks.terms.guidance import Weights, total_cost
 
 T = TypeVar("T")
@@ -67,7 +67,7 @@ def fitted(settings: T, robot: Robot) -> T:
             "left": (r.walking.sideways, r.walking.sideways),
             "turning": (r.walking.turning, r.walking.turning),
             "height": (r.walking.height,),
-            "cycle": (load_gait(r.gait).cycle,),
+            "cycle": (gait_of(r).cycle,),
         }
         for r in (robot, shipped_robot())
     )
@@ -90,6 +90,7 @@ class BaseTask:
     description: str = ""  # in a line
     settings_type: ClassVar[type[Settings]] = Settings
     steered: ClassVar[bool] = False  # by a person, who needs real time
+    performs: ClassVar[bool] = False  # skills that are asked for
     counts_undone: ClassVar[tuple[str, ...]] = ()  # metrics that hold of a run that never began, too
     guided_by_velocity_alone: ClassVar[bool] = False  # whether no other term of the cost is about its instructions
 
@@ -106,7 +107,7 @@ class BaseTask:
     @property
     def cycle(self) -> float:
         """Length of a cycle of the robot's gait [s]: within one, every walk sways."""
-        return load_gait((self.robot or shipped_robot()).gait).cycle
+        return gait_of(self.robot or shipped_robot()).cycle
 
     def ticks(self, seconds: float) -> int:
         """The nearest number of ticks, at least one."""

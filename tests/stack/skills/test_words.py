@@ -1,0 +1,66 @@
+"""Sentences that ask for skills, or for walking, or for what nobody here can do."""
+
+from __future__ import annotations
+
+import pytest
+
+from servoid.hw.config import ConfigError
+from servoid.hw.robot.description import load_robot
+from servoid.policy.text.captions import MOTIONS
+from servoid.policy.text.encoder import load_encoder
+from servoid.stack.skills.skill import load_skills
+from servoid.stack.skills.words import SkillWords
+from servoid.stack.tasks import load_task
+
+SKILLS = load_skills(load_robot())
+WORDS = SkillWords(load_encoder(), SKILLS)
+
+
+def heard(text: str) -> str | int:
+    try:
+        return WORDS.understand(text)
+    except ConfigError:
+        return ""
+
+
+def test_every_phrase_names_its_skill() -> None:
+    assert {text: heard(text) for skill in SKILLS.values() for text in skill.phrases} == {
+        text: name for name, skill in SKILLS.items() for text in skill.phrases
+    }
+
+
+def test_held_out_phrases_are_understood_and_none_as_another_skill() -> None:
+    pairs = [(name, heard(text)) for name, skill in SKILLS.items() for text in skill.held_out]
+    assert sum(name == found for name, found in pairs) >= 0.9 * len(pairs)
+    assert all(found in (name, "") for name, found in pairs)
+
+
+def test_sentences_about_walking_stay_about_walking() -> None:
+    assert all(isinstance(WORDS.understand(text), int) for motion in MOTIONS for text in motion.phrasings)
+
+
+@pytest.mark.parametrize("text", ["wave", "kick forward", "please sit down"])
+def test_a_task_that_only_walks_says_where_skills_are_performed(text: str) -> None:
+    with pytest.raises(ConfigError, match=f"asks for a skill: use servoid run skill --set text='{text}'"):
+        load_task("text", {"sentence": text})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("kick", "does not say with which side; add 'left' or 'right'"),
+        ("kick forward", "does not say with which side"),
+        ("wave with the left hand", "says 'left', but 'wave' has no side to choose"),
+        ("kick left and right", "asks for both left and right"),
+        ("do not kick with the left foot", "says what not to do"),
+        ("wave, then sit down", "one thing after another"),
+        ("wave three times", "says how much"),
+        ("make coffee", "asks for nothing that is known; the nearest skill is"),
+        ("play the violin", "asks for nothing that is known"),
+        ("setz dich hin", "asks for nothing that is known"),
+        ("", "is empty"),
+    ],
+)
+def test_what_cannot_be_told_is_refused(text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        WORDS.understand(text)
