@@ -86,7 +86,20 @@ function gamepad() {
   return centred ? sticks : [0, 0, 0];
 }
 
-setInterval(() => { if (holder === "you") send("beat", { way: way() }); }, BEAT);
+// A machine without a graphics card may draw so slowly that signs of life come late, and a stop with them: then the
+// picture goes, for numbers, map and stop to stay quick.
+const SLOW = 200, SLOW_BEATS = 15; // ms that a beat is late, and how many of the last 30 may be
+let beats = [], expected = performance.now();
+
+function beat() {
+  const now = performance.now();
+  if (!document.hidden) beats.push(now - expected > SLOW);
+  expected = now + BEAT;
+  beats = beats.slice(-30);
+  if (beats.filter(Boolean).length > SLOW_BEATS) flatten("This machine draws in 3D too slowly for a page that must stop a robot at once.");
+  if (holder === "you") send("beat", { way: way() });
+}
+setInterval(beat, BEAT);
 setInterval(() => send("look"), LOOK);
 
 const typing = (event) => ["INPUT", "SELECT", "TEXTAREA"].includes(event.target?.tagName) && event.target.type !== "range";
@@ -299,8 +312,22 @@ function show(now) {
 }
 
 const view = byId("view");
+function flatten(why) {
+  view.removeAttribute("src");
+  view.hidden = true;
+  byId("flat").hidden = false;
+  byId("flat-why").textContent = why;
+}
+function raise() {
+  beats = [];
+  view.hidden = false;
+  byId("flat").hidden = true;
+  view.src = "viser/";
+}
 view.onload = () => { try { listenForKeys(view.contentWindow); } catch { /* a page of an error, which hears no keys */ } };
-view.src = "viser/";
+byId("raise").onclick = raise;
+if (location.hash === "#flat") flatten("The page was opened without the picture in 3D.");
+else raise();
 stand();
 connect();
 requestAnimationFrame(show);
