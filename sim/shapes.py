@@ -9,7 +9,8 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
-from servoid.sim.model import compiled, spec
+from servoid.hw.robot.mjcf import compiled
+from servoid.sim.model import spec
 from servoid.sim.multi_robot import ADDED
 
 _GEOM = mujoco.mjtGeom
@@ -34,7 +35,7 @@ class Figure:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._model = compiled(spec(robot), robot)
+        self._model = compiled(spec(robot), robot.mjcf)
         self._data = mujoco.MjData(self._model)
         model = self._model
         self._joints = [int(model.joint(name).qposadr[0]) for name in robot.names]
