@@ -10,7 +10,7 @@ import trimesh
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import rotate
-from servoid.sim.shapes import BodyShape
+from servoid.sim.drawing.shapes import BodyShape
 
 SECTIONS = 24  # of a circle
 

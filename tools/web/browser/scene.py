@@ -17,9 +17,9 @@ import viser
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
+from servoid.sim.drawing.shapes import Figure
 from servoid.sim.marks import GOAL_COLOUR, PATH_COLOUR, PLAN_COLOUR, TRAIL_COLOUR
 from servoid.sim.scene import PILLAR_COLOUR, PILLAR_HEIGHT, SPHERE_COLOUR
-from servoid.sim.shapes import Figure
 from servoid.tools.web.browser.meshes import meshes
 from servoid.tools.web.line.snapshot import BodyPose, RunInfo, Snapshot
 
