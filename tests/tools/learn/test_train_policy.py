@@ -127,6 +127,12 @@ def test_rewards_are_highest_for_what_is_asked() -> None:
     assert steering.reward(sideways, state((0, 0), 0.0, (0.0, 0.1)))[0] == pytest.approx(1.0)
     assert steering.reward(sideways, state((0, 0), np.pi / 2, (0.0, 0.1)))[0] == pytest.approx(0.7)
     assert steering.reward(sideways, state((0, 0), 0.0, (0.0, -0.01)))[0] == pytest.approx(0.3)
+    ball = LEARNED_TASKS["dodgeball"](ROBOT)
+    thrown = ball.draw(np.random.default_rng(0), np.array([1.0, -1.0]))[None]
+    hit = [bool(ball.ended(ball.advance(thrown, t), state((1, -1), 0.0, (0.0, 0.0)))[0]) for t in np.arange(0, 6, 0.1)]
+    assert any(hit)  # it flies at where the robot stands
+    assert not hit[0]
+    assert ball.reward(thrown, state((5, 5), 0.0, (0, 0)))[0] > ball.reward(thrown, state((1, -1), 0.0, (0, 0)))[0] > 0
     place = np.array([[1.0, 0.0]])
     assert location.reward(place, state((1.0, 0.0), 0.0, (0.0, 0.0)))[0] == pytest.approx(1.0)
     assert location.reward(place, state((0.0, 0.0), 0.0, (0.0, 0.0)))[0] < 0.01
@@ -141,6 +147,11 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
     assert np.allclose(GOALS["steering"].observe(turning, walking), [0.5, 0.0, np.cos(0.5), np.sin(0.5)])
     far = Instruction(velocity=np.zeros(3), goal=np.array([3.0, 4.0]))
     assert np.allclose(GOALS["location"].observe(far, walking), [0.6, 0.8])
+    things = np.array([[2.0, 0.0, 0.1, -0.5, 0.0], [0.0, -1.0, 0.1, 0.0, 0.25]])
+    seen = GOALS["ball"].observe(Instruction(np.zeros(3), obstacles=things), walking)
+    assert np.allclose(seen, [0.0, -1.0, 0.0, 0.5])  # the nearest
+    with pytest.raises(ConfigError, match="run obstacle"):
+        GOALS["ball"].observe(turning, walking)
     with pytest.raises(ConfigError, match="the task gives none"):
         GOALS["location"].observe(turning, walking)
 

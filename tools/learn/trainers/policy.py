@@ -1,9 +1,9 @@
 """Train a policy for a task with PPO, under a motion prior that rewards what is like its data (SMP).
 
---task is speed, steering, location, or your own FILE.py:Class. The policy sees the estimate and its goal; it decides
-joint targets around the home pose as often as its prior has frames. --rewards weighs the task, the prior (manner) and
-their product (both); the paper adds the first two. With --demonstrations it begins as a network that does what a
-dataset shows, instead of at random.
+--task is speed, steering, location, dodgeball, or your own FILE.py:Class. The policy sees the estimate and its goal;
+it decides joint targets around the home pose as often as its prior has frames. --rewards weighs the task, the prior
+(manner) and their product (both); the paper adds the first two. With --demonstrations it begins as a network that
+does what a dataset shows, instead of at random.
 
 Ctrl-C saves, and the same command continues. The newest network is policy.safetensors.
 """
@@ -42,9 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid train policy`."""
     run = add_run_arguments(parser, PolicyTraining(), threads=1)  # the worlds use the cores
     run.add_argument("--task", required=True, metavar="NAME|FILE.py:CLASS", help="what is learned")
-    run.add_argument(
-        "--prior", type=Path, required=True, metavar="CHECKPOINT", help="motion prior (`servoid train prior`)"
-    )
+    run.add_argument("--prior", required=True, metavar="NAME|FILE", help="motion prior (`servoid train prior`)")
     run.add_argument(
         "--style",
         metavar="NAME|UPPER+LOWER",
@@ -83,11 +81,12 @@ def main(args: argparse.Namespace) -> int:
     torch.set_num_threads(args.threads)
     torch.manual_seed(settings.seed)
     robot = load_robot(args.robot)
-    prior = load_prior(args.prior, robot, limbs_of(robot))
+    found = checkpoint.resolve(args.prior, robot)
+    prior = load_prior(found, robot, limbs_of(robot))
     style = Style.parse(args.style, args.style_weight)
     rival = _rival(args, prior, settings)
     env = environment(args.task, prior, style, settings, settings.worlds, settings.seed, rival)
-    trainer = PolicyTrainer(env, style, settings, args.out, args.prior)
+    trainer = PolicyTrainer(env, style, settings, args.out, found)
     trainer.rival = rival
     trainer.start(args.resume, args.init)
     if args.demonstrations is not None and not trainer.begun_with:
