@@ -28,6 +28,7 @@ _ASTRAY_SECONDS = 0.5  # for which a world that follows a clip may be far from i
 _ASTRAY_GRAVITY = 1.0  # squared error of gravity, seen from the base: 60 degrees
 _ASTRAY_HEIGHT = 0.3  # of the standing height
 _GRACE_SECONDS = 1.0  # in which one that lies need not yet lie as the clip
+_NEAR = 0.3  # rad, root mean square, between the end of a clip and the beginning of one that goes on from it
 _LEARNED = 0.03  # of a clip's success, from one try
 _ALWAYS = 0.2  # weight of a clip that never fails, beside 1 of one that always does
 
@@ -49,6 +50,8 @@ class Motions:
         self._along = along(robot, clips, _ALONG, seed) if wanted else None
         self._lying = lying(robot, _LYING, seed) if wanted and self._lies.any() else None
         self._ends = np.array([clip.about.ends for clip in clips])
+        ends, begins = (np.array([clip.joints[at] for clip in clips]) for at in (-1, 0))
+        self._near = np.sqrt(((ends[:, None] - begins) ** 2).mean(-1)) < _NEAR
         self._chances = np.full(len(clips), 0.5)  # of failure
         self._astray, self._since = np.zeros(n, int), np.zeros(n, int)  # ticks: far off; since the last change
         self._next_command, self._next_change = np.zeros(n, int), np.zeros(n, int)
@@ -206,6 +209,8 @@ class Motions:
         play = np.zeros(self.n, bool)
         for i in np.flatnonzero(due & ~stand).tolist():
             fits = self._begins == pose[i]
+            if ended[i]:  # it sits, or lies, and who lies may come to any pose of lying
+                fits = fits & (self._lies | self._near[self.reference.clip.clip[i]])
             if not fits.any():
                 self.closing[i] = True
                 continue
