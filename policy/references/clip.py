@@ -116,12 +116,13 @@ class ClipReference(Reference):
         return low, within - low
 
     def frames(self, ahead: Array) -> ReferenceFrames:
-        passed = np.maximum(np.asarray(ahead) - np.floor(self._wait)[..., None], 0.0)
+        wait = np.floor(self._wait)[..., None]
+        passed = np.where(wait > 0.0, np.maximum(ahead - wait, 0.0), ahead)
         time = self.time[..., None] + passed * self.rate[..., None]
         clip = np.broadcast_to(self.clip[..., None], time.shape)
         at = self._reader(time)
         still = ~self._loop[clip] & (time >= self._ticks[clip] - 1)
-        moving = np.where(still | (np.asarray(ahead) < self._wait[..., None]), 0.0, self.rate[..., None])
+        moving = np.where(still | (ahead < wait), 0.0, self.rate[..., None])
         fading = np.clip((self._since[..., None] + np.asarray(ahead)) / self._blend[..., None], 0.0, 1.0)
         offset = (1.0 - smooth(fading))[..., None] * self._offset[..., None, :]
         slope = 30.0 * fading**2 * (1.0 - fading) ** 2 / (self._blend[..., None] * self.robot.dt)
