@@ -14,6 +14,7 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import Clip, smooth, velocities
 
 BLEND_SHARE = 0.5  # of the speed that the guard allows, that blending in may take
+WAIT_SHARE = 0.8  # the same where the clip waits meanwhile: nothing is added to its own speed
 
 
 class ClipReference(Reference):
@@ -82,7 +83,8 @@ class ClipReference(Reference):
         chosen = ... if where is None or not self.clip.ndim else where
         offset = joints - self._joints[self.clip, self._index(self.time)[0]]
         # A minimum-jerk blend is at its quickest 1.875 times as fast as its mean.
-        speed = BLEND_SHARE * self.robot.limits.joint_speed * self.robot.dt
+        share = np.where(self._waits[self.clip], WAIT_SHARE, BLEND_SHARE)
+        speed = share * self.robot.limits.joint_speed * self.robot.dt
         ticks = np.maximum(np.ceil(1.875 * np.abs(offset).max(-1) / speed), 1.0)
         self._offset[chosen], self._blend[chosen] = offset[chosen], ticks[chosen]
         self._since[chosen] = 0.0
