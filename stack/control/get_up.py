@@ -7,6 +7,7 @@ the clip's first pose often rolls it over, so that is looked at again.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import Robot
+from servoid.policy.checkpoint import read_header, resolve
 from servoid.policy.motion.clip import Clip
 from servoid.policy.motion.library import Library
 from servoid.policy.references.clip import BLEND_SHARE, ClipReference
@@ -142,7 +144,10 @@ def get_up(robot: Robot) -> GetUp:
     try:
         library = Library(robot)
         front, back = (library[name] for name in CLIPS)
-        return GetUp(robot, (front, back))
+        path = _tracker_of(robot)
+        if path is None:
+            return GetUp(robot, (front, back))
+        return TrackedGetUp(robot, (front, back), Tracker(robot, str(path), clips=True))
     except ConfigError as error:
         names = " and ".join(f"'{name}'" for name in CLIPS)
         raise ConfigError(
@@ -150,7 +155,14 @@ def get_up(robot: Robot) -> GetUp:
         ) from error
 
 
+def _tracker_of(robot: Robot) -> Path | None:
+    """The shipped tracker, where it is this robot's."""
+    path = resolve("tracker")
+    return path if read_header(path)["robot"] == robot.name else None
+
+
 def fingerprints(robot: Robot) -> dict[str, str | None]:
-    """Hashes of the clips' files, by their names, of a robot that has them."""
-    library = Library(robot)
-    return {name: sha256(library.path(name)) for name in CLIPS}
+    """Hashes of the clips' files, by their names, of a robot that has them, and of the tracker that follows them."""
+    library, tracker = Library(robot), _tracker_of(robot)
+    clips = {name: sha256(library.path(name)) for name in CLIPS}
+    return clips if tracker is None else {**clips, "tracker": sha256(tracker)}

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Policy
 from servoid.hw.robot.description import Robot
 from servoid.stack.control.clip import ClipPolicy
+from servoid.stack.control.tracker import Tracker
 from servoid.stack.skills.skill import Skill, clip_of
 
 
@@ -26,9 +26,7 @@ def _clip(skill: Skill, robot: Robot) -> Performer:
 
 
 def _tracker(skill: Skill, robot: Robot) -> Performer:
-    raise ConfigError(
-        f"skill '{skill.name}': policy: tracker needs a tracker of clips, and none is shipped: write policy: clip"
-    )
+    return ClipPolicy(robot, clip_of(skill, robot), tracker=Tracker(robot, "tracker", clips=True))
 
 
 PERFORMERS: dict[str, Callable[[Skill, Robot], Performer]] = {"clip": _clip, "tracker": _tracker}
