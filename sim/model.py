@@ -30,8 +30,8 @@ def build(robot: Robot, scene: Scene | None = None) -> mujoco.MjModel:
     """
     result = spec(robot, robots := count_robots(scene))
     if scene is not None:
-        if robots > 1 and len(scene.pillars) + len(scene.spheres):
-            raise ConfigError("a scene has other robots, or pillars and spheres, but not yet both")
+        if robots > 1 and len(scene.pillars) + len(scene.spheres) + len(scene.objects):
+            raise ConfigError("a scene has other robots, or pillars, spheres and objects, but not yet both")
         add_scene(result, scene)
     model = compiled(result, robot.mjcf)
     _check_soles(model, robot)

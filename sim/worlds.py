@@ -21,8 +21,9 @@ from servoid.hw.robot.legs import Legs
 from servoid.sim.ground import Ground
 from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.multi_robot import Crowd
+from servoid.sim.objects import ObjectsOf
 from servoid.sim.randomise import Body, draw, longest
-from servoid.sim.scene import robot_bodies
+from servoid.sim.scene import OBJECTS, robot_bodies
 from servoid.sim.truth import SimulatedTruth
 
 NOISE_ROWS = 64  # ticks of sensor noise drawn at a time
@@ -58,7 +59,7 @@ class Worlds:
             raise ConfigError(f"{robot.name}: rate: {robot.rate} does not divide the physics' {whole} steps a second")
         self.batch: Batch | Crowd = Crowd(self.model, n) if together else Batch(self.model, n, threads)
         self._legs, self._ground = Legs(robot), Ground(self.model)
-        self._bodies = robot_bodies(self.model)
+        self._bodies, self._objects = robot_bodies(self.model), ObjectsOf(self.model, OBJECTS)
         joints = [self.model.joint(name) for name in robot.names]
         self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._dof = np.array([int(joint.dofadr[0]) for joint in joints])
@@ -120,6 +121,8 @@ class Worlds:
             self._rngs[i] = rng
             self._place(i, self._drawn(rng, self.robot, self._bodies, rng.random() < self.randomise))
         self._state_qpos[ids] = 0.0
+        objects = np.broadcast_to(self._objects.begin, (len(ids), *self._objects.begin.shape))
+        self.put(ids, objects if start.objects is None else start.objects)
         self._state_qpos[ids[:, None], self._qpos] = pose - self._zero[ids]
         self._put(ids, pose - self._zero[ids], start)
         self._state_qvel[ids] = 0.0
@@ -216,6 +219,10 @@ class Worlds:
     def move(self, world: int, places: Array) -> None:
         """Put the centres of the scene's spheres in one world to `(m, 3)` m."""
         self._mocap[world] = places
+
+    def put(self, ids: Array, objects: Array) -> None:
+        """Put the movable objects of the worlds `ids` `(k,)` to poses `(k, movable objects, 7)`, at rest."""
+        self._objects.put(self._state_qpos, self._state_qvel, ids, objects)
 
     def observe(self) -> Observation:
         """What the rig's sensors say now: delayed, biased and noisy, and quantised but for those of the IMU."""

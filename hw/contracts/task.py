@@ -32,6 +32,7 @@ class Trace:
     goal: Array | None = None  # (ticks, 2) m, where the robot saw it; None: where the task has it
     obstacles: Array | None = None  # (ticks, n, 3) m: x, y, radius
     robots: Array | None = None  # (ticks, n, 3) the others: x, y m and heading rad
+    objects: Array | None = None  # (ticks, n, 7): x, y, z m of the middle, quaternion w x y z
     touched: bool | None = None  # whether the robot touched an obstacle or another robot; None: it cannot know
 
 

@@ -18,6 +18,7 @@ from servoid.hw.robot.checks import check_robot, check_servo
 from servoid.hw.robot.plausible import check_geometry, check_plausible
 
 _GRAVITY = 9.81  # m/s2
+GAIT = "gait.yaml"  # in a robot's own folder
 
 
 @dataclass(frozen=True)
@@ -220,7 +221,12 @@ class Robot:
     walking: Walking = Walking()
     passive: tuple[str, ...] = ()  # joints that no servo drives: not commanded, not read
     weight: float | None = None  # N; None: the file does not say it
-    gait: str = "gait"  # settings of its gait: a name in configs/policies/, or a .yaml file beside the robot's
+    # Settings of its gait: a name in configs/policies/, or a .yaml file beside the robot's; empty: none of its own.
+    gait: str = ""
+    folder: str = ""  # of its networks and its gait; absolute once loaded
+    arms: dict[str, float] = field(
+        default_factory=dict
+    )  # joints that swing arms, and the sign of swinging the left back
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -278,8 +284,11 @@ def load_robot(name: str | Path = "op3") -> Robot:
         replace(joint, servo=str(folder / joint.servo)) if joint.servo.endswith((".yaml", ".yml")) else joint
         for joint in robot.joints
     )
+    own = (folder / (robot.folder or path.stem)).resolve()
     gait = str(folder / robot.gait) if robot.gait.endswith((".yaml", ".yml")) else robot.gait
-    robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints, gait=gait)
+    if not gait and (own / GAIT).is_file():
+        gait = str(own / GAIT)
+    robot = replace(robot, mjcf=str((folder / robot.mjcf).resolve()), joints=joints, gait=gait, folder=str(own))
     check_plausible(robot, marks)  # loads the servos' files: one that cannot be used is found now
     robot = with_body(robot, marks)
     check_geometry(robot, marks)

@@ -157,7 +157,7 @@ def diffusion_policy(
     settings and robot do not fit.
     """
     settings = settings or load_settings()
-    path = resolve(settings.checkpoint)
+    path = resolve(settings.checkpoint, robot)
     settings = replace(settings, checkpoint=str(path))
     cost = None if cost is None else Stopping(cost)
     head = read_header(path)

@@ -14,7 +14,7 @@ from servoid.hw.config import ConfigError, available, nearest
 from servoid.hw.contracts.control import Policy
 from servoid.hw.contracts.task import Task
 from servoid.hw.plugins import Plugin, Portable, installed, load_plugin
-from servoid.hw.robot.description import Robot
+from servoid.hw.robot.description import Robot, shipped_robot
 from servoid.stack.control.base import BasePolicy
 
 if TYPE_CHECKING:
@@ -121,27 +121,28 @@ def make_policy(
     return _maker(name)(name, robot, task, realtime, shape)
 
 
-def policy_fingerprint(name: str, gait: str = "gait") -> dict[str, Any]:
+def policy_fingerprint(name: str, robot: Robot | None = None) -> dict[str, Any]:
     """Name of a policy and what it is made of, for the flight log: its checkpoint and that of odometry by their hashes,
-    settings of the planner or of the robot's `gait`, and the file of a user's own. None for what it has not.
+    settings of the planner or of the robot's gait, and the file of a user's own. None for what it has not.
 
-    Raises ConfigError.
+    `robot` is by default the shipped one. Raises ConfigError.
     """
     from servoid.policy.checkpoint import resolve
-    from servoid.policy.references.gait import load_gait
+    from servoid.policy.references.gait import gait_of
     from servoid.stack.log.provenance import described, sha256
 
+    robot = robot or shipped_robot()
     maker = _maker(name)
     planner = _planner(name) if maker is _diffusion else None
     own = _plugin(name) if maker is _own else None
     named = name if maker in (_expert, _clip) else None if planner is None else planner.checkpoint
-    checkpoint = None if named is None else resolve(named)
+    checkpoint = None if named is None else resolve(named, robot)
     return {
         "name": name,
         "checkpoint_sha256": None if checkpoint is None else sha256(checkpoint),
-        "odometry_sha256": sha256(resolve("odometry")),
+        "odometry_sha256": sha256(resolve("odometry", robot)),
         "planner": None if planner is None else described(planner),
-        "gait": described(load_gait(gait)) if maker in (_gait, _expert) else None,
+        "gait": described(gait_of(robot)) if maker in (_gait, _expert) else None,
         "source": None if own is None else own.source(),
     }
 

@@ -19,7 +19,7 @@ class Tracker:
         self, robot: Robot, checkpoint: str = "expert", shape: tuple[int, ...] = (), *, clips: bool = False
     ) -> None:
         """Raises CheckpointError where the network does not fit, or `clips` are to be tracked and it knows none."""
-        path = resolve(checkpoint)
+        path = resolve(checkpoint, robot)
         self._network, knows = load_tracker(path, robot)
         if clips and not knows:
             raise CheckpointError(f"{path}: a tracker of the gait alone, and it is a clip that is to be tracked")

@@ -84,6 +84,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
                 "place": "m, goal in the odometry frame",
                 "obstacles": "x, y, radius m, odometry frame",
                 "robots": "x, y m and heading rad, odometry frame",
+                "objects": "x, y, z m of the middle and quaternion w x y z, odometry frame",
             }
         )
     ),
@@ -159,6 +160,7 @@ def messages(record: TickRecord) -> list[tuple[str, dict[str, Any]]]:
         if (percept := proposal.percept) is not None:
             instruction["source"] = percept.source
             arrays |= {"place": percept.goal, "obstacles": percept.obstacles, "robots": percept.robots}
+            arrays |= {"objects": percept.objects}
         instruction |= {name: pack(array, COMPACT) for name, array in arrays.items() if array is not None}
         out.append(("/instruction", instruction))
     if proposal.plan is not None:

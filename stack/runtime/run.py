@@ -20,7 +20,7 @@ from servoid.hw.seeds import Stream, generator
 from servoid.stack.control.get_up import GetUp, fingerprints, get_up
 from servoid.stack.control.policies import make_policy, policy_fingerprint
 from servoid.stack.estimation.estimator import Estimator
-from servoid.stack.estimation.odometry import load_odometry
+from servoid.stack.estimation.odometry import odometry_of
 from servoid.stack.log.provenance import header
 from servoid.stack.log.recorder import Recorder, check_new
 from servoid.stack.log.tick import Listener
@@ -115,6 +115,7 @@ class Run:
         self._recorder: Recorder | None = None
         self._teammates: Teammates | None = None
         self._assembly: str | None = None  # which calibration a real robot goes by
+        self._unlearned: str | None = None  # why odometry is by the legs alone
 
     def __enter__(self) -> Run:
         return self
@@ -135,7 +136,7 @@ class Run:
             )
         if settings.recover:
             self._get_up = get_up(self.robot)
-        self._odometry = load_odometry(self.robot)
+        self._odometry, self._unlearned = odometry_of(self.robot)
         if settings.record is not None:
             check_new(settings.record)
         self.assignment = draw(task, settings.seed)
@@ -158,6 +159,12 @@ class Run:
             raise ConfigError(f"task '{name}' has {robots} robots, each with its own policy: name one instead")
         if scene is not None and scene.robots is not None and self.settings.recover:
             raise ConfigError(f"task '{name}' has several robots, and a fall of one ends it: drop --recover")
+        if scene is not None and scene.objects and simulation is None:
+            things = ", ".join(dict.fromkeys(thing.kind for thing in scene.objects))
+            raise ConfigError(
+                f"task '{name}' needs to see its {things}, and backend '{self.body.name}' shows none: "
+                "use a simulated one; servoid run skill performs the motion alone"
+            )
         if episode.pushes and simulation is None:
             raise ConfigError(f"backend '{self.body.name}' cannot push the robot: drop the task's push setting")
 
@@ -190,8 +197,9 @@ class Run:
             self._confirm(f"{known}{robot.name} will go to its home pose and then: {task.name}{again}")
         self._interrupt.settle()  # from here on a Ctrl-C is a request, until the motors are off
         self.guard = Guard(robot, motors, settings.gain, recover=settings.recover)
-        if self._assembly is not None:
-            self.guard.note("system", self._assembly)
+        for text in (self._assembly, self._unlearned):
+            if text is not None:
+                self.guard.note("system", text)
         self._controlled = ControlledRobot(robot, sensors, Estimator(robot, self._odometry), self.guard)
         recovering = None if self._get_up is None else Recovering(self._get_up, self._begin_policy)
         self.phases = Phases(
@@ -263,9 +271,7 @@ class Run:
     def _record(self) -> Recorder:
         settings, own = self.settings, self._policy
         assert settings.record is not None
-        policy = (
-            policy_fingerprint(settings.policy, self.robot.gait) if own is None else {"name": type(own).__qualname__}
-        )
+        policy = policy_fingerprint(settings.policy, self.robot) if own is None else {"name": type(own).__qualname__}
         facts = header(settings, self.robot, self.assignment, source(settings.task), self.body.name, policy)
         if self.assignment.task.performs:
             facts["skills"] = skill_fingerprints(self.robot)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Policy
 from servoid.hw.robot.description import Robot
 from servoid.stack.control.clip import ClipPolicy
@@ -26,7 +27,11 @@ def _clip(skill: Skill, robot: Robot) -> Performer:
 
 
 def _tracker(skill: Skill, robot: Robot) -> Performer:
-    return ClipPolicy(robot, clip_of(skill, robot), tracker=Tracker(robot, "tracker", clips=True))
+    try:
+        tracker = Tracker(robot, skill.tracker, clips=True)
+    except ConfigError as error:
+        raise ConfigError(f"skill '{skill.name}': policy: tracker: {error}: write policy: clip") from error
+    return ClipPolicy(robot, clip_of(skill, robot), tracker=tracker)
 
 
 PERFORMERS: dict[str, Callable[[Skill, Robot], Performer]] = {"clip": _clip, "tracker": _tracker}

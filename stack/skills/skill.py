@@ -37,7 +37,8 @@ class After:
 class Skill:
     """What a skill is; where it begins and ends is one of the poses of `policy.motion.clip.POSES`.
 
-    `policy` performs it: `clip` plays the clip open loop, `tracker` follows it with feedback.
+    `policy` performs it: `clip` plays the clip open loop, `tracker` follows it with feedback, by a network that knows
+    clips.
     """
 
     about: str  # in a line, for people
@@ -45,6 +46,7 @@ class Skill:
     phrases: tuple[str, ...]  # that ask for it; the first is shown
     held_out: tuple[str, ...] = ()  # others, by which the understanding of words is measured
     policy: Literal["clip", "tracker"] = "clip"
+    tracker: str = "expert"  # checkpoint, where a tracker performs it
     entry: str = UPRIGHT
     end: str = UPRIGHT
     interrupted_by: Literal["anything", "nothing"] = "nothing"  # another skill, or being asked to stop, before its end

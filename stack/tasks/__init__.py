@@ -20,6 +20,7 @@ from servoid.stack.tasks.goal import Goal
 from servoid.stack.tasks.inbetween import Inbetween
 from servoid.stack.tasks.obstacle import Obstacle
 from servoid.stack.tasks.path import Path
+from servoid.stack.tasks.skills.kick import Kick
 from servoid.stack.tasks.skills.skill import PerformSkills
 from servoid.stack.tasks.stand import Stand
 from servoid.stack.tasks.steer import Steer
@@ -42,7 +43,7 @@ class TaskEntry:
 
 _CLASSES: tuple[type[BaseTask], ...] = (
     Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Cross, Inbetween, Survive, Text, Steer,
-    PerformSkills,
+    PerformSkills, Kick,
 )  # fmt: skip
 _OWN: dict[str, TaskEntry] = {
     **{cls.name: TaskEntry(cls.name, cls, cls.description) for cls in _CLASSES},

@@ -134,7 +134,7 @@ def changes(log: FlightLog) -> list[str]:
     robot = load_robot(settings.robot)
     planner, header = _planner(log), {**log.header, **_part("policy", log.header["policy"])}
     try:
-        policy = policy_fingerprint(settings.policy, robot.gait)
+        policy = policy_fingerprint(settings.policy, robot)
     except ConfigError:
         if planner is None:
             raise

@@ -110,7 +110,6 @@ class DiffusionNetwork(DenoiserShape):
 
     text: Annotated[str, "encoder of instructions; empty: a model without instructions"] = "words"
     emphasis: Annotated[float, "emphasis of global states; 0: no projection"] = 5.0
-    changes: Annotated[bool, "learn from windows over which the command changes too, which are told nothing"] = False
 
 
 @dataclass(frozen=True)

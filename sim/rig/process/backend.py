@@ -194,6 +194,11 @@ class VirtualTruth:
         return self._now().joints
 
     @property
+    def objects(self) -> Array:
+        """The scene's objects as they are `(1, objects, 7)`: x, y, z m of the middle, quaternion w x y z."""
+        return self._now().objects
+
+    @property
     def touching(self) -> Array:
         """Whether the robot touches an obstacle of the scene, or did within the last tick `(1,)`."""
         return self._now().touching

@@ -55,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
     clips = chosen_clips(robot, settings.clips)
     env = Tracking(robot, settings.worlds, odometry, settings, settings.seed, clips)
     trainer = TrackerTrainer(env, settings, args.out)
-    trainer.start(args.resume, None if args.init is None else checkpoint.resolve(args.init))
+    trainer.start(args.resume, None if args.init is None else checkpoint.resolve(args.init, robot))
     trainer.run()
     return 0
 
