@@ -15,7 +15,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import Robot
-from servoid.policy.checkpoint import read_header, resolve
+from servoid.policy.checkpoint import CHECKPOINTS, read_header
 from servoid.policy.motion.clip import Clip
 from servoid.policy.motion.library import Library
 from servoid.policy.references.clip import BLEND_SHARE, ClipReference
@@ -29,7 +29,7 @@ CLIPS = ("get-up-front", "get-up-back")
 SETTLE_SECONDS = 0.5  # in a clip's first pose: clips were recorded from there, at rest
 STAND_SECONDS = 1.5  # that the robot has to come to a stand in when the clip is over
 HOME_SECONDS = 2.0  # the same, when it is home
-RATE = 1.5  # at which a tracker gets up, of the clip's own speed
+RATE = 1.3  # at which a tracker gets up, of the clip's own speed
 ROLLED_SHARE = 0.15  # of a clip, in which the robot may still roll over to its other side
 
 
@@ -119,6 +119,8 @@ class TrackedGetUp(GetUp):
                 rolled, side = True, self._side()
                 reference.play(side, self._applied, everywhere, rate=RATE)
             yield self._follow()
+        for _ in range(round(SETTLE_SECONDS * self._robot.rate)):
+            yield self._follow()
         reference.stand(self._applied, everywhere)
         for _ in range(round((STAND_SECONDS + HOME_SECONDS) * self._robot.rate)):
             yield self._follow()
@@ -156,9 +158,9 @@ def get_up(robot: Robot) -> GetUp:
 
 
 def _tracker_of(robot: Robot) -> Path | None:
-    """The shipped tracker, where it is this robot's."""
-    path = resolve("tracker")
-    return path if read_header(path)["robot"] == robot.name else None
+    """The shipped tracker, where there is one of this robot."""
+    path = CHECKPOINTS / "tracker.safetensors"
+    return path if path.is_file() and read_header(path)["robot"] == robot.name else None
 
 
 def fingerprints(robot: Robot) -> dict[str, str | None]:

@@ -72,7 +72,7 @@ def _clip(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[in
 
 
 # Policies of Servoid's own; besides there are the planner's other settings in configs/policies/.
-POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "gait": _gait, "tracker": _expert}
+POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "gait": _gait}
 _KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert, "clip": _clip}  # of .safetensors files
 
 

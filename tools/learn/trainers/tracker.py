@@ -21,7 +21,6 @@ from servoid.policy.tracker.network import load_tracker
 from servoid.tools.learn.envs.tracking import Tracking
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.settings import TrackerTraining
-from servoid.tools.learn.trainers.imitation import Teacher, imitate
 from servoid.tools.learn.trainers.ppo import PpoTrainer
 from servoid.tools.learn.trainers.trainer import add_run_arguments
 
@@ -36,8 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument(
         "--init",
         metavar="CHECKPOINT",
-        help="start from this tracker, halfway through the schedules; one with other inputs or layers, such as the"
-        " shipped `expert`, is imitated first",
+        help="start from this tracker (tracker: the shipped one), halfway through the schedules",
     )
 
 
@@ -89,13 +87,15 @@ class TrackerTrainer(PpoTrainer):
         return super().resume()
 
     def adopt(self, path: Path) -> None:
-        whole = self.env.observation.size
         network, clips = load_tracker(path, self.env.robot)
-        if clips and network.sizes == (whole, *self.settings.hidden, self.env.action_size):
-            self.begin_with(network)
-            return
-        teacher = Teacher(self.env, network, clips=clips)
-        self.begin_with(imitate(self.env, teacher, self.settings.hidden, self.settings.seed))
+        hidden = list(network.sizes[1:-1])
+        if hidden != list(self.settings.hidden):
+            raise checkpoint.CheckpointError(
+                f"{path}: its hidden layers are {hidden}; give --hidden {' '.join(map(str, hidden))}"
+            )
+        if not clips:
+            raise checkpoint.CheckpointError(f"{path}: a tracker of the gait alone, which sees less than this one")
+        self.begin_with(network)
 
     def actor(self) -> Mlp:
         """As it runs; joints that follow the reference alone get nothing added."""
