@@ -70,6 +70,8 @@ VERBS: dict[str, Verb] = {
                 "train latent actions for a diffusion model to plan in", "servoid.tools.learn.trainers.latent"
             ),
             "diffusion": Verb("train the diffusion model", "servoid.tools.learn.trainers.diffusion"),
+            "prior": Verb("train a motion prior", "servoid.tools.learn.trainers.prior"),
+            "policy": Verb("train a policy for a task under a motion prior", "servoid.tools.learn.trainers.policy"),
         },
     ),
     "evaluate": Verb("measure a policy as papers do, or as you define", "servoid.tools.commands.evaluate"),

@@ -71,9 +71,21 @@ def _clip(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[in
     return policy
 
 
+def _task_policy(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
+    from servoid.policy.priors.task_policy import TaskPolicy
+
+    policy: Policy = TaskPolicy(robot, Path(source), shape)
+    return policy
+
+
 # Policies of Servoid's own; besides there are the planner's other settings in configs/policies/.
 POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "gait": _gait}
-_KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert, "clip": _clip}  # of .safetensors files
+_KINDS: dict[str, Maker] = {  # of .safetensors files
+    "diffusion": _diffusion,
+    "tracker": _expert,
+    "clip": _clip,
+    "task_policy": _task_policy,
+}
 
 
 def _own(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
@@ -112,7 +124,7 @@ def make_policy(
     """A policy for a robot and a task, or for worlds of any leading `shape`.
 
     Raises ConfigError for an unknown name, or for a checkpoint that does not fit. `name` is one of `names`, the
-    .safetensors file of a diffusion model, a tracker or a clip, a .yaml file of diffusion settings, or
+    .safetensors file of a diffusion model, a tracker, a clip or a task policy, a .yaml file of diffusion settings, or
     `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is
     for. `planner` holds the settings of a recorded diffusion policy: no file is read for them then.
     """
@@ -135,7 +147,7 @@ def policy_fingerprint(name: str, robot: Robot | None = None) -> dict[str, Any]:
     maker = _maker(name)
     planner = _planner(name) if maker is _diffusion else None
     own = _plugin(name) if maker is _own else None
-    named = name if maker in (_expert, _clip) else None if planner is None else planner.checkpoint
+    named = name if maker in (_expert, _clip, _task_policy) else None if planner is None else planner.checkpoint
     checkpoint = None if named is None else resolve(named, robot)
     return {
         "name": name,

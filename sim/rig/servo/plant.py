@@ -81,7 +81,11 @@ class Plant:
         self.held, self._noise_block, self._ticks = True, -1, 0
         self._idle_rng = generator(seed, Stream.BODY, 1)  # while held: the episode's stream waits
         self._idle = self._idle_rng.standard_normal(6 + len(self.robot.joints))
-        self._joint_age = round(self.body.joint_latency / TIMESTEP)
+        first = self.robot.servos[0]
+        later = np.array([servo.position_latency - first.position_latency for servo in self.robot.servos])
+        ages = np.round(np.maximum(self.body.joint_latency + later, 0.0) / TIMESTEP).astype(int)
+        self._joint_age = int(ages.max())
+        self._sample = self._joint_age - ages, np.arange(len(ages))  # of each joint in its history
         self._imu_age = max(round(self.body.imu_latency / TIMESTEP) - 1, 0)  # sensor data is a substep old already
         self._imu_span = max(round(self.robot.imu.average / TIMESTEP), 1)
         self.place(self.robot.home)
@@ -176,10 +180,10 @@ class Plant:
     def encoder(self) -> tuple[Array, Array, Array]:
         """What the servos have measured by now: angle [rad], speed [rad/s] with noise, torque [N m]. A servo that rests
         measures no speed at all: its encoder shows the same tick again and again."""
-        speed = self._speed[0]
+        speed = self._speed[self._sample]
         moving = np.abs(speed) > self._slowest
         measured = np.where(moving, speed + VELOCITY_NOISE * self._row()[6:], 0.0)
-        return self._angle[0] + self.body.zero, measured, self._force[0]
+        return self._angle[self._sample] + self.body.zero, measured, self._force[self._sample]
 
     @property
     def imu(self) -> Array:
