@@ -25,7 +25,6 @@ def follow(
     worlds: int = 1,
     randomise: float = 0.0,
     seed: int = 0,
-    rate: float = 1.0,
     push: float = 0.0,
 ) -> Played:
     """Follow a clip in `worlds` worlds of their own robots, by the checkpoint `tracker`.
@@ -42,9 +41,9 @@ def follow(
     for _ in range(round(SETTLE_SECONDS * robot.rate)):
         fleet.observe()
         fleet.step(first)
-    reference.play(0, rate=rate)
+    reference.play(0)
     rows: dict[str, list[Array]] = {key: [] for key in ("goal", "joints", "place", "turn", "contact", "effort", "fell")}
-    truth, ticks = fleet.truth, round((clip.ticks - 1) / rate) + round(HOLD_SECONDS * robot.rate)
+    truth, ticks = fleet.truth, clip.ticks - 1 + round(HOLD_SECONDS * robot.rate)
     for tick in range(ticks):
         if tick % robot.rate == robot.rate // 2:
             size = np.array([rng.uniform(0.0, push) for rng in fleet.rngs])

@@ -48,10 +48,11 @@ def main(args: argparse.Namespace) -> int:
         from servoid.tools.motions.tracked import follow
 
         clip, robot = clip_of(args.clip, args)
-        goals = clip.at_rate(args.rate).joints
+        clip = clip.at_rate(args.rate)
+        goals = clip.joints
         drawn = {"worlds": worlds, "randomise": float(args.randomise), "seed": args.seed}
         if args.tracker:
-            played = follow(clip, robot, args.tracker, rate=args.rate, push=args.push, **drawn)
+            played = follow(clip, robot, args.tracker, push=args.push, **drawn)
         else:
             held = np.concatenate([goals, np.repeat(goals[-1:], round(HOLD_SECONDS * robot.rate), 0)])
             played = play(held, robot, begins=clip.about.begins, **drawn)
