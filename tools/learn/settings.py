@@ -210,7 +210,7 @@ class TrackingSettings:
     randomised: Annotated[float, "share of episodes on a robot drawn at random; the others are nominal"] = 0.8
     hardest_push: Annotated[
         float, "hardest push, of the robot's top speed; pushes are uniform from zero and grow over the first fifth"
-    ] = 0.9
+    ] = 0.6
     push_every: Annotated[Range, "time between pushes [s]"] = (0.6, 2.0)
     command_every: Annotated[Range, "time between commands [s]"] = (2.0, 5.0)
     stand: Annotated[float, "share of commands that are zero"] = 0.1
@@ -220,13 +220,13 @@ class TrackingSettings:
         float, "share of commands that walk backward while turning and side-stepping, where falls were most frequent"
     ] = 0.25
     clips: Annotated[tuple[str, ...], "clips of the library to learn; none: all that are of this robot"] = ()
-    clip_share: Annotated[float, "share of episodes that begin with a clip, and of walks that lead to one"] = 0.5
+    clip_share: Annotated[float, "share of episodes that begin with a clip, and of walks that lead to one"] = 1.0
     rates: Annotated[Range, "how fast clips are played, of their own speed; the fastest grows over the first half"] = (
         0.9,
         1.2,
     )
-    get_up_rates: Annotated[Range, "the same of clips that begin lying"] = (0.9, 1.6)
-    walk_seconds: Annotated[Range, "seconds of walking between two clips"] = (1.5, 6.0)
+    get_up_rates: Annotated[Range, "the same of clips that begin lying"] = (1.0, 1.6)
+    walk_seconds: Annotated[Range, "seconds of walking between two clips"] = (0.6, 2.5)
     rewards: Annotated[dict[str, float], "weights of reward terms, per tick (policy/tracker/rewards.py)"] = field(
         default_factory=lambda: {
             "velocity": 3.0,

@@ -10,7 +10,9 @@ from types import ModuleType
 import pytest
 
 from servoid.hw.config import CONFIGS, ConfigError, load_yaml
+from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import read_header, resolve
+from servoid.policy.motion.library import Library
 from servoid.tools.common.parser import Parser
 from servoid.tools.learn.flags import add_setting_flags, plain, read_settings
 from servoid.tools.learn.settings import (
@@ -23,6 +25,7 @@ from servoid.tools.learn.settings import (
 )
 from servoid.tools.learn.trainers import diffusion, latent, odometry, tracker
 
+CLIPS = tuple(name for name in Library(load_robot()).names if name != "push-ups")
 METHODS: list[tuple[ModuleType, TrainingRun]] = [
     (tracker, TrackerTraining()),
     (odometry, OdometryTraining()),
@@ -125,7 +128,7 @@ def test_what_makes_no_sense_is_refused_by_its_flag(words: list[str], message: s
 @pytest.mark.parametrize(
     ("base", "changes"),
     [
-        (TrackerTraining(), {"minutes": 200.0, "samples": 40e6}),
+        (TrackerTraining(), {"minutes": 180.0, "samples": 8.5e6, "clips": CLIPS}),
         (DiffusionTraining(), {"minutes": 60.0, "width": 128, "horizon": 24}),
         (LatentTraining(), {}),
         (OdometryTraining(), {"worlds": 240, "seconds": 45.0, "steps": 4000}),
@@ -140,9 +143,12 @@ def test_shipped_files_differ_from_the_defaults_where_they_say_so_alone(
 
 
 def test_shipped_files_are_of_the_networks_that_ship() -> None:
-    made = load_yaml(CONFIGS / "training" / "tracker.yaml", TrackerTraining)
+    made = load_yaml(CONFIGS / "training" / "expert.yaml", TrackerTraining)
     head = read_header(resolve("expert"))
     assert head["config"] == {"hidden": list(made.hidden), "rewards": made.rewards}
+    assert made == replace(TrackerTraining(), minutes=200.0, samples=40e6, clip_share=0.0, hardest_push=0.9)
+    made = load_yaml(CONFIGS / "training" / "tracker.yaml", TrackerTraining)
+    assert read_header(resolve("tracker"))["training"] == plain(made)
     model, head = (
         load_yaml(CONFIGS / "training" / "diffusion.yaml", DiffusionTraining),
         read_header(resolve("diffusion")),
