@@ -70,6 +70,7 @@ VERBS: dict[str, Verb] = {
                 "train latent actions for a diffusion model to plan in", "servoid.tools.learn.trainers.latent"
             ),
             "diffusion": Verb("train the diffusion model", "servoid.tools.learn.trainers.diffusion"),
+            "planner": Verb("train the planner of whole-body motion", "servoid.tools.learn.trainers.planner"),
         },
     ),
     "evaluate": Verb("measure a policy as papers do, or as you define", "servoid.tools.commands.evaluate"),
