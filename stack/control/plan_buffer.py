@@ -126,9 +126,13 @@ class PlanBuffer:
     @property
     def due(self) -> bool:
         """Whether a plan is to be asked for at this tick. A recorded run says so of a plan that it did adopt."""
-        tick, pace = self.tick, self.pace
-        idle = self._requested is None or (self._only is not None and tick in self._only)
-        return tick % pace.execution_horizon == 0 and tick >= pace.history - 1 and idle
+        return self.tick % self.pace.execution_horizon == 0 and self.free
+
+    @property
+    def free(self) -> bool:
+        """Whether the planner may be asked at this tick, due or not: it waits for the history, and for one answer."""
+        idle = self._requested is None or (self._only is not None and self.tick in self._only)
+        return self.tick >= self.pace.history - 1 and idle
 
     def ask(self, history: History, meanwhile: list[Array], instruction: Instruction) -> None:
         """Ask for a plan; `meanwhile` are the actions of the next `delay` ticks. Without delay it is adopted now."""

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from servoid.hw.contracts.body import Array
 from servoid.policy.diffusion.prefix.frames import Frames, turned, wrapped
 from servoid.policy.diffusion.prefix.key_points import AnyArray
 
@@ -112,7 +113,7 @@ def drawn(frames: Frames, future: AnyArray, generator: Any) -> BodyTarget:
     return BodyTarget(places, heading, asked)
 
 
-def of_points(frames: Frames, asked: Sequence[tuple[str, Sequence[float]]]) -> BodyTarget:
+def of_points(frames: Frames, asked: Sequence[tuple[str, Sequence[float] | Array]]) -> BodyTarget:
     """One target from names of `names` and their places [m], or angle [rad] for the heading. Raises KeyError."""
     import torch
 

@@ -3,7 +3,8 @@
 It learns from takes made here: the clips of the library, with what leads from one to the next, mirrored twins, and
 walks of the gait; with --data, from recorded walks, too. On takes that it does not learn from it measures the error of
 the clean frames (`validation_loss`), the same with other windows' sentences (`shuffled_loss`: no higher means that
-sentences are not read), and by how far plans miss targets (`target_error_m`).
+sentences are not read), by how far plans miss targets (`target_error_m`), and the milliseconds of one core that a plan
+takes, with its sentence (`plan_ms`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import time
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -22,12 +24,15 @@ from servoid.tools.learn.settings import PlannerTraining
 from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments, require_same, source_of
 
 if TYPE_CHECKING:
+    import torch
+
     from servoid.hw.robot.description import Robot
     from servoid.policy.diffusion.prefix.dataset import PlanWindows
     from servoid.policy.diffusion.prefix.frames import Frames
+    from servoid.policy.diffusion.prefix.planner import PrefixPlanner
     from servoid.policy.text.encoder import TextEncoder
 
-MEASURED = ("validation_loss", "shuffled_loss", "target_error_m")
+MEASURED = ("validation_loss", "shuffled_loss", "target_error_m", "plan_ms")
 _PLANS = 64  # that the missing of targets is measured on
 
 
@@ -86,6 +91,21 @@ def learned_from(
             made.add(frames, motion, label)
     sentences = ToldSentences(told, encoder, settings.words)
     return PlanWindows(made, frames, settings, sentences, settings.untold, NAMES.index("stand")), source, licence
+
+
+def _plan_ms(planner: PrefixPlanner, prefix: torch.Tensor, text: torch.Tensor, plans: int = 5) -> float:
+    """Processor time of a plan of one robot on one thread, so that a busy machine gives the same."""
+    from servoid.policy.diffusion.prefix.target import none
+    from servoid.policy.diffusion.rolling import seeded
+    from servoid.policy.diffusion.runtime import one_thread
+
+    nothing = none(planner.frames, 1)
+    with one_thread():
+        planner.plan(prefix, text, nothing, [seeded(0)])
+        start = time.process_time()
+        for number in range(plans):
+            planner.plan(prefix, text, nothing, [seeded(number)])
+        return 1000.0 * (time.process_time() - start) / plans
 
 
 class PlannerTrainer(Trainer):
@@ -188,7 +208,9 @@ class PlannerTrainer(Trainer):
             planned = planner.plan(prefix, few.text, few.target, [seeded(i) for i in range(len(prefix))])
             distance, _ = few.target.error(windows.kinematics, planned)
             missed = distance[few.target.asked[:, :-1]].mean().item()
-        return dict(zip(MEASURED, (loss, other, missed), strict=True))
+        model = PlannerModel(network, windows.normaliser, {})
+        milliseconds = _plan_ms(PrefixPlanner(model, windows.kinematics), prefix[:1], few.text[:1])
+        return dict(zip(MEASURED, (loss, other, missed, milliseconds), strict=True))
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
         from servoid.policy.checkpoint import Origin
