@@ -28,6 +28,7 @@ HEAVY = {
     "torch": (
         "policy/diffusion/",
         "policy/priors/score_matching/",
+        "policy/priors/adversarial/",
         "policy/latent/network.py",
         "policy/latent/dataset.py",
     ),

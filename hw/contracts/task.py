@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.operator import CommandSource, Intent
 from servoid.hw.contracts.world import Percept, Scene
 
 
@@ -134,7 +135,7 @@ class Task(Protocol):
 
     @property
     def steered(self) -> bool:
-        """Whether a person steers, who needs real time."""
+        """Whether a person steers, who needs real time: `steered_behaviour` then takes the place of `behaviour`."""
         ...
 
     @property
@@ -153,6 +154,15 @@ class Task(Protocol):
 
     def behaviour(self, episode: Any) -> Behaviour:
         """What is asked in a run of this episode. It opens the devices that it needs. Raises ConfigError."""
+        ...
+
+    def open_source(self) -> CommandSource:
+        """The device that a person steers with, opened, where the task is `steered`. Raises ConfigError where there is
+        none."""
+        ...
+
+    def steered_behaviour(self, episode: Any, wanted: Callable[[], Intent]) -> Behaviour:
+        """What is asked in a run of this episode by a person, who wants now what `wanted` says."""
         ...
 
     @property

@@ -54,11 +54,23 @@ def _location(instruction: Instruction, walking: Walking) -> Array:
     return goal * np.minimum(1.0, FARTHEST / distance)
 
 
+def _ball(instruction: Instruction, walking: Walking) -> Array:
+    """Where the nearest thing to keep clear of is [m], and where it goes in shares of the top speed, in the heading
+    frame `(..., 4)`. Raises ConfigError where the task has none."""
+    if instruction.obstacles is None or not np.size(instruction.obstacles):
+        raise ConfigError("this policy gets out of a ball's way, and the task has none: run obstacle")
+    things = np.asarray(instruction.obstacles, float)
+    distance = np.linalg.norm(things[..., :2], axis=-1)
+    nearest = np.take_along_axis(things, np.argmin(distance, -1)[..., None, None], -2)[..., 0, :]
+    return np.concatenate([nearest[..., :2], nearest[..., 3:5] / walking.forward], -1)
+
+
 GOALS: Mapping[str, SeenGoal] = {
     goal.name: goal
     for goal in (
         SeenGoal("velocity", 2, Mirror.PLANAR, _velocity),
         SeenGoal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering),
         SeenGoal("location", 2, Mirror.PLANAR, _location),
+        SeenGoal("ball", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _ball),
     )
 }

@@ -11,7 +11,7 @@ import sys
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
@@ -27,6 +27,12 @@ from servoid.tools.common.parser import (
 )
 from servoid.tools.common.pictures.drawing import prepare
 from servoid.tools.common.prompt import confirm
+from servoid.tools.web.launch import STOPS, add_view_arguments, open_page, view_of
+
+if TYPE_CHECKING:
+    from servoid.stack.runtime.result import Result
+    from servoid.stack.runtime.run import Confirm, RunSettings
+    from servoid.tools.common.live import LiveLine
 
 EXIT_CODES = {
     "succeeded": exit_codes.DONE,
@@ -64,6 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--video-size", default="1280x720", metavar="WxH", help="size of the film (default: %(default)s)"
     )
     parser.add_argument("--fast", action="store_true", help="simulate as fast as possible, also on a terminal")
+    add_view_arguments(parser)
     add_json_argument(parser)
 
 
@@ -78,7 +85,7 @@ def main(args: argparse.Namespace) -> int:
         from servoid.tools.common.live import LiveLine
         from servoid.tools.common.summary import summary
 
-        watched = (sys.stdout.isatty() and not args.json) or find(args.task).cls.steered
+        watched = (sys.stdout.isatty() and not args.json) or args.view or find(args.task).cls.steered
         plan = RunSettings(
             task=args.task,
             backend=args.backend,
@@ -98,8 +105,9 @@ def main(args: argparse.Namespace) -> int:
         for text in out_of_reach(args):
             report.line(text)
         live = LiveLine(sys.stderr if args.json else sys.stdout)
+        asks = partial(confirm, remedy="give --start to let the robot move")
         try:
-            result = run(plan, on_tick=live, confirm=partial(confirm, remedy="give --start to let the robot move"))
+            result = _shown(report, args, plan, live, asks) if args.view else run(plan, on_tick=live, confirm=asks)
         finally:
             live.close()
             tell_lateness(report, args.port)
@@ -114,6 +122,15 @@ def main(args: argparse.Namespace) -> int:
         chosen = {name: vars(args)[name] for name in ("task", "policy", "backend", "robot", "seed")}
         report.result(chosen | {"randomised": args.randomise} | result.summary() | files)
     return EXIT_CODES[result.outcome]
+
+
+def _shown(report: Report, args: argparse.Namespace, plan: RunSettings, live: LiveLine, asks: Confirm) -> Result:
+    """The run, on the page."""
+    from servoid.tools.web.watched import watched_run
+
+    with open_page(view_of(args), plan.robot) as page:
+        report.line(f"page: {page.url}  ({STOPS})")
+        return watched_run(page.link, plan, on_tick=live, confirm=asks)
 
 
 def tell_lateness(report: Report, port: str | None) -> None:

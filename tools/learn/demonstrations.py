@@ -68,7 +68,7 @@ def cloned(observations: Array, actions: Array, hidden: tuple[int, ...], steps: 
     import torch
     from torch import nn
 
-    mean, std = observations.mean(0, keepdims=True), observations.std(0, keepdims=True) + _EPS
+    mean, std = observations.mean(0), observations.std(0) + _EPS
     x = torch.from_numpy((observations - mean) / std).float()
     y = torch.from_numpy(actions).float()
     torch.manual_seed(seed)

@@ -8,18 +8,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from made_prior import write_prior
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Instruction
 from servoid.hw.robot.description import load_robot
+from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError, read_header
+from servoid.policy.priors.adversarial.discriminator import (
+    Adversary,
+    Discriminator,
+    load_discriminator,
+    save_discriminator,
+)
 from servoid.policy.priors.goals import GOALS
 from servoid.policy.priors.score_matching.model import Style, load_prior
+from servoid.policy.priors.score_matching.windows import PriorWindows
 from servoid.policy.priors.task_policy import TaskPolicy
 from servoid.policy.recording import read_recording
 from servoid.sim.kinematics import limbs_of
 from servoid.tools.learn.demonstrations import demonstrated
+from servoid.tools.learn.envs.score_term import Rival
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
 from servoid.tools.learn.envs.tasks import LEARNED_TASKS, TaskState, load_learned_task
 from servoid.tools.learn.prior_settings import PolicyTraining
@@ -117,6 +127,12 @@ def test_rewards_are_highest_for_what_is_asked() -> None:
     assert steering.reward(sideways, state((0, 0), 0.0, (0.0, 0.1)))[0] == pytest.approx(1.0)
     assert steering.reward(sideways, state((0, 0), np.pi / 2, (0.0, 0.1)))[0] == pytest.approx(0.7)
     assert steering.reward(sideways, state((0, 0), 0.0, (0.0, -0.01)))[0] == pytest.approx(0.3)
+    ball = LEARNED_TASKS["dodgeball"](ROBOT)
+    thrown = ball.draw(np.random.default_rng(0), np.array([1.0, -1.0]))[None]
+    hit = [bool(ball.ended(ball.advance(thrown, t), state((1, -1), 0.0, (0.0, 0.0)))[0]) for t in np.arange(0, 6, 0.1)]
+    assert any(hit)  # it flies at where the robot stands
+    assert not hit[0]
+    assert ball.reward(thrown, state((5, 5), 0.0, (0, 0)))[0] > ball.reward(thrown, state((1, -1), 0.0, (0, 0)))[0] > 0
     place = np.array([[1.0, 0.0]])
     assert location.reward(place, state((1.0, 0.0), 0.0, (0.0, 0.0)))[0] == pytest.approx(1.0)
     assert location.reward(place, state((0.0, 0.0), 0.0, (0.0, 0.0)))[0] < 0.01
@@ -131,6 +147,11 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
     assert np.allclose(GOALS["steering"].observe(turning, walking), [0.5, 0.0, np.cos(0.5), np.sin(0.5)])
     far = Instruction(velocity=np.zeros(3), goal=np.array([3.0, 4.0]))
     assert np.allclose(GOALS["location"].observe(far, walking), [0.6, 0.8])
+    things = np.array([[2.0, 0.0, 0.1, -0.5, 0.0], [0.0, -1.0, 0.1, 0.0, 0.25]])
+    seen = GOALS["ball"].observe(Instruction(np.zeros(3), obstacles=things), walking)
+    assert np.allclose(seen, [0.0, -1.0, 0.0, 0.5])  # the nearest
+    with pytest.raises(ConfigError, match="run obstacle"):
+        GOALS["ball"].observe(turning, walking)
     with pytest.raises(ConfigError, match="the task gives none"):
         GOALS["location"].observe(turning, walking)
 
@@ -164,3 +185,34 @@ def test_demonstrations_are_told_what_came_of_them(synthetic_dataset: Path) -> N
     speed = np.linalg.norm(asked, axis=1)
     assert speed.max() < 0.31  # the made-up bodies glide at 0.3 m/s at most
     assert (np.abs(asked[:, 0]) > np.abs(asked[:, 1])).mean() > 0.9  # and almost straight ahead
+
+
+@pytest.mark.slow
+def test_a_discriminator_learns_along_and_rewards_frozen(prior: Path, synthetic_dataset: Path, tmp_path: Path) -> None:
+    """AMP in the same environment: it comes to tell the policy's windows, and its file rewards another training."""
+    known = load_prior(prior, ROBOT, limbs_of(ROBOT))
+    recordings = {"": read_recording(synthetic_dataset, ROBOT)}
+    discriminator = Discriminator(known)
+    adversary = Adversary(discriminator, PriorWindows(recordings, known.features, known.config), 0)
+    rival = Rival(discriminator, adversary)
+    env = environment("speed", known, Style(), replace(SETTINGS, generated=0.0), 6, 0, rival)
+    env.reset()
+    for _ in range(6):
+        env.step(np.ones((env.n, env.action_size)))
+    told = [env.score.learn() for _ in range(60)][-1]
+    assert told["tells_data"] > 0.9
+    assert told["tells_policy"] > 0.9
+    file = tmp_path / "discriminator.safetensors"
+    save_discriminator(file, discriminator, known, {"data": "", "licence": "", "results": {}})
+    frozen = load_discriminator(file, known)
+    real = adversary._data.held_out(20)[0] * known.std + known.mean
+    assert np.array_equal(frozen.reward(real), discriminator.reward(real))
+    assert frozen.reward(real).mean() > frozen.reward(torch.cat(adversary._memory)).mean()
+    again = environment("speed", known, Style(), SETTINGS, 6, 0, Rival(frozen, None))
+    again.reset()
+    again.step(np.zeros((6, again.action_size)))
+    assert again.score.learn() == {}
+    head, tensors = checkpoint.read(file)
+    checkpoint.write(file, tensors, {**head, "config": {**head["config"], "stride": 1}})
+    with pytest.raises(CheckpointError, match="stride 1"):
+        load_discriminator(file, known)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,9 +17,20 @@ from servoid.tools.learn.prior_settings import ScoreSettings
 from servoid.tools.learn.terms import StatefulTerm
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from servoid.policy.priors.adversarial.discriminator import Adversary, Discriminator
     from servoid.policy.priors.score_matching.model import Prior, Style
 
 _SMOOTHING = 0.2  # of a decision's error in its running average by world
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A discriminator that rewards in the prior's place, and what teaches it; None: it stays as it is."""
+
+    discriminator: Discriminator
+    adversary: Adversary | None
 
 
 class ScoreTerm(StatefulTerm[State]):
@@ -62,16 +74,24 @@ class ScoreTerm(StatefulTerm[State]):
         self.sharpness = first * (last / first) ** progress
 
     def __call__(self, step: State) -> Array:
+        windows = self._windows(step)
+        errors = self._score(windows)
+        self.ratio = self.ratio + _SMOOTHING * ((errors / self.data_error).mean(-1) - self.ratio)
+        return self._reward(windows, errors)
+
+    def _reward(self, windows: Tensor, errors: Array) -> Array:
+        """The term `(n,)` of the newest windows, whose errors `(n, count)` are known."""
         from servoid.policy.priors.score_matching.score import likeness
 
-        errors = self.errors(step)
         scale = self._running(errors) if self._settings.scale == "running" else self.data_error
-        now = (errors / self.data_error).mean(-1)
-        self.ratio = self.ratio + _SMOOTHING * (now - self.ratio)
         return likeness(errors, scale, self.sharpness)
 
-    def errors(self, state: State) -> Array:
-        """The errors `(n, count)` of the windows that end in `state`, which they take in."""
+    def learn(self) -> dict[str, float]:
+        """Once an update of the policy; returns what is logged. A frozen prior learns nothing."""
+        return {}
+
+    def _windows(self, state: State) -> Tensor:
+        """The windows `(n, frames, size)` that end in `state`, which they take in."""
         import torch
 
         from servoid.policy.priors.features import seen_from_last
@@ -83,7 +103,23 @@ class ScoreTerm(StatefulTerm[State]):
             self._frames[self._fresh] = frame[self._fresh][:, None]
             self._yaw[self._fresh] = yaw[self._fresh][:, None]
             self._fresh = np.zeros_like(self._fresh)
-        return self._score(torch.from_numpy(seen_from_last(self._frames, self._yaw).astype(np.float32)))
+        return torch.from_numpy(seen_from_last(self._frames, self._yaw).astype(np.float32))
+
+
+class AdversarialTerm(ScoreTerm):
+    """The reward of a discriminator instead (AMP), frozen or learning; the prior measures the manner all the same."""
+
+    def __init__(self, prior: Prior, style: Style, n: int, settings: ScoreSettings, seed: int, rival: Rival) -> None:
+        super().__init__(prior, style, n, settings, seed)
+        self.discriminator, self._adversary = rival.discriminator, rival.adversary
+
+    def _reward(self, windows: Tensor, errors: Array) -> Array:
+        if self._adversary is not None:
+            self._adversary.see(windows)
+        return self.discriminator.reward(windows)
+
+    def learn(self) -> dict[str, float]:
+        return {} if self._adversary is None else self._adversary.learn()
 
 
 class GeneratedStarts:

@@ -156,6 +156,7 @@ class TaskEnvironment:
             self.fleet.step(target)
             fallen |= self.fleet.truth.fallen
         self.ticks += 1
+        self.asked = self.task.advance(self.asked, self.dt)
         truth = self.fleet.truth
         self._places = np.concatenate([truth.position[None, :, :2], self._places[:-1]])
         known = TaskState(truth.position[:, :2], truth.yaw, self.velocity)
@@ -165,8 +166,9 @@ class TaskEnvironment:
         reward, self.terms = self.reward(step)
         unlike = (self.score.ratio > self.settings.unlike) if self.settings.unlike else np.zeros(self.n, bool)
         unlike &= self.ticks > self.settings.unlike_after / self.dt
-        late = (self.ticks >= self.limit) & ~fallen & ~unlike
-        done = fallen | unlike | late
+        over = fallen | unlike | self.task.ended(self.asked, known)
+        late = (self.ticks >= self.limit) & ~over
+        done = over | late
         self.joints, self.ground = truth.joints.copy(), known.velocity
         if done.any():
             self._reset(done)

@@ -1,9 +1,9 @@
 """Train a policy for a task with PPO, under a motion prior that rewards what is like its data (SMP).
 
---task is speed, steering, location, or your own FILE.py:Class. The policy sees the estimate and its goal; it decides
-joint targets around the home pose as often as its prior has frames. --rewards weighs the task, the prior (manner) and
-their product (both); the paper adds the first two. With --demonstrations it begins as a network that does what a
-dataset shows, instead of at random.
+--task is speed, steering, location, dodgeball, or your own FILE.py:Class. The policy sees the estimate and its goal;
+it decides joint targets around the home pose as often as its prior has frames. --rewards weighs the task, the prior
+(manner) and their product (both); the paper adds the first two. With --demonstrations it begins as a network that
+does what a dataset shows, instead of at random.
 
 Ctrl-C saves, and the same command continues. The newest network is policy.safetensors.
 """
@@ -31,18 +31,18 @@ from servoid.tools.learn.trainers.trainer import add_run_arguments
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
     from servoid.policy.priors.score_matching.model import Prior, Style
+    from servoid.tools.learn.envs.score_term import Rival
 
 _IMITATION_STEPS = 3000
 _JUDGED = 64  # worlds
+_DISCRIMINATOR = "discriminator.safetensors"  # beside the policy
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid train policy`."""
     run = add_run_arguments(parser, PolicyTraining(), threads=1)  # the worlds use the cores
     run.add_argument("--task", required=True, metavar="NAME|FILE.py:CLASS", help="what is learned")
-    run.add_argument(
-        "--prior", type=Path, required=True, metavar="CHECKPOINT", help="motion prior (`servoid train prior`)"
-    )
+    run.add_argument("--prior", required=True, metavar="NAME|FILE", help="motion prior (`servoid train prior`)")
     run.add_argument(
         "--style",
         metavar="NAME|UPPER+LOWER",
@@ -54,6 +54,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--init", type=Path, metavar="CHECKPOINT", help="start from this task policy")
     run.add_argument(
         "--demonstrations", type=Path, metavar="DIR", help="start from a network that imitates this dataset"
+    )
+    run.add_argument(
+        "--adversarial",
+        type=Path,
+        metavar="DIR",
+        help="reward by a discriminator that learns from this dataset (AMP); the prior measures and starts episodes",
+    )
+    run.add_argument(
+        "--discriminator", type=Path, metavar="CHECKPOINT", help="reward by this discriminator, which stays as it is"
     )
 
 
@@ -72,10 +81,13 @@ def main(args: argparse.Namespace) -> int:
     torch.set_num_threads(args.threads)
     torch.manual_seed(settings.seed)
     robot = load_robot(args.robot)
-    prior = load_prior(args.prior, robot, limbs_of(robot))
+    found = checkpoint.resolve(args.prior, robot)
+    prior = load_prior(found, robot, limbs_of(robot))
     style = Style.parse(args.style, args.style_weight)
-    env = environment(args.task, prior, style, settings, settings.worlds, settings.seed)
-    trainer = PolicyTrainer(env, style, settings, args.out, args.prior)
+    rival = _rival(args, prior, settings)
+    env = environment(args.task, prior, style, settings, settings.worlds, settings.seed, rival)
+    trainer = PolicyTrainer(env, style, settings, args.out, found)
+    trainer.rival = rival
     trainer.start(args.resume, args.init)
     if args.demonstrations is not None and not trainer.begun_with:
         trainer.imitate(args.demonstrations)
@@ -83,17 +95,45 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
+def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> Rival | None:
+    """What rewards in the prior's place, where that was asked for. Raises ConfigError."""
+    from servoid.policy.priors.adversarial.discriminator import Adversary, Discriminator, load_discriminator
+    from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.tools.learn.envs.score_term import Rival
+    from servoid.tools.learn.trainers.prior import read_by_style
+
+    if args.discriminator is not None:
+        if args.adversarial is not None:
+            raise ConfigError("give --adversarial or --discriminator, not both: one that learns, or one that stays")
+        return Rival(load_discriminator(args.discriminator, prior), None)
+    if args.adversarial is None:
+        return None
+    if args.resume and (args.out / "resume.pt").exists():
+        raise ConfigError(f"{args.out}: a discriminator does not go on where it stopped: use --no-resume")
+    recordings = read_by_style(args.adversarial, prior.features.robot)
+    discriminator = Discriminator(prior)
+    data = PriorWindows(recordings, prior.features, prior.config)
+    return Rival(discriminator, Adversary(discriminator, data, settings.seed))
+
+
 def environment(
-    task: str, prior: Prior, style: Style, settings: PolicyTraining, worlds: int, seed: int
+    task: str,
+    prior: Prior,
+    style: Style,
+    settings: PolicyTraining,
+    worlds: int,
+    seed: int,
+    rival: Rival | None = None,
 ) -> TaskEnvironment:
-    """Worlds of a task under a prior. Raises ConfigError."""
+    """Worlds of a task under a prior, or under a rival of it. Raises ConfigError."""
     from servoid.stack.estimation.odometry import load_odometry
-    from servoid.tools.learn.envs.score_term import GeneratedStarts, ScoreTerm
+    from servoid.tools.learn.envs.score_term import AdversarialTerm, GeneratedStarts, ScoreTerm
     from servoid.tools.learn.envs.tasks import load_learned_task
 
     robot: Robot = prior.features.robot
     made = load_learned_task(task, robot)
-    score = ScoreTerm(prior, style, worlds, settings, seed)
+    given = prior, style, worlds, settings, seed
+    score = ScoreTerm(*given) if rival is None else AdversarialTerm(*given, rival)
     starts = GeneratedStarts(prior, style, settings, seed)
     return TaskEnvironment(made, score, starts, load_odometry(robot), settings, worlds, seed)
 
@@ -104,6 +144,7 @@ class PolicyTrainer(PpoTrainer):
     BEST = LAST = "policy.safetensors"
     env: TaskEnvironment
     settings: PolicyTraining
+    rival: Rival | None = None
 
     def __init__(self, env: TaskEnvironment, style: Style, settings: PolicyTraining, out: Path, prior: Path) -> None:
         from servoid.stack.log.provenance import sha256
@@ -120,6 +161,11 @@ class PolicyTrainer(PpoTrainer):
         measured = ("return", "falls", "prior_error", "amplitude", "amplitude_error", "cadence")
         self.columns = (*self.columns, *measured)
         self.panels = (*self.panels, ("return", "falls"), ("prior_error",), ("amplitude", "cadence"))
+
+    def learn(self) -> dict[str, float]:
+        row = super().learn()
+        self.env.score.learn()
+        return row
 
     @property
     def title(self) -> str:
@@ -171,4 +217,8 @@ class PolicyTrainer(PpoTrainer):
             "results": results,
             "training": plain(self.settings),
         }
+        if self.rival is not None and self.rival.adversary is not None:
+            from servoid.policy.priors.adversarial.discriminator import save_discriminator
+
+            save_discriminator(path.with_name(_DISCRIMINATOR), self.rival.discriminator, env.score.prior, about)
         save_task_policy(path, self.actor(), env.robot, config, about)

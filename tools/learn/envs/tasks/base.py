@@ -52,6 +52,14 @@ class LearnedTask(ABC):
     def reward(self, asked: Array, state: TaskState) -> Array:
         """How well it does what is asked `(n,)`, 0 to 1."""
 
+    def advance(self, asked: Array, seconds: float) -> Array:
+        """What is asked `(n, size)` so much later [s]: a thing that moves has gone on."""
+        return asked
+
+    def ended(self, asked: Array, state: TaskState) -> Array:
+        """Where the episode is over, and earns nothing any more `(n,)` bool."""
+        return np.zeros(len(asked), bool)
+
     def steady(self, speed: float) -> Array | None:
         """What asks to walk straight on at `speed` [m/s] `(size,)`; None where the task asks for no speed."""
         return None
