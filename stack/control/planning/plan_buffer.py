@@ -17,7 +17,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Adopted, Instruction, Plan, PlanRequest
 from servoid.policy.diffusion.model.action_space import ActionSpace
-from servoid.stack.control.planner import Planner
+from servoid.stack.control.planning.planner import Planner
 
 _MANY = 25  # late plans in a row after which it is said that the machine is too slow
 
