@@ -20,10 +20,11 @@ from servoid.tools.learn.settings import (
     DiffusionTraining,
     LatentTraining,
     OdometryTraining,
+    PlannerTraining,
     TrackerTraining,
     TrainingRun,
 )
-from servoid.tools.learn.trainers import diffusion, latent, odometry, tracker
+from servoid.tools.learn.trainers import diffusion, latent, odometry, planner, tracker
 
 CLIPS = tuple(name for name in Library(load_robot()).names if name != "push-ups")
 METHODS: list[tuple[ModuleType, TrainingRun]] = [
@@ -31,6 +32,7 @@ METHODS: list[tuple[ModuleType, TrainingRun]] = [
     (odometry, OdometryTraining()),
     (latent, LatentTraining()),
     (diffusion, DiffusionTraining()),
+    (planner, PlannerTraining()),
 ]
 
 
