@@ -131,10 +131,10 @@ def test_a_start_forgets_the_stop_before_it_and_heeds_the_one_after(line: Line) 
     line.ask("stop")
     line.link.read()
     line.ask("start", task="walk", set={"vx": "0.1"})
-    request = line.link.take_start()
+    request = line.link.take("start")
     assert request is not None
     assert (request.task, request.set) == ("walk", {"vx": "0.1"})
-    assert line.link.take_start() is None
+    assert line.link.take("start") is None
     assert line.link.read().halt is Halt.NO
     line.ask("stop")
     line.link.begin(INFO)

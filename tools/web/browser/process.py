@@ -34,7 +34,7 @@ from servoid.tools.web.line.messages import HALTS, PageRequest
 from servoid.tools.web.line.snapshot import Snapshot
 
 LONGEST = 1 << 20  # bytes of a message of the loop
-NICE = 10  # the loop goes first where they share a core
+NICE = 5  # the loop goes first where they share a core
 PICTURE_SECONDS = 1.0 / 30.0
 DEAF_SECONDS = 0.5  # after which a loop that does not heed a wish to stop is sent the signal of Ctrl-C
 FAREWELL_SECONDS = 0.5  # that pages stay after the loop's program has ended
@@ -123,6 +123,8 @@ class PageProcess:
                 self._halted = None
         elif kind == "run":
             self._telemetry.begin(value)
+            for event in value.events:
+                self._telemetry.hear(event)
             self._scene.begin(value)
             self._phase, self._plan = Phase.LIMP, None
             self._server.renew()
