@@ -126,8 +126,9 @@ def main(args: argparse.Namespace) -> int:
 
 def _shown(report: Report, args: argparse.Namespace, plan: RunSettings, live: LiveLine, asks: Confirm) -> Result:
     """The run, on the page."""
-    from servoid.tools.web.watched import watched_run
+    from servoid.tools.web.watched import check_steered, watched_run
 
+    check_steered(plan)
     with open_page(view_of(args), plan.robot) as page:
         report.line(f"page: {page.url}  ({STOPS})")
         return watched_run(page.link, plan, on_tick=live, confirm=asks)

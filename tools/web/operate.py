@@ -58,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
             try:
                 while (request := _wait(page.link)) is not None:
                     if any(request.task == task["name"] for task in tasks):  # never a file: it could be anybody's code
-                        _run(report, args, page.link, request, args.seed + runs)
+                        run_task(report, args, page.link, request, args.seed + runs)
                         runs += 1
             except KeyboardInterrupt:
                 report.line("ended by Ctrl-C")
@@ -80,7 +80,7 @@ def _wait(link: PageLink) -> PageRequest | None:
     return None
 
 
-def _run(report: Report, args: argparse.Namespace, link: PageLink, request: PageRequest, seed: int) -> None:
+def run_task(report: Report, args: argparse.Namespace, link: PageLink, request: PageRequest, seed: int) -> None:
     """A run of the task that was asked for. Raises KeyboardInterrupt for a Ctrl-C that was not the page's."""
     from servoid.stack.log.recorder import free_name
     from servoid.stack.runtime.run import RunSettings

@@ -86,11 +86,15 @@ class Player:
         while self._link.alive:
             select.select([self._link], [], [], FRAME_SECONDS)
             now = time.monotonic()
-            self._heed()
-            if self._plays:
-                self._now = min(self._now + now - before, float(self._ticks.times[-1]))
+            self.look(now - before)
             before = now
-            self._show()
+
+    def look(self, seconds: float = 0.0) -> None:
+        """Heed what people ask, and show the moment that it is after so long."""
+        self._heed()
+        if self._plays:
+            self._now = min(self._now + seconds, float(self._ticks.times[-1]))
+        self._show()
 
     def _heed(self) -> None:
         if (request := self._link.take("play")) is not None:
