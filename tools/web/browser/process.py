@@ -84,7 +84,8 @@ class PageProcess:
                 await gate.listen(self._settings.port)
             except OSError as error:
                 raise ConfigError(
-                    f"the page cannot be at {self._settings.host}, port {self._settings.port}: {os.strerror(error.errno or 0)}: "
+                    f"the page cannot be at {self._settings.host}, port {self._settings.port}: "
+                    f"{os.strerror(error.errno or 0)}: "
                     "choose another with --view-port, or --view-host"
                 ) from None
             print(json.dumps({"url": access.url(gate.port)}), flush=True)
