@@ -12,7 +12,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.operator import CommandSource, Intent
-from servoid.hw.contracts.world import Percept, Scene
+from servoid.hw.contracts.world import Percept, Scene, Start
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +48,7 @@ class Episode:
     )  # by tick: change of planar velocity (2,) m/s, world frame
     reach: float | None = None  # m from the goal that count as there, where that is judged
     path: Array | None = None  # (n, 2) m to walk along, in the frame that the robot starts in
+    start: Start | None = None  # how a simulated body begins, one row; None: standing at home
     low: bool = False  # the task has the robot sit, lie or touch the ground: only its tilt tells a fall then
 
 

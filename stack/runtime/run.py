@@ -13,8 +13,7 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.control import Policy
-from servoid.hw.contracts.task import Assignment, Behaviour, Task
-from servoid.hw.contracts.world import Scene
+from servoid.hw.contracts.task import Assignment, Behaviour, Episode, Task
 from servoid.hw.dynamixel.calibration import calibrated
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.hw.seeds import Stream, generator
@@ -81,7 +80,7 @@ def prepare(settings: RunSettings) -> tuple[Assignment, Backend]:
     """
     robot = load_robot(settings.robot)
     assignment = draw(_task(settings, robot), settings.seed)
-    return assignment, _body(settings, robot, assignment.episode.scene)
+    return assignment, _body(settings, robot, assignment.episode)
 
 
 def draw(task: Task, seed: int) -> Assignment:
@@ -151,7 +150,7 @@ class Run:
         assembled = self.robot
         if not simulated and backend is None:
             assembled, self._assembly = calibrated(self.robot)
-        self.body = backend or _body(settings, assembled, self.assignment.episode.scene)
+        self.body = backend or _body(settings, assembled, self.assignment.episode)
         self._check()
 
     def _check(self) -> None:
@@ -200,7 +199,9 @@ class Run:
         if body.simulation is None and not settings.start and self._confirm is not None:
             known = f"{self._assembly}. " if self._assembly is not None else ""
             again = (
-                "" if self._get_up is None else f"; if it falls, it gets up by itself, {TRIES} tries: keep away from it"
+                ""
+                if self._get_up is None
+                else f"; if it lies or falls, it gets up by itself, {TRIES} tries: keep away from it"
             )
             self._confirm(f"{known}{robot.name} will go to its home pose and then: {task.name}{again}")
         self._interrupt.settle()  # from here on a Ctrl-C is a request, until the motors are off
@@ -314,14 +315,14 @@ def _task(settings: RunSettings, robot: Robot) -> Task:
     return load_task(settings.task, values, robot.dt, robot)
 
 
-def _body(settings: RunSettings, robot: Robot, scene: Scene | None) -> Backend:
+def _body(settings: RunSettings, robot: Robot, episode: Episode) -> Backend:
     return make_backend(
         settings.backend,
         robot,
         seed=settings.seed,
         randomise=settings.randomise,
         port=settings.port,
-        scene=scene,
+        episode=episode,
     )
 
 
