@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Walks:
+class Punctuality:
     """The ticks of some walks, ms."""
 
     late: list[float] = field(default_factory=list)
@@ -66,13 +66,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         hz = load_robot(args.robot).rate
-        alone = Walks()
+        alone = Punctuality()
         if args.viewers is None:
             seconds = _walk(args, alone)
             values: dict[str, Any] = {"hz": hz, "seconds": seconds, **alone.values()}
             report.line(_line(f"{hz} Hz", alone))
         else:
-            watched, taken = Walks(), [0, 0, 0, 0]
+            watched, taken = Punctuality(), [0, 0, 0, 0]
             for _ in range(args.rounds):
                 _walk(args, alone)
                 taken = [a + b for a, b in zip(taken, _watched_walk(args, watched), strict=True)]
@@ -94,7 +94,7 @@ def main(args: argparse.Namespace) -> int:
     return exit_codes.DONE
 
 
-def _line(what: str, walks: Walks) -> str:
+def _line(what: str, walks: Punctuality) -> str:
     values = walks.values()
     late = f"late p50 {values['late_p50_ms']:.2f} ms, p99 {values['late_p99_ms']:.2f} ms"
     return (
@@ -106,11 +106,11 @@ def _settings(args: argparse.Namespace) -> RunSettings:
     return RunSettings("walk", robot=args.robot, policy="gait", seconds=args.seconds, set={"vx": "0.1"}, realtime=True)
 
 
-def _walk(args: argparse.Namespace, walks: Walks) -> float:
+def _walk(args: argparse.Namespace, walks: Punctuality) -> float:
     return run(_settings(args), on_tick=walks).seconds
 
 
-def _watched_walk(args: argparse.Namespace, walks: Walks) -> list[int]:
+def _watched_walk(args: argparse.Namespace, walks: Punctuality) -> list[int]:
     """What viewers took: messages and bytes of pictures, and of numbers. Raises ConfigError where there is no page."""
     from servoid.tools.web.launch import View, open_page
     from servoid.tools.web.watched import watched_run

@@ -69,6 +69,7 @@ class PageProcess:
         self._plan: Array | None = None  # (n, 2) m: the newest one's path
         self._phase: str | None = None  # of the newest tick of what runs; None: nothing runs
         self._halted: float | None = None  # s, when somebody asked to stop and was not heeded yet
+        self._insists = True
         self._signals = 0  # that were sent for it
         self._parent = os.getppid()
         self._ended = asyncio.Event()
@@ -127,7 +128,7 @@ class PageProcess:
             for event in value.events:
                 self._telemetry.hear(event)
             self._scene.begin(value)
-            self._phase, self._plan = Phase.LIMP, None
+            self._phase, self._plan, self._insists = Phase.LIMP, None, value.insists
             self._server.renew()
         elif kind == "end":
             self._telemetry.end(*value)
@@ -158,7 +159,7 @@ class PageProcess:
 
     def _insist(self) -> None:
         """Where the loop hangs, a signal is what ends it: one is a request, the second breaks off what hangs."""
-        if self._halted is None or self._phase is None or os.getppid() != self._parent:
+        if self._halted is None or self._phase is None or not self._insists or os.getppid() != self._parent:
             return
         if time.monotonic() - self._halted > DEAF_SECONDS * (self._signals + 1) and self._signals < 2:
             self._signals += 1

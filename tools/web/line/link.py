@@ -22,7 +22,7 @@ from servoid.hw.contracts.world import Truth
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.event import Event
 from servoid.tools.web.line.messages import HALTS, LONGEST, OPEN, PageRequest, parse_request
-from servoid.tools.web.line.snapshot import RunInfo, Snapshots
+from servoid.tools.web.line.snapshot import RunInfo, Snapshot, Snapshots
 
 ROOM = 1 << 20  # bytes on the way to the page: some hundred ticks
 MOST = 64  # requests that are read in one tick: a page that floods waits its turn
@@ -77,16 +77,26 @@ class PageLink:
             return
         self._waiting += record.events
         truth = self._truth if self._shows_truth else None
-        snapshot = self._snapshots.take(record, truth, tuple(self._waiting))
+        self.publish(self._snapshots.take(record, truth, tuple(self._waiting)))
+        del self._waiting[:-KEPT]
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Publish a tick that was made elsewhere."""
         if self._flush() and self._send(pickle.dumps(("tick", snapshot), pickle.HIGHEST_PROTOCOL)):
             self._waiting.clear()
-        del self._waiting[:-KEPT]
 
     def read(self) -> Intent:
         """What the person at the page wants now."""
         self._receive()
         age = math.inf if self._heard_ns is None else (self._clock() - self._heard_ns) * 1e-9
         return replace(self._intent, age=age)
+
+    def take_halt(self) -> Halt:
+        """A wish to stop, once, for whoever is no run, which ends with the first."""
+        self._receive()
+        halt = self._intent.halt
+        self._intent = replace(self._intent, halt=Halt.NO)
+        return halt
 
     def take(self, kind: str) -> PageRequest | None:
         """The newest wish of a kind of TAKEN, once. With one to start a task, what was asked before is forgotten, and
