@@ -1,7 +1,7 @@
 """A virtual rig on the page, from beside it: `python -m servoid.tools.web.rig_view SETTINGS`, which are JSON.
 
-It asks the rig's control socket where the robot is, as often as a picture is due, so that the rig, which must answer its
-bus in time, does no more than that. Stop presses the stop button of the rig's board: what controls the robot hears it.
+It asks the rig's control socket where the robot is, and seldom how its servos are: the rig must answer its bus in time.
+Stop presses the stop button of the rig's board: what controls the robot hears it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from servoid.sim.truth import SimulatedTruth
 from servoid.tools.web.launch import STOPS, View, open_page
 from servoid.tools.web.line.snapshot import BodyPose, RunInfo, Snapshot
 
-FRAME_SECONDS = 1.0 / 30.0
+FRAME_SECONDS = 1.0 / 15.0
+SERVOS_EVERY = 15  # frames between two looks at the servos
 PRESS_SECONDS = 0.2  # that a button is held, several reads of whoever controls the robot
 
 
@@ -36,20 +37,23 @@ class RigView:
     def __init__(self, robot: Robot, control: Control) -> None:
         self._robot, self._control = robot, control
         self._truth = RigTruth(control, robot)
+        self._servos: list[dict[str, Any]] = []
         self._began, self._number = time.monotonic(), 0
         self._stop = min((BUTTONS[name] for name in robot.bus.stop_buttons), default=0)
 
     def snapshot(self) -> Snapshot:
         """The rig as it is. Raises BackendError when it is gone."""
-        truth, held = self._truth.fetch(), bool(self._control.call("truth")["held"])
-        servos = self._control.servos()
+        truth = self._truth.fetch()
+        if self._number % SERVOS_EVERY == 0:
+            self._servos = self._control.servos()
+        servos = self._servos
         n, on = len(servos), sum(bool(servo["torque"]) for servo in servos)
         unread = np.full(n, np.nan)
         self._number += 1
         return Snapshot(
             tick=self._number,
             time=time.monotonic() - self._began,
-            phase=f"{'held' if held else 'free'}, torque on {on} of {n}",
+            phase=f"{'held' if self._truth.held else 'free'}, torque on {on} of {n}",
             position=truth.joints[0].copy(),
             target=unread,
             effort=unread,
