@@ -73,6 +73,7 @@ VERBS: dict[str, Verb] = {
             "diffusion": Verb("train the diffusion model", "servoid.tools.learn.trainers.diffusion"),
             "prior": Verb("train a motion prior", "servoid.tools.learn.trainers.prior"),
             "policy": Verb("train a policy for a task under a motion prior", "servoid.tools.learn.trainers.policy"),
+            "planner": Verb("train the planner of whole-body motion", "servoid.tools.learn.trainers.planner"),
         },
     ),
     "evaluate": Verb("measure a policy as papers do, or as you define", "servoid.tools.commands.evaluate"),
