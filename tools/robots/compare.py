@@ -22,7 +22,7 @@ _LEVEL = 0.05  # rad that soles may lean at home
 
 
 @dataclass(frozen=True)
-class Finding:
+class Comparison:
     """Something that was compared, and whether it is as it should be."""
 
     good: bool
@@ -30,14 +30,14 @@ class Finding:
     found: str
 
 
-def findings(robot: Robot) -> list[Finding]:
+def findings(robot: Robot) -> list[Comparison]:
     """All comparisons. Raises ConfigError where the robot cannot be simulated at all."""
     model = build(robot)
     data = mujoco.MjData(model)
     joints = np.array([int(model.joint(name).qposadr[0]) for name in robot.names])
     mass = float(model.body_mass[1:].sum())
     return [
-        Finding(
+        Comparison(
             True, "weight and height", f"{mass:.2f} kg, base {robot.standing_height:.3f} m above the ground at home"
         ),
         _kinematics(robot, model, data, joints),
@@ -57,7 +57,7 @@ def _put(model: mujoco.MjModel, data: mujoco.MjData, joints: Array, pose: Array)
     mujoco.mj_fwdPosition(model, data)
 
 
-def _kinematics(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Finding:
+def _kinematics(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
     legs, rng, worst = Legs(robot), np.random.default_rng(0), 0.0
     for pose in rng.uniform(robot.lower, robot.upper, (_POSES, len(joints))):
         _put(model, data, joints, pose)
@@ -65,10 +65,10 @@ def _kinematics(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints
         soles, _ = legs.soles(legs.pick(pose))
         for sole, foot in zip(soles, robot.legs, strict=True):
             worst = max(worst, float(np.abs(data.sensor(f"servoid/{foot}_position").data - sole).max()))
-    return Finding(worst < _EXACT, "kinematics", f"soles {worst:.1e} m from MuJoCo's at {_POSES} random poses")
+    return Comparison(worst < _EXACT, "kinematics", f"soles {worst:.1e} m from MuJoCo's at {_POSES} random poses")
 
 
-def _mirrors(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Finding:
+def _mirrors(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
     """Joints of a mirrored pose are at the mirror images of where they were."""
     index, sign = robot.mirror
     ids, flip = [model.joint(name).id for name in robot.names], np.array([1.0, -1.0, 1.0])
@@ -83,30 +83,30 @@ def _mirrors(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: A
     away = np.maximum(away, off)
     worst = int(away.argmax())
     text = f"joints {1000 * away.max():.1f} mm beside their images, most {robot.names[worst]}"
-    return Finding(bool(away.max() < _MIRRORED), "mirrors", text)
+    return Comparison(bool(away.max() < _MIRRORED), "mirrors", text)
 
 
-def _ranges(robot: Robot) -> Finding:
+def _ranges(robot: Robot) -> Comparison:
     """Both sides may go as far."""
     index, sign = robot.mirror
     ends = np.sort(np.stack([robot.lower[index] * sign, robot.upper[index] * sign]), axis=0)
     off = np.abs(ends - np.stack([robot.lower, robot.upper])).max(0)
     off[index == np.arange(len(index))] = 0.0
     wrong = [robot.names[i] for i in np.flatnonzero(off > 1e-3)]
-    return Finding(
+    return Comparison(
         not wrong, "ranges", f"differ from their mirrors': {', '.join(wrong)}" if wrong else "alike on both sides"
     )
 
 
-def _soles(robot: Robot) -> Finding:
+def _soles(robot: Robot) -> Comparison:
     legs = Legs(robot)
     _, rotation, _, _ = legs.forward(legs.pick(robot.home))
     tilt = float(np.arccos(np.clip(rotation[:, :, 2] @ rotation[0, :, 2], -1.0, 1.0)).max())
     step = float(np.ptp(legs.soles(legs.pick(robot.home))[1] @ rotation[0, :, 2]))
-    return Finding(tilt < _LEVEL, "soles at home", f"{tilt:.3f} rad and {1000 * step:.0f} mm from one plane")
+    return Comparison(tilt < _LEVEL, "soles at home", f"{tilt:.3f} rad and {1000 * step:.0f} mm from one plane")
 
 
-def _balance(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Finding:
+def _balance(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
     """The centre of mass is above the soles at home."""
     legs = Legs(robot)
     _put(model, data, joints, robot.home)
@@ -115,10 +115,10 @@ def _balance(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: A
     corners = legs.soles(legs.pick(robot.home))[1].reshape(-1, 3) @ rotation[0]
     centre = data.subtree_com[model.body(robot.base).id] @ rotation[0]
     room = float(min(centre[0] - corners[:, 0].min(), corners[:, 0].max() - centre[0]))
-    return Finding(room > 0, "balance at home", f"the centre of mass is {1000 * room:.0f} mm inside the soles' ends")
+    return Comparison(room > 0, "balance at home", f"the centre of mass is {1000 * room:.0f} mm inside the soles' ends")
 
 
-def _load(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Finding:
+def _load(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
     """What holding each leg's share of the weight at home takes of the servos."""
     legs = Legs(robot)
     _put(model, data, joints, robot.home)
@@ -135,10 +135,10 @@ def _load(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Arra
     leg, joint = np.unravel_index(int((torque / stall).argmax()), torque.shape)
     share = float((torque / stall)[leg, joint])
     name = robot.names[legs.index[leg, joint]]
-    return Finding(share < _LOADED, "servos at home", f"{name} needs most: {100 * share:.0f} % of its stall torque")
+    return Comparison(share < _LOADED, "servos at home", f"{name} needs most: {100 * share:.0f} % of its stall torque")
 
 
-def _steps(robot: Robot) -> Finding:
+def _steps(robot: Robot) -> Comparison:
     """The gait's steps are within the joints' ranges."""
     gait, phase = Gait(robot), np.linspace(0.0, 1.0, 24, endpoint=False)
     velocity = np.broadcast_to(np.array([0.5, 0.0, 0.0]) * gait.upper, (24, 3))
@@ -149,4 +149,4 @@ def _steps(robot: Robot) -> Finding:
     wrong = [name for i, name in enumerate(robot.names) if np.asarray(beyond)[i] and i in legs]
     speed = float(np.abs(np.diff(pose, axis=0, append=pose[:1])).max() * 24 / gait.settings.cycle)
     text = f"beyond the ranges of {', '.join(wrong)}" if wrong else f"within the ranges, joints up to {speed:.1f} rad/s"
-    return Finding(not wrong, "steps of the gait", text)
+    return Comparison(not wrong, "steps of the gait", text)

@@ -80,7 +80,7 @@ def main(args: argparse.Namespace) -> int:
         start = gait_of(robot)
         out = args.out or Path(robot.folder) / "gait.yaml"
         out.parent.mkdir(parents=True, exist_ok=True)
-        trial = Trial(robot, start, args.candidates, args.seconds, args.randomise, args.seed)
+        trial = GaitTrial(robot, start, args.candidates, args.seconds, args.randomise, args.seed)
         options = {"popsize": args.candidates, "seed": args.seed + 1, "verbose": -9}
         search = cma.CMAEvolutionStrategy(np.zeros(len(NAMES)), _SIGMA, options)
         best = first = trial.walk([start] * args.candidates)[0]
@@ -109,7 +109,7 @@ def _words(walked: Walked) -> str:
     return f"{100 * walked.falls:.0f} % of walks fell, speed off by {100 * walked.error:.0f} % of the top speed"
 
 
-class Trial:
+class GaitTrial:
     """Walks of a generation, all at once: each candidate under every command."""
 
     def __init__(
