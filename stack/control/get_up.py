@@ -29,7 +29,7 @@ CLIPS = ("get-up-front", "get-up-back")
 SETTLE_SECONDS = 0.5  # in a clip's first pose: clips were recorded from there, at rest
 STAND_SECONDS = 1.5  # that the robot has to come to a stand in when the clip is over
 HOME_SECONDS = 2.0  # the same, when it is home
-RATE = 1.3  # at which a tracker gets up, of the clip's own speed
+RATE = 1.6  # at which a tracker gets up, of the clip's own speed
 ROLLED_SHARE = 0.15  # of a clip, in which the robot may still roll over to its other side
 
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from servoid.hw.config import CONFIGS, ConfigError, load_marked, nearest
 from servoid.hw.robot.description import Robot
+from servoid.policy.checkpoint import resolve
 from servoid.policy.motion.clip import POSES, SUFFIX, Clip
 from servoid.policy.motion.library import Library, find
 from servoid.stack.log.provenance import sha256
@@ -46,8 +47,8 @@ class Skill:
     clip: str  # name in the shipped library, or a file
     phrases: tuple[str, ...]  # that ask for it; the first is shown
     held_out: tuple[str, ...] = ()  # others, by which the understanding of words is measured
-    policy: Literal["clip", "tracker"] = "clip"
-    tracker: str = "expert"  # checkpoint, where a tracker performs it
+    policy: Literal["clip", "tracker"] = "tracker"
+    tracker: str = "tracker"  # checkpoint, where a tracker performs it
     entry: str = UPRIGHT
     end: str = UPRIGHT
     interrupted_by: Literal["anything", "nothing"] = "nothing"  # another skill, or being asked to stop, before its end
@@ -100,12 +101,14 @@ def clip_of(skill: Skill, robot: Robot) -> Clip:
 
 
 def fingerprints(robot: Robot) -> dict[str, dict[str, Any]]:
-    """What each skill is, and the hash of its clip's file, by name, to be compared."""
+    """What each skill is, and the hashes of its clip's file and its tracker's, by name, to be compared."""
     library = Library(robot)
-    return {
-        name: asdict(skill) | {"clip_sha256": sha256(clip_path(skill.clip, library))}
-        for name, skill in load_skills(robot).items()
-    }
+
+    def files(skill: Skill) -> dict[str, str | None]:
+        clip = {"clip_sha256": sha256(clip_path(skill.clip, library))}
+        return clip if skill.policy == "clip" else {**clip, "tracker_sha256": sha256(resolve(skill.tracker))}
+
+    return {name: asdict(skill) | files(skill) for name, skill in load_skills(robot).items()}
 
 
 def clip_path(clip: str, library: Library) -> Path:

@@ -163,7 +163,7 @@ def changes(log: FlightLog) -> list[str]:
         "task": "the task's settings",
         "task_files": "a file that the task's settings name",
         "task_source": "the task's file",
-        "recovery": "a clip that it gets up by",
+        "recovery": "what it gets up by",
         "skills": "a skill or its clip",
         "policy.source": "the policy's file",
         "versions": "installed packages",
