@@ -157,6 +157,8 @@ def changes(log: FlightLog) -> list[str]:
         "policy.checkpoint_sha256": "the policy's checkpoint",
         "policy.odometry_sha256": "the odometry's checkpoint",
         "policy.planner": "the file of the planner's settings (those of the log are used)",
+        "policy.closed_loop": "the settings of the closed loop",
+        "policy.tracker_sha256": "the checkpoint of its tracker",
         "policy.gait": "the gait's settings",
         "task": "the task's settings",
         "task_files": "a file that the task's settings name",

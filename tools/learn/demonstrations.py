@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from servoid.policy.recording import Recording
 
 AHEAD_SECONDS = (0.48, 2.0)  # how far ahead what came to pass is taken for what was asked
+_BATCH = 512
 _RATE = 1e-3  # learning rate at the start
 _EPS = 1e-2  # added to the deviation of inputs, as rsl-rl's normaliser adds it
 
@@ -63,14 +65,25 @@ def _hindsight(raw: Array, rows: Array, robot: Robot, rng: np.random.Generator) 
     return Instruction(np.concatenate([place / seconds, turn], -1), goal=place)
 
 
-def cloned(observations: Array, actions: Array, hidden: tuple[int, ...], steps: int, seed: int) -> Mlp:
-    """A network with so many `hidden` units, trained on the squared error of actions `(n, action_size)`."""
+@dataclass(frozen=True)
+class Mirrors:
+    """Of what a network sees, and of what it decides."""
+
+    seen: Mirror
+    decided: Mirror
+
+
+def cloned(
+    observations: Array, actions: Array, mirrors: Mirrors, hidden: tuple[int, ...], steps: int, seed: int
+) -> Mlp:
+    """A network with so many `hidden` units, trained on the squared error of actions `(n, action_size)`, and to decide
+    in a mirror what it decides: PPO on mirrored samples spoils one that does not."""
     import torch
     from torch import nn
 
     mean, std = observations.mean(0), observations.std(0) + _EPS
-    x = torch.from_numpy((observations - mean) / std).float()
-    y = torch.from_numpy(actions).float()
+    x, y = torch.from_numpy(observations).float(), torch.from_numpy(actions).float()
+    centre, scale = torch.from_numpy(mean).float(), torch.from_numpy(std).float()
     torch.manual_seed(seed)
     dense = [nn.Linear(a, b) for a, b in pairwise([x.shape[1], *hidden, y.shape[1]])]
     network = nn.Sequential(*[part for layer in dense[:-1] for part in (layer, nn.ELU())], dense[-1])
@@ -78,9 +91,11 @@ def cloned(observations: Array, actions: Array, hidden: tuple[int, ...], steps: 
     generator = torch.Generator().manual_seed(seed)
     for step in counted(steps, "imitating"):
         for group in optimiser.param_groups:
-            group["lr"] = _RATE * (1.0 - 0.95 * step / steps)
-        pick = torch.randint(len(x), (1024,), generator=generator)
-        loss = (network(x[pick]) - y[pick]).square().mean()
+            group["lr"] = _RATE * (1.0 - 0.98 * step / steps)
+        pick = torch.randint(len(x), (_BATCH,), generator=generator)
+        both = torch.cat([x[pick], mirrors.seen(x[pick])])
+        done, mirrored = network((both - centre) / scale).chunk(2)
+        loss = (done - y[pick]).square().mean() + (mirrored - mirrors.decided(done)).square().mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()

@@ -25,6 +25,8 @@ class PriorShape:
         for name in ("stride", "layers", "width", "heads", "levels"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.levels < 10:
+            raise ValueError(f"levels must be at least 10, not {self.levels}: rewards compare at three of them")
         if self.frames < 2:
             raise ValueError(f"frames must be at least 2, not {self.frames}: one shows no motion")
         if self.width % (2 * self.heads):
@@ -120,11 +122,13 @@ class PolicyTraining(EpisodeSettings, Ppo):
         float, "samples for which only the critic learns, where the actor began with demonstrations"
     ] = 100_000
 
+    imitation_steps: Annotated[int, "steps in which a network learns what demonstrations show"] = 6000
+
     def __post_init__(self) -> None:
         for part in (Ppo, EpisodeSettings):
             part.__post_init__(self)
-        if self.critic_alone < 0:
-            raise ValueError(f"critic_alone must not be negative, not {self.critic_alone:g}")
+        if self.critic_alone < 0 or self.imitation_steps < 1:
+            raise ValueError("critic_alone must not be negative, and imitation_steps must be at least 1")
 
 
 PRIOR_TITLES: Mapping[type, str] = {

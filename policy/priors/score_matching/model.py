@@ -124,6 +124,11 @@ def load_prior(path: Path, robot: Robot, limbs: Limbs | None = None) -> Prior:
     checkpoint.check(path, head, KIND, robot)
     if head["results"].get("step", 1) < 1:
         raise CheckpointError(f"{path}: a prior that was trained for 0 steps knows no motion; train it with --minutes")
+    if "error" not in head["results"]:
+        raise CheckpointError(
+            f"{path}: its training was interrupted before it was measured, so nothing says what an error means: go on "
+            "with it, and use prior.safetensors"
+        )
     try:
         theirs = Limbs.from_header(head["limbs"])
         features = PriorFeatures(robot, theirs)

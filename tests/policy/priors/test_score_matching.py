@@ -136,6 +136,7 @@ def test_what_does_not_fit_is_refused(styled: Path, tmp_path: Path) -> None:
         ({"joints": list(ROBOT.names[::-1])}, "joints do not fit"),
         ({"prior_layout": layout}, "layout is not this program's"),
         ({"results": {"step": 0}}, "0 steps"),
+        ({"results": {"step": 10}}, "interrupted before it was measured"),
         ({"kind": "diffusion"}, "a prior network is needed"),
         ({"config": {**head["config"], "frames": 1}}, "frames must be at least 2"),
     ]

@@ -14,6 +14,7 @@ from made_prior import write_prior
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Instruction
 from servoid.hw.robot.description import load_robot
+from servoid.hw.robot.mirror import Mirror
 from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError, read_header
 from servoid.policy.priors.adversarial.discriminator import (
@@ -28,7 +29,7 @@ from servoid.policy.priors.score_matching.windows import PriorWindows
 from servoid.policy.priors.task_policy import TaskPolicy
 from servoid.policy.recording import read_recording
 from servoid.sim.kinematics import limbs_of
-from servoid.tools.learn.demonstrations import demonstrated
+from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
 from servoid.tools.learn.envs.score_term import Rival
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
 from servoid.tools.learn.envs.tasks import LEARNED_TASKS, TaskState, load_learned_task
@@ -216,3 +217,13 @@ def test_a_discriminator_learns_along_and_rewards_frozen(prior: Path, synthetic_
     checkpoint.write(file, tensors, {**head, "config": {**head["config"], "stride": 1}})
     with pytest.raises(CheckpointError, match="stride 1"):
         load_discriminator(file, known)
+
+
+def test_a_clone_does_what_was_shown_and_in_a_mirror_its_mirror() -> None:
+    rng = np.random.default_rng(0)
+    seen = rng.normal(size=(400, 4)).astype(np.float32)
+    shown = np.stack([seen[:, 0], 0.5 * seen[:, 1]], -1)  # of a robot whose mirror flips the second of both
+    mirrors = Mirrors(Mirror.join(Mirror.PLANAR, Mirror.PLANAR), Mirror.PLANAR)
+    network = cloned(seen, shown, mirrors, (16,), 600, 0)
+    assert np.abs(network(seen) - shown).mean() < 0.1
+    assert np.abs(network(mirrors.seen(seen)) - mirrors.decided(network(seen))).mean() < 0.05

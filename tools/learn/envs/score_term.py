@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -67,6 +68,14 @@ class ScoreTerm(StatefulTerm[State]):
         self._frames[where] = np.concatenate([windows[:, :1], windows[:, :-1]], 1)[where]
         self._yaw[where] = 0.0
         self._fresh = self._fresh & ~where
+
+    def state(self) -> dict[str, Any]:
+        """What a training that goes on needs: plain numbers."""
+        return {"mean": self._running.mean.tolist(), "samples": self._running.samples}
+
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Inverse of `state`."""
+        self._running.mean, self._running.samples = np.array(saved["mean"]), float(saved["samples"])
 
     def anneal(self, progress: float) -> None:
         """The sharpness changes over a training, geometrically."""

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from servoid.policy.priors.score_matching.model import Prior, Style
     from servoid.tools.learn.envs.score_term import Rival
 
-_IMITATION_STEPS = 3000
 _JUDGED = 64  # worlds
 _DISCRIMINATOR = "discriminator.safetensors"  # beside the policy
 
@@ -189,7 +188,7 @@ class PolicyTrainer(PpoTrainer):
         import numpy as np
 
         from servoid.policy.recording import read_recording
-        from servoid.tools.learn.demonstrations import cloned, demonstrated
+        from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
         from servoid.tools.learn.trainers.trainer import source_of
 
         env, seed = self.env, self.settings.seed
@@ -197,8 +196,16 @@ class PolicyTrainer(PpoTrainer):
         rng = np.random.default_rng(seed)
         seen, targets = demonstrated(recording, env.robot, env.task.seen, env.stride, rng)
         actions = (targets - env.robot.home) / env.reach
-        self.begin_with(cloned(seen, actions, self.settings.hidden, _IMITATION_STEPS, seed))
+        mirrors = Mirrors(env.mirrors["actor"], env.mirrors["action"])
+        self.begin_with(cloned(seen, actions, mirrors, self.settings.hidden, self.settings.imitation_steps, seed))
         self.begun_with = {"demonstrations": source_of(folder, recording)}
+
+    def state(self) -> dict[str, Any]:
+        return {**super().state(), "score": self.env.score.state()}
+
+    def restore(self, path: Path, saved: Mapping[str, Any]) -> None:
+        super().restore(path, saved)
+        self.env.score.restore(saved["score"])
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
         env = self.env

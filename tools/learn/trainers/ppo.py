@@ -188,6 +188,15 @@ class PpoTrainer(Trainer):
                 f"{path}: a network with other inputs or layers: use --no-resume or another --out"
             ) from None
 
+    def begin_small(self, share: float) -> None:
+        """Let the actor's actions begin at a `share` of what its initial weights give."""
+        import torch
+
+        last = _dense(self.ppo.actor)[-1]
+        with torch.no_grad():
+            last.weight.mul_(share)
+            last.bias.mul_(share)
+
     def begin_with(self, network: Mlp) -> None:
         """Give the actor the weights and the input statistics of a network with the same layers."""
         import torch

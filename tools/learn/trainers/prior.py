@@ -1,8 +1,9 @@
 """Train a motion prior, a diffusion model of short windows of motion (SMP), on recorded datasets.
 
-The folder of --data is a dataset of `servoid collect`, or holds one for each style, in a folder named after it. A prior
-is judged by the error of the noise that it predicts in windows that it did not see (`error`); beside it, what it makes
-of the same windows played backward (`reversed_error`) shows whether it knows motion from poses.
+The folder of --data is a dataset of `servoid collect`, or holds one for each style, in a folder named after it. A
+prior is judged by the error of the noise that it predicts in windows that it did not see (`error`). Beside it is what
+it makes of what they are not: the same windows played backward (`reversed_error`), at rest in their last frame
+(`still_error`) and with three tenths of their amplitude (`shuffling_error`).
 
 Ctrl-C saves, and the same command continues. The best network is prior.safetensors.
 """
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from servoid.policy.recording import Recording
 
 _WARMUP = 200  # steps
+_SHUFFLE = 0.3  # of the amplitude: what walks under a weak prior does so
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -96,8 +98,13 @@ class PriorTrainer(Trainer):
         "error_middle",
         "error_low",
         "reversed_error",
+        "still_error",
+        "shuffling_error",
     )
-    panels = (("loss", "error", "reversed_error"), ("error_high", "error_middle", "error_low"))
+    panels = (
+        ("loss", "error", "reversed_error", "still_error", "shuffling_error"),
+        ("error_high", "error_middle", "error_low"),
+    )
 
     def __init__(
         self, windows: PriorWindows, features: PriorFeatures, settings: PriorTraining, out: Path, source: str
@@ -158,22 +165,27 @@ class PriorTrainer(Trainer):
         return {"steps_per_s": steps_per_s}, f"loss {means['loss']:.4f}, {steps_per_s:.0f} steps/s"
 
     def held_out(self, count: int = 4096) -> dict[str, float]:
-        """Errors on held-out windows: of the levels that rewards use, highest first, and their mean."""
+        """Errors on held-out windows: of the levels that rewards use, highest first, and their mean; and of what those
+        windows are not."""
         from servoid.policy.priors.score_matching.model import Style
         from servoid.policy.priors.score_matching.score import Score
 
         prior = self._prior()
         windows = prior.decode(self.windows.held_out(count)[0])
         errors = Score(prior, Style(), 0)(windows).mean(0)
-        back = windows.flip(1)
-        back[..., self.features.layout.slice("velocity")] *= -1.0
-        back[..., self.features.layout.slice("angular_velocity")] *= -1.0
-        backward = Score(prior, Style(), 0)(back).mean()
+        speeds = [self.features.layout.slice(name) for name in ("velocity", "angular_velocity")]
+        backward, still = windows.flip(1), windows[:, -1:].expand_as(windows).clone()
+        for at in speeds:
+            backward[..., at] *= -1.0
+            still[..., at] = 0.0
+        middle = windows.mean(1, keepdim=True)
+        shuffling = middle + _SHUFFLE * (windows - middle)
+        named = {"reversed_error": backward, "still_error": still, "shuffling_error": shuffling}
         names = ("error_high", "error_middle", "error_low")
         return {
             "error": float(errors.mean()),
-            **{name: float(error) for name, error in zip(names, errors, strict=False)},
-            "reversed_error": float(backward),
+            **{name: float(error) for name, error in zip(names, errors, strict=True)},
+            **{name: float(Score(prior, Style(), 0)(unlike).mean()) for name, unlike in named.items()},
         }
 
     def _prior(self) -> Prior:
