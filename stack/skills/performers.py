@@ -8,7 +8,7 @@ from typing import Protocol
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Policy
 from servoid.hw.robot.description import Robot
-from servoid.stack.control.clip import ClipPolicy
+from servoid.stack.control.clip import ClipPolicy, TrackedClip
 from servoid.stack.control.tracker import Tracker
 from servoid.stack.skills.skill import Skill, clip_of
 
@@ -31,7 +31,7 @@ def _tracker(skill: Skill, robot: Robot) -> Performer:
         tracker = Tracker(robot, skill.tracker, clips=True)
     except ConfigError as error:
         raise ConfigError(f"skill '{skill.name}': policy: tracker: {error}: write policy: clip") from error
-    return ClipPolicy(robot, clip_of(skill, robot), tracker=tracker)
+    return TrackedClip(robot, clip_of(skill, robot), tracker)
 
 
 PERFORMERS: dict[str, Callable[[Skill, Robot], Performer]] = {"clip": _clip, "tracker": _tracker}

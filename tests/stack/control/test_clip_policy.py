@@ -11,10 +11,12 @@ from made_clips import walking_in_a_circle
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Instruction
 from servoid.hw.robot.description import load_robot
-from servoid.policy.motion.library import SHIPPED
-from servoid.stack.control.clip import ClipPolicy
+from servoid.policy.motion.library import SHIPPED, Library
+from servoid.stack.control.clip import ClipPolicy, TrackedClip
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.policies import make_policy
+from servoid.stack.control.tracker import Tracker
+from servoid.stack.estimation.odometry import load_odometry
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.tasks import load_task
 from servoid.tools.cli import main
@@ -41,6 +43,35 @@ def test_it_enters_plays_and_stays_in_the_last_pose_in_each_world() -> None:
     assert np.ptp(one) < np.ptp(ROBOT.home) + 1e-6
     assert np.abs(np.diff(one, axis=0)).max() < 1e-9, "it plays once"
     assert np.abs(np.diff(other, axis=0)).max() > 1e-3, "and anew where an episode begins"
+
+
+def test_a_tracked_clip_keeps_its_balance_and_is_over_when_the_robot_stands() -> None:
+    """On robots drawn at random, a kick that open loop throws over many of them."""
+    n, clip = 8, Library(ROBOT)["kick-low-left"]
+
+    def upright(tracked: bool) -> int:
+        fleet = Fleet(ROBOT, n, load_odometry(ROBOT), randomise=1.0, seed=4)
+        fleet.reset(np.ones(n, bool))
+        policy = (
+            TrackedClip(ROBOT, clip, Tracker(ROBOT, "tracker", (n,)), (n,))
+            if tracked
+            else ClipPolicy(ROBOT, clip, (n,))
+        )
+        policy.reset(None, np.zeros(n, int))
+        for tick in range(clip.ticks + 150):
+            if tick >= clip.ticks - 1 and policy.ended:
+                break
+            fleet.step(policy.act(fleet.observe(), fleet.applied, STILL))
+        assert policy.ended
+        assert tick > clip.ticks + 50 or not tracked, "it comes to a stand first"
+        if not tracked:
+            for _ in range(60):
+                fleet.step(clip.joints[-1])
+        return int((~fleet.truth.fallen).sum())
+
+    alone, followed = upright(False), upright(True)
+    assert followed >= 7
+    assert followed > alone
 
 
 def test_a_clip_that_begins_lying_is_no_policy_of_a_run() -> None:
