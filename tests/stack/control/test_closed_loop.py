@@ -17,7 +17,7 @@ from servoid.policy.checkpoint import Origin
 from servoid.policy.diffusion.prefix import target
 from servoid.policy.diffusion.prefix.config import PlannerConfig
 from servoid.policy.diffusion.prefix.frames import Frames
-from servoid.policy.diffusion.prefix.model import load, save
+from servoid.policy.diffusion.prefix.model import PlannerModel, load, save
 from servoid.policy.diffusion.prefix.network import PlannerNetwork
 from servoid.policy.diffusion.prefix.runtime import PlannerRuntime
 from servoid.policy.features import Normaliser, raw_layout
@@ -52,8 +52,9 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> str:
     )  # fmt: skip
     path = tmp_path_factory.mktemp("planner") / "planner.safetensors"
     around = Normaliser(_standing().astype(np.float32), np.full(size, 0.01, np.float32)).to_torch()
-    weights = dict(PlannerNetwork(config).named_parameters())
-    save(path, weights, config, around, FRAMES, Origin("nothing", "Apache-2.0", {}, {}))
+    model = PlannerModel(PlannerNetwork(config), around, ("wave", "kick", "walk forward", "stand still"))
+    weights = dict(model.network.named_parameters())
+    save(path, weights, model, FRAMES, Origin("nothing", "Apache-2.0", {}, {}))
     return str(path)
 
 
@@ -128,6 +129,15 @@ def test_velocity_goal_and_targets_change_a_plan_and_a_far_goal_is_asked_for_in_
         plan(Instruction(np.zeros(3), targets={"tail": np.zeros(3)}))
     with pytest.raises(ConfigError, match="no English word"):
         plan(Instruction(np.zeros(3), text="???"))
+
+
+def test_a_sentence_is_read_as_the_nearest_of_the_training(checkpoint: str) -> None:
+    """So that one that no training saw asks for a motion all the same."""
+    nearest, plain = _runtime(checkpoint), _runtime(checkpoint, text_nearest=False)
+    told, meant = (_request(instruction=Instruction(np.zeros(3), text=text)) for text in ("wave now", "wave"))
+    np.testing.assert_array_equal(nearest.plan(told).states, nearest.plan(meant).states)
+    np.testing.assert_array_equal(plain.plan(meant).states, nearest.plan(meant).states)
+    assert not np.allclose(plain.plan(told).states, plain.plan(meant).states, atol=1e-5)
 
 
 def test_another_sentence_is_planned_for_at_once_and_a_run_is_repeated(checkpoint: str) -> None:
