@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -79,6 +78,7 @@ def main(args: argparse.Namespace) -> int:
         check_seed(args.seed)
         if args.video is not None:
             size = prepare(args.video, args.video_size)
+        from servoid.stack.log.recorder import free_name
         from servoid.stack.runtime.backends import backend_kind
         from servoid.stack.runtime.run import RunSettings, run
         from servoid.stack.tasks import find
@@ -97,7 +97,7 @@ def main(args: argparse.Namespace) -> int:
             gain=args.gain,
             set=settings(args),
             start=args.start,
-            record=args.record or _default_log(find(args.task).name),
+            record=args.record or free_name(find(args.task).name, Path("runs")),
             realtime=(watched and not args.fast) if backend_kind(args.backend).simulated else None,
             port=args.port,
             recover=args.recover,
@@ -126,8 +126,9 @@ def main(args: argparse.Namespace) -> int:
 
 def _shown(report: Report, args: argparse.Namespace, plan: RunSettings, live: LiveLine, asks: Confirm) -> Result:
     """The run, on the page."""
-    from servoid.tools.web.watched import watched_run
+    from servoid.tools.web.watched import check_steered, watched_run
 
+    check_steered(plan)
     with open_page(view_of(args), plan.robot) as page:
         report.line(f"page: {page.url}  ({STOPS})")
         return watched_run(page.link, plan, on_tick=live, confirm=asks)
@@ -147,13 +148,6 @@ def tell_lateness(report: Report, port: str | None) -> None:
             text = str(error)
         if text is not None:
             report.line(text)
-
-
-def _default_log(task: str) -> Path:
-    """A name that is free: runs/DATE-TASK.mcap, numbered when two runs start in one second."""
-    stem = f"{datetime.now():%Y%m%d-%H%M%S}-{task}"
-    names = (Path("runs") / f"{stem}{end}.mcap" for end in ("", *(f"-{i}" for i in range(2, 1000))))
-    return next(name for name in names if not name.exists())
 
 
 def _film(report: Report, log: Path, path: Path, size: tuple[int, int]) -> dict[str, Path]:

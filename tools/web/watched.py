@@ -33,9 +33,7 @@ def watched_run(
 ) -> Result:
     """Do one run, shown on the page. `held`: somebody has to be heard there all the time; by default where the page
     steers. Raises what `run` raises; the page is told of it."""
-    steered = find(settings.task).cls.steered
-    if steered and settings.set.get("device", "auto") != "auto":
-        raise ConfigError(f"--set device={settings.set['device']}: with --view the page steers: leave one of them out")
+    steered = check_steered(settings)
     try:
         assignment, body = prepare(settings)
         simulated = body.simulation is not None
@@ -53,6 +51,14 @@ def watched_run(
         raise
     link.end(result.outcome, _told(result))
     return result
+
+
+def check_steered(settings: RunSettings) -> bool:
+    """Whether the page steers a run's task. Raises ConfigError where something else shall, too."""
+    steered = find(settings.task).cls.steered
+    if steered and settings.set.get("device", "auto") != "auto":
+        raise ConfigError(f"--set device={settings.set['device']}: with --view the page steers: leave one of them out")
+    return steered
 
 
 def _info(settings: RunSettings, assignment: Assignment, simulated: bool) -> RunInfo:

@@ -155,10 +155,12 @@ class RigTruth:
         self._recent, self._scene = np.zeros((1, 1, model.nsensordata)), scene_sensors(model)
         qpos, qvel, sensors = self._arrays.values()
         self._truth = SimulatedTruth(model, robot, qpos, qvel, sensors, self._recent)
+        self.held = True  # whether somebody held the robot when the truth was fetched last
 
     def fetch(self) -> SimulatedTruth:
         """The truth of now; a later call changes what this one returned."""
         answer = self._control.call("truth")
+        self.held = bool(answer["held"])
         for name, array in self._arrays.items():
             array[0] = answer[name]
         self._recent[..., self._scene] = answer["touches"]

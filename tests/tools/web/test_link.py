@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-import pickle
-import socket
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from page_line import Line
 
 from servoid.hw.contracts.operator import Halt
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, prepare, run
 from servoid.stack.safety.event import Event
-from servoid.tools.web.line.link import PageLink
-from servoid.tools.web.line.messages import PageRequest
 from servoid.tools.web.line.snapshot import RunInfo
 
 INFO = RunInfo("op3", "walk", "sim", "gait", simulated=True)
@@ -28,30 +25,6 @@ def ticks() -> list[TickRecord]:
     made: list[TickRecord] = []
     run(RunSettings("walk", policy="gait", seconds=1.0), on_tick=made.append)
     return made
-
-
-class Line:
-    """A link, the page's end of its line, and a clock that stands still."""
-
-    def __init__(self) -> None:
-        ours, self.page = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.now = 0
-        self.link = PageLink(ours, clock=lambda: self.now)
-        self._sequence = 0
-        self.page.setblocking(False)
-
-    def ask(self, kind: str, **fields: object) -> None:
-        self._sequence += 1
-        self.page.send(PageRequest(kind, self._sequence, 0.0, **fields).encode())  # type: ignore[arg-type]
-
-    def told(self) -> list[tuple[str, object]]:
-        """All that has arrived."""
-        arrived = []
-        while True:
-            try:
-                arrived.append(pickle.loads(self.page.recv(1 << 20)))
-            except BlockingIOError:
-                return arrived
 
 
 @pytest.fixture
@@ -131,10 +104,10 @@ def test_a_start_forgets_the_stop_before_it_and_heeds_the_one_after(line: Line) 
     line.ask("stop")
     line.link.read()
     line.ask("start", task="walk", set={"vx": "0.1"})
-    request = line.link.take_start()
+    request = line.link.take("start")
     assert request is not None
     assert (request.task, request.set) == ("walk", {"vx": "0.1"})
-    assert line.link.take_start() is None
+    assert line.link.take("start") is None
     assert line.link.read().halt is Halt.NO
     line.ask("stop")
     line.link.begin(INFO)

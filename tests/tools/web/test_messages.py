@@ -18,6 +18,7 @@ EXAMPLES = {
     "task": "walk",
     "set": {"vx": "0.1"},
     "on": True,
+    "at": 2.5,
 }
 
 
@@ -140,7 +141,7 @@ def test_nothing_that_arrives_breaks_the_page_or_gains_control() -> None:
         except NotHeeded:
             continue
     assert control.holder == 0
-    assert {request.kind for request in passed if request is not None} <= {"stop", "off", "truth"}
+    assert {request.kind for request in passed if request is not None} <= {"stop", "off", "truth", "seek", "play"}
     assert passed  # some were right: a test that refuses all would see nothing
 
 

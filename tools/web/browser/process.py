@@ -34,7 +34,7 @@ from servoid.tools.web.line.messages import HALTS, PageRequest
 from servoid.tools.web.line.snapshot import Snapshot
 
 LONGEST = 1 << 20  # bytes of a message of the loop
-NICE = 10  # the loop goes first where they share a core
+NICE = 5  # the loop goes first where they share a core
 PICTURE_SECONDS = 1.0 / 30.0
 DEAF_SECONDS = 0.5  # after which a loop that does not heed a wish to stop is sent the signal of Ctrl-C
 FAREWELL_SECONDS = 0.5  # that pages stay after the loop's program has ended
@@ -69,6 +69,7 @@ class PageProcess:
         self._plan: Array | None = None  # (n, 2) m: the newest one's path
         self._phase: str | None = None  # of the newest tick of what runs; None: nothing runs
         self._halted: float | None = None  # s, when somebody asked to stop and was not heeded yet
+        self._insists = True
         self._signals = 0  # that were sent for it
         self._parent = os.getppid()
         self._ended = asyncio.Event()
@@ -84,7 +85,8 @@ class PageProcess:
                 await gate.listen(self._settings.port)
             except OSError as error:
                 raise ConfigError(
-                    f"the page cannot be at {self._settings.host}, port {self._settings.port}: {error.strerror}: "
+                    f"the page cannot be at {self._settings.host}, port {self._settings.port}: "
+                    f"{os.strerror(error.errno or 0)}: "
                     "choose another with --view-port, or --view-host"
                 ) from None
             print(json.dumps({"url": access.url(gate.port)}), flush=True)
@@ -123,8 +125,10 @@ class PageProcess:
                 self._halted = None
         elif kind == "run":
             self._telemetry.begin(value)
+            for event in value.events:
+                self._telemetry.hear(event)
             self._scene.begin(value)
-            self._phase, self._plan = Phase.LIMP, None
+            self._phase, self._plan, self._insists = Phase.LIMP, None, value.insists
             self._server.renew()
         elif kind == "end":
             self._telemetry.end(*value)
@@ -155,7 +159,7 @@ class PageProcess:
 
     def _insist(self) -> None:
         """Where the loop hangs, a signal is what ends it: one is a request, the second breaks off what hangs."""
-        if self._halted is None or self._phase is None or os.getppid() != self._parent:
+        if self._halted is None or self._phase is None or not self._insists or os.getppid() != self._parent:
             return
         if time.monotonic() - self._halted > DEAF_SECONDS * (self._signals + 1) and self._signals < 2:
             self._signals += 1

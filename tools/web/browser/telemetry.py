@@ -105,6 +105,7 @@ class Telemetry:
                 "goal": _numbers(info.goal),
                 "reach": info.reach,
                 "path": _numbers(info.path),
+                "length": info.length,
             },
             "outcome": self.outcome,
         }
@@ -117,7 +118,7 @@ class Telemetry:
         self._missed += snapshot.missed
         self._unread += int(np.isnan(snapshot.position).sum())
         for event in snapshot.events:
-            self._hear(event)
+            self.hear(event)
         if snapshot.phase in ENDING and not self.why:
             self.why = self._newest
         text = json.dumps(self._frame(snapshot), allow_nan=False)
@@ -129,7 +130,7 @@ class Telemetry:
     def end(self, outcome: str, text: str) -> None:
         self.outcome = (outcome, text)
 
-    def _hear(self, event: Event) -> None:
+    def hear(self, event: Event) -> None:
         self._numbered += 1
         self._plans += event.kind == "plan"
         if event.kind not in QUIET:

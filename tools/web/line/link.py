@@ -22,10 +22,11 @@ from servoid.hw.contracts.world import Truth
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.event import Event
 from servoid.tools.web.line.messages import HALTS, LONGEST, OPEN, PageRequest, parse_request
-from servoid.tools.web.line.snapshot import RunInfo, Snapshots
+from servoid.tools.web.line.snapshot import RunInfo, Snapshot, Snapshots
 
 ROOM = 1 << 20  # bytes on the way to the page: some hundred ticks
 MOST = 64  # requests that are read in one tick: a page that floods waits its turn
+TAKEN = {"start", "seek", "play"}  # kinds of wishes that are no part of what is wanted of a run
 KEPT = 1000  # events that wait for a page which takes nothing
 
 
@@ -48,7 +49,7 @@ class PageLink:
         self._shows_truth = False
         self._intent = Intent()
         self._heard_ns: int | None = None
-        self._start: PageRequest | None = None
+        self._wishes: dict[str, PageRequest] = {}  # the newest of each kind that `take` hands out
 
     @property
     def alive(self) -> bool:
@@ -59,9 +60,10 @@ class PageLink:
         """For `select`; -1 where there is no page any more."""
         return -1 if self._stream is None else self._stream.fileno()
 
-    def begin(self, info: RunInfo, truth: Truth | None = None) -> None:
-        """Something runs from here on: its robot's truth, where it is simulated, may be shown."""
-        self._snapshots, self._truth = Snapshots(), truth
+    def begin(self, info: RunInfo, truth: Truth | None = None, start_ns: int | None = None) -> None:
+        """Something runs from here on: its robot's truth, where it is simulated, may be shown. Its time counts from
+        `start_ns` of the body's clock, by default from its first tick."""
+        self._snapshots, self._truth = Snapshots(start_ns), truth
         self._tell("run", info)
 
     def end(self, outcome: str, text: str) -> None:
@@ -75,10 +77,13 @@ class PageLink:
             return
         self._waiting += record.events
         truth = self._truth if self._shows_truth else None
-        snapshot = self._snapshots.take(record, truth, tuple(self._waiting))
+        self.publish(self._snapshots.take(record, truth, tuple(self._waiting)))
+        del self._waiting[:-KEPT]
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Publish a tick that was made elsewhere."""
         if self._flush() and self._send(pickle.dumps(("tick", snapshot), pickle.HIGHEST_PROTOCOL)):
             self._waiting.clear()
-        del self._waiting[:-KEPT]
 
     def read(self) -> Intent:
         """What the person at the page wants now."""
@@ -86,12 +91,19 @@ class PageLink:
         age = math.inf if self._heard_ns is None else (self._clock() - self._heard_ns) * 1e-9
         return replace(self._intent, age=age)
 
-    def take_start(self) -> PageRequest | None:
-        """The newest wish to start a task, once. With it, what was asked before is forgotten, and from now on a wish to
-        stop holds for the run to come."""
+    def take_halt(self) -> Halt:
+        """A wish to stop, once, for whoever is no run, which ends with the first."""
         self._receive()
-        request, self._start = self._start, None
-        if request is not None:
+        halt = self._intent.halt
+        self._intent = replace(self._intent, halt=Halt.NO)
+        return halt
+
+    def take(self, kind: str) -> PageRequest | None:
+        """The newest wish of a kind of TAKEN, once. With one to start a task, what was asked before is forgotten, and
+        from now on a wish to stop holds for the run to come."""
+        self._receive()
+        request = self._wishes.pop(kind, None)
+        if request is not None and kind == "start":
             self._intent = Intent(request.sequence)
         return request
 
@@ -152,8 +164,8 @@ class PageLink:
         wish = replace(wish, sequence=request.sequence)
         if request.kind == "truth":
             self._shows_truth = request.on
-        elif request.kind == "start":
-            self._start = request
+        elif request.kind in TAKEN:
+            self._wishes[request.kind] = request
         elif request.kind not in OPEN:
             self._heard_ns = self._clock()
             wish = _after(wish, request)

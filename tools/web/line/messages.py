@@ -29,10 +29,12 @@ KINDS: dict[str, dict[str, str]] = {
     "start": {"task": "name", "set": "settings"},  # begin a task
     "stop": {},  # come to rest, be lowered, torque off
     "off": {},  # torque off at once
+    "seek": {"at": "seconds"},  # of a log: go to a moment
+    "play": {"on": "switch"},  # go on from there
     "truth": {"on": "switch"},  # show the simulation's truth
 }
 HALTS = {"stop", "off"}  # which anyone may ask for who may see the page
-OPEN = HALTS | {"look", "take", "truth"}  # which ask for nothing that moves the robot
+OPEN = HALTS | {"look", "take", "truth", "seek", "play"}  # which ask for nothing that moves the robot
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class PageRequest:
     task: str = ""
     set: dict[str, str] = field(default_factory=dict)
     on: bool = False
+    at: float = 0.0  # s
 
     def encode(self) -> bytes:
         """As `parse_request` reads it."""
@@ -131,6 +134,7 @@ def _switch(value: Any) -> bool:
 _READ = {
     "sequence": _sequence,
     "time": lambda value: _number(value, LATEST),
+    "seconds": lambda value: _number(value, LATEST),
     "way": lambda value: _numbers(value, 3, 1.0),
     "place": lambda value: _numbers(value, 2, FARTHEST),
     "text": _filled,

@@ -30,6 +30,9 @@ class RunInfo:
     goal: Array | None = None  # (2,) m in the frame that the robot starts in, where the episode fixes one
     reach: float | None = None  # m around the goal that count as there
     path: Array | None = None  # (n, 2) m, the way that the robot shall walk, in that frame
+    insists: bool = True  # whether a wish to stop that is not heeded is sent as the signal of Ctrl-C
+    length: float | None = None  # s of a log that is looked back into; None: a run
+    events: tuple[Event, ...] = ()  # that are known from the beginning: of a log
     pillars: int | None = None  # how many of the obstacles stand, the first ones; the others roll. None: all stand
 
 
@@ -78,8 +81,9 @@ class Snapshot:
 class Snapshots:
     """Makes snapshots of ticks. It remembers where the robot was when plans were asked for."""
 
-    def __init__(self) -> None:
-        self._first_ns: int | None = None
+    def __init__(self, start_ns: int | None = None) -> None:
+        """`start_ns` is time 0 by the body's clock, by default that of the first tick."""
+        self._first_ns = start_ns
         self._states: deque[tuple[Array, float]] = deque(maxlen=MEMORY)  # displacement and heading of the last ticks
 
     def take(self, record: TickRecord, truth: Truth | None, events: tuple[Event, ...]) -> Snapshot:

@@ -142,7 +142,7 @@ function pad(element, axes) {
 pad(byId("pad-walk"), pads.walk);
 pad(byId("pad-turn"), pads.turn);
 
-byId("stop").onclick = () => send("stop");
+byId("stop").onclick = byId("stop").onpointerdown = () => send("stop");
 byId("off").onclick = () => send("off");
 byId("rest").onclick = () => send("rest");
 byId("end").onclick = () => send("end");
@@ -161,13 +161,23 @@ byId("start").onsubmit = (event) => {
 };
 byId("task").onchange = describe;
 
+// A log that is looked back into.
+let plays = true, drags = false;
+byId("play").onclick = () => { plays = !plays; send("play", { on: plays }); byId("play").textContent = plays ? "Pause" : "Play"; };
+byId("moment").onpointerdown = () => { drags = true; };
+byId("moment").onchange = () => { drags = false; };
+byId("moment").oninput = () => send("seek", { at: Number(byId("moment").value) });
+
 // --- what is shown ----------------------------------------------------------------------------------------------------
 
 function begin() {
   byId("robot").textContent = hello.robot;
   const run = hello.run;
   byId("run").textContent = run ? `${run.title}, ${run.policy}, ${run.backend}` : "";
-  if (!hello.history.length) byId("events").replaceChildren();
+  if (!hello.history.length && !run?.length) byId("events").replaceChildren();
+  byId("timeline").hidden = !run?.length;
+  document.body.classList.toggle("looking-back", Boolean(run?.length));
+  if (run?.length) byId("moment").max = run.length;
   if (byId("joints").tBodies[0].rows.length !== hello.joints.length) makeTable();
   banner();
 }
@@ -209,6 +219,7 @@ function addEvent(message) {
   const line = document.createElement("li");
   line.textContent = `${message.time.toFixed(2)} s  ${text}`;
   line.className = message.what;
+  line.onclick = () => { if (hello?.run?.length) send("seek", { at: Math.max(0, message.time) }); };
   list.append(line);
   while (list.children.length > 300) list.firstChild.remove();
   list.scrollTop = list.scrollHeight;
@@ -249,7 +260,11 @@ function banner() {
 
 function showTick() {
   const phase = byId("phase");
-  phase.textContent = hello?.outcome ? hello.outcome[0].replace("_", " ") : frame.phase;
+  if (hello.run?.length) {
+    if (!drags) byId("moment").value = frame.time;
+    byId("clock").textContent = `${frame.time.toFixed(2)} of ${hello.run.length.toFixed(1)} s`;
+  }
+  phase.textContent = hello.outcome && !hello.run?.length ? hello.outcome[0].replace("_", " ") : frame.phase;
   phase.className = `badge ${frame.phase}`;
   const parts = [
     `${frame.time.toFixed(1)} s`,
@@ -300,15 +315,16 @@ function showPlots() {
   plots.timing.draw(frames, HISTORY, [series((f) => f.late, 0), series((f) => f.busy, 1)]);
 }
 
+// Ten times a second is enough for a person, and leaves a slow machine time for what is asked.
 let drawn = null, plotted = 0;
-function show(now) {
-  requestAnimationFrame(show);
-  if (!hello || !frame || frame === drawn) return;
+function show() {
+  if (!hello || !frame || frame === drawn || document.hidden) return;
   drawn = frame;
   showTick();
   banner();
   map = drawMap(byId("map"), frame, hello.run);
-  if (now - plotted > 200) { plotted = now; showPlots(); }
+  const now = performance.now();
+  if (now - plotted > 300) { plotted = now; showPlots(); }
 }
 
 const view = byId("view");
@@ -330,4 +346,4 @@ if (location.hash === "#flat") flatten("The page was opened without the picture 
 else raise();
 stand();
 connect();
-requestAnimationFrame(show);
+setInterval(show, 100);
