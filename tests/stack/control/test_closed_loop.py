@@ -125,7 +125,7 @@ def test_velocity_goal_and_targets_change_a_plan_and_a_far_goal_is_asked_for_in_
     assert all(not np.allclose(a, b, atol=1e-5) for i, a in enumerate(plans) for b in plans[:i])
     far, further = (plan(Instruction(np.zeros(3), goal=np.array([x, 0.0]))) for x in (2.0, 3.0))
     np.testing.assert_allclose(far, further, atol=1e-6)
-    with pytest.raises(KeyError, match="tail"):
+    with pytest.raises(ConfigError, match="tail"):
         plan(Instruction(np.zeros(3), targets={"tail": np.zeros(3)}))
     with pytest.raises(ConfigError, match="no English word"):
         plan(Instruction(np.zeros(3), text="???"))
@@ -164,6 +164,18 @@ def test_another_sentence_is_planned_for_at_once_and_a_run_is_repeated(checkpoin
     np.testing.assert_array_equal(targets, again)
     np.testing.assert_allclose(targets[:4], np.tile(ROBOT.home, (4, 1)), atol=1e-6)  # held until the first plan
     assert np.abs(targets[5:] - ROBOT.home).max() > 1e-4
+
+
+def test_what_cannot_be_understood_is_said_and_the_last_plan_goes_on(checkpoint: str) -> None:
+    policy, fleet = closed_loop_policy(ROBOT, _settings(checkpoint), shape=(1,)), Fleet(ROBOT, 1, None, seed=0)
+    fleet.reset(np.ones(1, bool))
+    policy.reset(None, np.zeros(1, int))
+    events: list[str] = []
+    for tick in range(26):
+        told = Instruction(np.zeros((1, 3)), text="wave" if tick < 14 else "???")
+        fleet.step(policy.act(fleet.observe(), fleet.applied, told))
+        events += policy.take_events()
+    assert any("no English word" in event and "goes on" in event for event in events)
 
 
 def test_worlds_of_many_plan_together(checkpoint: str) -> None:
