@@ -21,7 +21,7 @@ def prepare(path: Path, size: str) -> tuple[int, int]:
     """
     _check_new(path)
     chosen = _size(size)
-    _choose_drawing()
+    choose_drawing()
     return chosen
 
 
@@ -50,20 +50,22 @@ def _size(text: str) -> tuple[int, int]:
     return size
 
 
-def _choose_drawing() -> None:
-    """Find a way to draw, for MuJoCo to take when it is loaded. Raises ConfigError naming what is missing.
+def choose_drawing(option: str = "--video") -> None:
+    """Find a way to draw, for MuJoCo to take when it is loaded. Raises ConfigError naming what is missing, of `option`.
 
     It is tried in a process of its own: some ways that do not work end the process, and none is to be left open while
     a robot runs.
     """
     if any(find_spec(name) is None for name in ("av", "matplotlib", "PIL")):
-        raise ConfigError("--video: this needs the 'video' extra: pip install 'servoid[video]'")
+        raise ConfigError(f"{option}: this needs the 'video' extra: pip install 'servoid[video]'")
     import av
 
     try:
         av.Codec("libx264", "w")
     except av.error.FFmpegError:
-        raise ConfigError("--video: the installed 'av' cannot write H.264: pip install --force-reinstall av") from None
+        raise ConfigError(
+            f"{option}: the installed 'av' cannot write H.264: pip install --force-reinstall av"
+        ) from None
     asked = os.environ.get("MUJOCO_GL")
     ways = (asked,) if asked else ("glfw", "egl", "osmesa") if os.environ.get("DISPLAY") else ("egl", "osmesa")
     for way in ways:
@@ -77,4 +79,4 @@ def _choose_drawing() -> None:
             return
     others = " or ".join(f"MUJOCO_GL={way}" for way in ("egl", "osmesa") if way != asked)
     hint = f"try {others}" if asked else "install libegl1 (or libosmesa6)"
-    raise ConfigError(f"--video: cannot draw on this machine with {', '.join(ways)}: {hint}")
+    raise ConfigError(f"{option}: cannot draw on this machine with {', '.join(ways)}: {hint}")
