@@ -31,11 +31,15 @@ class CheckpointError(ConfigError):
     """A checkpoint that cannot be used: exit code 2."""
 
 
-def resolve(name: str | Path) -> Path:
-    """Path of a checkpoint: a .safetensors file as it is, or the shipped one of that name. Raises CheckpointError."""
+def resolve(name: str | Path, robot: Robot | None = None) -> Path:
+    """Path of a checkpoint: a .safetensors file as it is; or, of that name, the robot's own, or else the shipped one.
+
+    Raises CheckpointError.
+    """
     path = Path(name)
     if path.suffix != ".safetensors":
-        path = CHECKPOINTS / f"{name}.safetensors"
+        own = None if robot is None else Path(robot.folder) / f"{name}.safetensors"
+        path = own if own is not None and own.is_file() else CHECKPOINTS / f"{name}.safetensors"
     if path.is_file():
         return path
     shipped = sorted(p.stem for p in CHECKPOINTS.glob("*.safetensors"))
@@ -102,6 +106,7 @@ def write(path: Path, tensors: Mapping[str, Array], head: Mapping[str, Any]) -> 
     missing = [key for key in REQUIRED if key not in head]
     if missing:
         raise CheckpointError(f"{path}: the header lacks {', '.join(missing)}")
+    check_out(path, head["joints"])
     content = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     part = path.with_suffix(".part")
     try:
@@ -109,6 +114,14 @@ def write(path: Path, tensors: Mapping[str, Array], head: Mapping[str, Any]) -> 
         part.replace(path)
     except OSError as error:
         raise CheckpointError(f"{path}: cannot write the checkpoint: {error}") from error
+
+
+def check_out(path: Path, joints: Sequence[str]) -> None:
+    """Refuse to write over the checkpoint of a robot with other joints. Raises CheckpointError."""
+    if path.is_file() and list(joints) != (known := read_header(path))["joints"]:
+        raise CheckpointError(
+            f"{path}: is a checkpoint of {known['robot']}, which has other joints: choose another file"
+        )
 
 
 def read_header(path: Path) -> dict[str, Any]:
@@ -156,8 +169,9 @@ def check(path: Path, head: Mapping[str, Any], kind: str, robot: Robot) -> None:
     if head["kind"] != kind:
         raise CheckpointError(f"{path}: holds a {head['kind']} network, but a {kind} network is needed")
     theirs, ours = list(head["joints"]), list(robot.names)
-    # The one network that every run of a robot needs, and that a robot of one's own does not come with.
-    remedy = f"; train it once: servoid train odometry --policy gait --robot FILE --out {path}"
+    # The network that a robot of one's own needs first.
+    own = Path(robot.folder) / f"{path.stem}.safetensors"
+    remedy = f"; train it once: servoid train odometry --policy gait --robot FILE --out {own}"
     remedy = remedy if kind == "odometry" else ""
     if theirs != ours:
         reason = difference(theirs, ours)

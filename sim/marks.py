@@ -10,6 +10,8 @@ import mujoco
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.world import SceneObject
+from servoid.sim.objects import COLOURS, shape
 from servoid.sim.scene import PILLAR_COLOUR, PILLAR_HEIGHT, SPHERE_COLOUR
 
 Colour = tuple[float, float, float, float]
@@ -34,6 +36,7 @@ class Frame:
     plan: Array | None = None  # (n, 2) m: where the robot means to go
     pillars: Array | None = None  # (n, 3) m: x, y, radius
     spheres: Array | None = None  # (n, 3) m: x, y, radius; they lie on the ground
+    objects: tuple[tuple[SceneObject, Array], ...] = ()  # with their poses (7,): x, y, z m, quaternion w x y z
     robots: Array | None = None  # (n, 3): x, y m and heading rad; of their joints nothing is known: at home
     reach: float | None = None  # m around the goal that count as there
     path: Array | None = None  # (n, 2) m: the way that was asked for
@@ -53,6 +56,8 @@ def draw(scene: mujoco.MjvScene, frame: Frame, trail: list[Array]) -> None:
         _add(scene, _GEOM.mjGEOM_CYLINDER, size, np.array([x, y]), half, PILLAR_COLOUR)
     for x, y, radius in frame.spheres if frame.spheres is not None else ():
         _add(scene, _GEOM.mjGEOM_SPHERE, (radius, 0, 0), np.array([x, y]), radius, SPHERE_COLOUR)
+    for thing, pose in frame.objects:
+        _put(scene, thing, pose)
     if frame.push is not None:  # it ends where it pushes
         tip = frame.place + np.array([0.0, 0.0, 0.08])
         tail = tip - PUSH_LENGTH * np.array([*frame.push, 0.0])
@@ -82,6 +87,23 @@ def _connect(
         geom = scene.geoms[scene.ngeom]
         mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.array(colour, dtype=np.float32))
         mujoco.mjv_connector(geom, kind, width, np.asarray(start, dtype=float), np.asarray(end, dtype=float))
+        scene.ngeom += 1
+
+
+def _put(scene: mujoco.MjvScene, thing: SceneObject, pose: Array) -> None:
+    """Add an object in its pose."""
+    if scene.ngeom < scene.maxgeom:
+        kind, size = shape(thing)
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, np.asarray(pose[3:], dtype=float))
+        mujoco.mjv_initGeom(
+            scene.geoms[scene.ngeom],
+            type=kind,
+            size=np.array(size, dtype=float),
+            pos=np.asarray(pose[:3], dtype=float),
+            mat=turn,
+            rgba=np.array(COLOURS[thing.kind], dtype=np.float32),
+        )
         scene.ngeom += 1
 
 

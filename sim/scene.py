@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import mujoco
@@ -10,18 +11,21 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
-from servoid.hw.contracts.world import Percept, Scene, Truth
+from servoid.hw.contracts.world import Percept, Scene, SceneObject, Truth
+from servoid.hw.geometry import headed
 from servoid.sim.multi_robot import ADDED, prefix
+from servoid.sim.objects import add_object
 
 SCENE = f"{ADDED}scene/"  # of the names of a scene's bodies, which follow the robot's
+OBJECTS = f"{SCENE}object"  # and a number
 PILLAR_HEIGHT = 0.4  # m: taller than the robot's shoulders
 PILLAR_COLOUR, SPHERE_COLOUR = (0.55, 0.42, 0.32, 1.0), (0.80, 0.20, 0.20, 1.0)
 FOUND = 1  # data bit of MuJoCo's contact sensor
 
 
 def add_scene(model: mujoco.MjSpec, scene: Scene) -> None:
-    """Add static pillars, mocap spheres and a contact sensor for each of both. Like the floor, they meet all that
-    collides with the floor."""
+    """Add static pillars, mocap spheres and a contact sensor for each of both, and objects. Like the floor, they meet
+    all that collides with the floor."""
     bodies = []
     if len(scene.pillars):
         bodies.append(model.worldbody.add_body(name=f"{SCENE}pillars"))
@@ -39,6 +43,8 @@ def add_scene(model: mujoco.MjSpec, scene: Scene) -> None:
             objname=body.name,
             intprm=[FOUND, 0, 1],
         )
+    for number, thing in enumerate(scene.objects):
+        add_object(model, f"{OBJECTS}{number}", thing)
 
 
 def _add_geom(
@@ -71,7 +77,8 @@ def plain(scene: Scene) -> dict[str, Any]:
     if scene.robots is not None:
         raise ValueError("a virtual rig has one robot, and this scene has others")
     goal = None if scene.goal is None else scene.goal.tolist()
-    return {"pillars": scene.pillars.tolist(), "spheres": scene.spheres.tolist(), "goal": goal}
+    objects = [asdict(thing) for thing in scene.objects]
+    return {"pillars": scene.pillars.tolist(), "spheres": scene.spheres.tolist(), "goal": goal, "objects": objects}
 
 
 def from_plain(values: dict[str, Any]) -> Scene:
@@ -80,6 +87,10 @@ def from_plain(values: dict[str, Any]) -> Scene:
         np.array(values["pillars"], dtype=float).reshape(-1, 3),
         np.array(values["spheres"], dtype=float).reshape(-1, 4),
         None if values["goal"] is None else np.array(values["goal"], dtype=float),
+        objects=tuple(
+            SceneObject(**{**each, "place": tuple(each["place"]), "size": tuple(each["size"])})
+            for each in values["objects"]
+        ),
     )
 
 
@@ -111,9 +122,14 @@ class Stage:
             others = np.arange(len(self.scene.robots) + 1) != self._robot
             places = _seen(self._truth.position[others, :2], base, yaw, state)
             robots = np.column_stack([places, self._truth.yaw[others] + float(state.yaw) - yaw])
+        objects = None
+        if self.scene.objects:
+            objects = self._truth.objects[self._robot].copy()
+            objects[:, :2] = _seen(objects[:, :2], base, yaw, state)
+            objects[:, 3:] = headed(objects[:, 3:], np.full(len(objects), float(state.yaw) - yaw))
         if len(self._spheres):
             self._pursue(base)
-        return Percept(source="scene", age=0.0, goal=goal, obstacles=obstacles, robots=robots)
+        return Percept(source="scene", age=0.0, goal=goal, obstacles=obstacles, robots=robots, objects=objects)
 
     def _pursue(self, base: Array) -> None:
         """Let the spheres roll toward the robot for a tick."""

@@ -9,7 +9,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import turned, up_vector, yaw_of
 from servoid.hw.robot.description import Robot
 from servoid.sim.multi_robot import ADDED
-from servoid.sim.scene import scene_sensors
+from servoid.sim.objects import ObjectsOf
+from servoid.sim.scene import OBJECTS, scene_sensors
 
 FALL_HEIGHT = 0.6  # of the standing height
 FALL_TILT = np.deg2rad(60.0)
@@ -28,6 +29,7 @@ class SimulatedTruth:
         starts = {sensor.name.removeprefix(ADDED): (int(sensor.adr[0]), int(sensor.dim[0])) for sensor in views}
         self._at = {name: slice(start, start + size) for name, (start, size) in starts.items()}
         self._scene = scene_sensors(model)
+        self._objects = ObjectsOf(model, OBJECTS)
         joints = [model.joint(name) for name in robot.names]
         self._joint_qpos = np.array([int(joint.qposadr[0]) for joint in joints])
         self._joint_dof = np.array([int(joint.dofadr[0]) for joint in joints])
@@ -112,6 +114,16 @@ class SimulatedTruth:
         all_contacts = self._sensors[:, self._at["floor"]][:, 0]
         foot_contacts = self._feet("contact")[..., 0].sum(-1)
         return low | (self.tilt > FALL_TILT) | (all_contacts > foot_contacts)
+
+    @property
+    def objects(self) -> Array:
+        """The scene's objects as they are `(n, objects, 7)`: x, y, z m of the middle, quaternion w x y z."""
+        return self._objects.poses(self._qpos)
+
+    @property
+    def object_velocity(self) -> Array:
+        """Velocities of the movable objects `(n, movable objects, 3)` m/s, world frame."""
+        return self._qvel[:, self._objects.qvel[:, :3]]
 
     @property
     def touching(self) -> Array:

@@ -32,6 +32,7 @@ VERBS: dict[str, Verb] = {
     "tasks": Verb("list tasks and their settings", "servoid.tools.commands.tasks"),
     "doctor": Verb("check that this machine is ready", "servoid.tools.commands.doctor"),
     "run": Verb("run a task on a robot", "servoid.tools.commands.run"),
+    "operate": Verb("control a robot from a page in the browser", "servoid.tools.web.operate"),
     "rollout": Verb("run a task many times in simulation and measure it", "servoid.tools.commands.rollout"),
     "virtual": Verb("serve a virtual rig on a serial port", "servoid.tools.commands.virtual"),
     "bringup": Verb(
@@ -66,12 +67,15 @@ VERBS: dict[str, Verb] = {
     "train": Verb(
         "train a network",
         verbs={
-            "expert": Verb("train the tracker of references with PPO", "servoid.tools.learn.trainers.expert"),
+            "tracker": Verb("train the tracker of gait and clips with PPO", "servoid.tools.learn.trainers.tracker"),
             "odometry": Verb("train the correction of leg odometry", "servoid.tools.learn.trainers.odometry"),
             "latent": Verb(
                 "train latent actions for a diffusion model to plan in", "servoid.tools.learn.trainers.latent"
             ),
             "diffusion": Verb("train the diffusion model", "servoid.tools.learn.trainers.diffusion"),
+            "prior": Verb("train a motion prior", "servoid.tools.learn.trainers.prior"),
+            "policy": Verb("train a policy for a task under a motion prior", "servoid.tools.learn.trainers.policy"),
+            "planner": Verb("train the planner of whole-body motion", "servoid.tools.learn.trainers.planner"),
         },
     ),
     "evaluate": Verb("measure a policy as papers do, or as you define", "servoid.tools.commands.evaluate"),
@@ -92,6 +96,7 @@ VERBS: dict[str, Verb] = {
             "fuzz": Verb("feed random bytes to everything that reads bytes", "servoid.tools.faults.fuzz"),
         },
     ),
+    "view": Verb("look at a recorded run in the browser", "servoid.tools.web.view"),
     "replay": Verb("repeat a recorded run and compare", "servoid.tools.commands.replay"),
     "export": Verb("write a recorded run as CSV or Parquet", "servoid.tools.commands.export"),
     "plot": Verb("draw a recorded run", "servoid.tools.commands.plot"),

@@ -80,6 +80,16 @@ class Keyframes:
 
 
 @dataclass(frozen=True, slots=True)
+class DistanceMap:
+    """How far it is to the goal by a free way, on a grid."""
+
+    corner: Array  # (2,) m in the heading frame: where the grid begins
+    yaw: float  # rad, of the grid's first axis in the heading frame
+    size: float  # m, from one point of the grid to the next
+    metres: Array  # (n, m) at its points; more than the way is long beside obstacles, and much more inside them
+
+
+@dataclass(frozen=True, slots=True)
 class Instruction:
     """What a task asks of a policy at a tick."""
 
@@ -90,8 +100,12 @@ class Instruction:
     obstacles: Array | None = None  # (n, 5) in the heading frame: x, y, radius m, velocity m/s; to be kept clear of
     keyframes: Keyframes | None = None
     ground: Array | None = None  # (2,) m/s over the ground in the heading frame, where the task asks for one
+    distances: DistanceMap | None = None  # to the goal by a free way, where the task works that out
     skill: str | None = None  # name of a skill, for as long as that is asked for; None: stand, or walk
     stand: bool = False  # come to rest, and stand: that is all a planner's cost is about, whatever the task wants
+    # Where parts of the body shall be at the end of a plan, by name: m in the heading frame from below the base, a
+    # point of the ground being (2,), others (3,); "heading": rad.
+    targets: Mapping[str, Array] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -16,8 +16,8 @@ from servoid.hw.contracts.control import State
 class Percept:
     """What else a task may know, in the odometry frame, with its age and where it came from.
 
-    `robots` are the others that share the floor, as a camera sees them: where their bases are and where they face. How
-    fast they go, a task tells from where they were before.
+    `objects` are those of the scene, in its order. `robots` are the others that share the floor, as a camera sees them:
+    where their bases are and where they face. How fast they go, a task tells from where they were before.
     """
 
     source: str  # "task", "scene", or the name of an external feed
@@ -25,19 +25,50 @@ class Percept:
     goal: Array | None = None  # (2,) m
     obstacles: Array | None = None  # (n, 3) m: x, y, radius
     robots: Array | None = None  # (n, 3): x, y m and heading rad
+    objects: Array | None = None  # (n, 7): x, y, z m of the middle, quaternion w x y z
+
+
+@dataclass(frozen=True, slots=True)
+class SceneObject:
+    """A thing with a body of its own: a ball that rolls and a bag that stands and falls, or a seat, which is fixed.
+
+    Raises ValueError for a size or mass that no thing has.
+    """
+
+    kind: Literal["ball", "bag", "seat"]
+    place: tuple[float, float]  # m, its middle, in the frame that the robot starts in
+    size: tuple[float, float, float]  # m along its x, y and z; of a ball the first, its diameter
+    mass: float = 0.0  # kg; of a seat it is not asked for
+    heading: float = 0.0  # rad
+
+    def __post_init__(self) -> None:
+        if min(self.size) <= 0.0:
+            raise ValueError(f"size: must be positive, not {min(self.size):g}")
+        if self.movable and self.mass <= 0.0:
+            raise ValueError(f"mass: must be positive, not {self.mass:g}")
+
+    @property
+    def movable(self) -> bool:
+        return self.kind != "seat"
+
+    @property
+    def height(self) -> float:
+        """Of the middle of one that stands on the ground [m]."""
+        return (self.size[0] if self.kind == "ball" else self.size[2]) / 2
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
     """What a task puts into a simulated world, on its floor, in the frame that the robot starts in: x ahead.
 
-    In a percept, obstacles are the pillars followed by the spheres.
+    In a percept, obstacles are the pillars followed by the spheres. Objects may be touched.
     """
 
     pillars: Array  # (n, 3) m: x, y, radius; they stand where they are
     spheres: Array  # (m, 4): x, y, radius m and speed m/s; they roll straight toward the robot
     goal: Array | None = None  # (2,) m, a mark on the floor that the robot sees
     robots: Array | None = None  # (n, 5): where the other robots start, x, y m and heading rad, and their goals, x, y m
+    objects: tuple[SceneObject, ...] = ()
 
 
 class Surroundings(Protocol):
@@ -105,6 +136,11 @@ class Truth(Protocol):
         ...
 
     @property
+    def objects(self) -> Array:
+        """The scene's objects as they are `(n, objects, 7)`: x, y, z m of the middle, quaternion w x y z."""
+        ...
+
+    @property
     def touching(self) -> Array:
         """Whether each body touches an obstacle of the scene, or another robot, or did within the last tick `(n,)`."""
         ...
@@ -125,6 +161,7 @@ class Start:
     velocity: Array | None = None  # (n, 3) m/s of the base, world frame
     angular_velocity: Array | None = None  # (n, 3) rad/s, base frame
     joint_velocity: Array | None = None  # (n, n_joints) rad/s
+    objects: Array | None = None  # (n, movable objects, 7) where they are, at rest; None: as the scene has them
 
     def of(self, ids: Array) -> Start:
         """The rows `ids` `(k,)`."""
@@ -147,6 +184,10 @@ class World(Protocol):
     def observe(self) -> Observation: ...
 
     def step(self, command: Command) -> None: ...
+
+    def put(self, ids: Array, objects: Array) -> None:
+        """Put the movable objects of the worlds `ids` `(k,)` to poses `(k, movable objects, 7)`, at rest."""
+        ...
 
     def push(self, velocity: Array) -> None:
         """Change the bases' velocity by `(n, 2)` m/s, world frame."""

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from servoid.hw.robot.description import Axes, Foot, Link, Robot
 
 _ALIKE = 1e-4  # m: a chain that the robot's file gives, too, must be the MJCF's so far
+_PITCHES = 0.7  # of an axis: its part along the base's y
 _ASTRAY = 0.01  # m that a given sole may lie beside the foot's geoms
 
 
@@ -60,7 +61,7 @@ def with_body(robot: Robot, marks: Marks) -> Robot:
                 f"{len(next(iter(legs.values())))}: legs need the same number of joints",
             )
     _check_given(robot, legs, marks)
-    robot = replace(robot, legs=legs, feet=feet)
+    robot = replace(robot, legs=legs, feet=feet, arms=_arms(model, robot, legs))
     if np.isnan(robot.standing_height):
         robot = replace(robot, standing_height=float(Legs(robot).stand(robot.home)[0]))
     return robot
@@ -94,32 +95,51 @@ def _chain(model: mujoco.MjModel, robot: Robot, side: str, marks: Marks) -> _Cha
     bodies = [int(model.geom(name).bodyid[0]) for name in robot.feet[side].geoms]
     if len({int(model.body_weldid[body]) for body in bodies}) > 1:
         raise marks.error(key, "the geoms are on bodies that move against each other: a foot is one body")
-    base = int(model.body(robot.base).id)
+    chain = _walk(model, int(model.body(robot.base).id), bodies[0])
+    for name in chain.joints:
+        if int(model.joint(name).type[0]) != mujoco.mjtJoint.mjJNT_HINGE:
+            raise marks.error(key, f"{name!r}, on the way from the base to it, is not a hinge, but a servo turns")
+        if name not in robot.names:
+            raise marks.error(key, f"{name!r}, on the way from the base to it, has no servo: its angle is not known")
+    if not chain.joints:
+        raise marks.error(key, f"no joint leads from the base {robot.base!r} to this foot")
+    return chain
+
+
+def _walk(model: mujoco.MjModel, base: int, end: int) -> _Chain:
+    """The chain from the base to any body that hangs on it."""
     path: list[int] = []
-    body = bodies[0]
-    while body != base:
-        path.insert(0, body)
-        body = int(model.body_parentid[body])
+    while end != base:
+        path.insert(0, end)
+        end = int(model.body_parentid[end])
     place, turn = np.zeros(3), np.eye(3)
     joints, offsets, axes = [], [], []
     for body in path:
         place = place + turn @ model.body_pos[body]
         turn = turn @ rotation_matrix(model.body_quat[body])
         for j in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
-            name = model.joint(j).name
-            if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
-                raise marks.error(key, f"{name!r}, on the way from the base to it, is not a hinge, but a servo turns")
-            if name not in robot.names:
-                raise marks.error(
-                    key, f"{name!r}, on the way from the base to it, has no servo: its angle is not known"
-                )
-            joints.append(name)
+            joints.append(model.joint(j).name)
             offsets.append(place + turn @ model.jnt_pos[j])
             axes.append(turn @ model.jnt_axis[j])
             place = place - offsets[-1]
-    if not joints:
-        raise marks.error(key, f"no joint leads from the base {robot.base!r} to this foot")
     return _Chain(tuple(joints), np.array(offsets), np.array(axes), place, turn)
+
+
+def _arms(model: mujoco.MjModel, robot: Robot, legs: dict[str, tuple[Link, ...]]) -> dict[str, float]:
+    """Joints that swing an arm, in no leg and with another in the mirror: of each arm the first that pitches; and the
+    sign by which it swings the left arm back and the right one forward."""
+    in_legs = {link.joint for leg in legs.values() for link in leg}
+    base, found = int(model.body(robot.base).id), dict[str, float]()
+    for joint in robot.joints:
+        if joint.name in in_legs or joint.mirror == joint.name:
+            continue
+        chain = _walk(model, base, int(model.jnt_bodyid[model.joint(joint.name).id]))
+        last = chain.joints.index(joint.name)
+        pitches = [name for name, axis in zip(chain.joints, chain.axes, strict=True) if abs(axis[1]) > _PITCHES]
+        if pitches[:1] == [joint.name]:
+            side = np.sign(chain.offsets[: last + 1, 1].sum())
+            found[joint.name] = float(side * np.sign(chain.axes[last, 1]))
+    return found
 
 
 def _check_imu(model: mujoco.MjModel, robot: Robot, marks: Marks) -> None:

@@ -45,6 +45,7 @@ class Legs:
         body, axes = np.array([foot.body_axes for foot in feet]), np.array([foot.axes for foot in feet])
         turn = body @ axes
         self._foot = None if np.array_equal(turn, np.broadcast_to(np.eye(3), turn.shape)) else turn
+        self.level = self._foot is None  # whether soles are along the base's axes at zero angles
         at = np.array([foot.body_place for foot in feet]) + np.einsum("lij,lj->li", body, [foot.sole for foot in feet])
         self.sole = np.einsum("lji,lj->li", turn, at)  # (legs, 3) in the foot's frame
         signs = np.array([[sx, sy, 0.0] for sx in (1, -1) for sy in (1, -1)])
@@ -115,14 +116,24 @@ class LegInverse:
 
     ORDER = np.array([2, 0, 1, 1, 1, 0])  # coordinate axis of each joint: z x y y y x
 
-    def __init__(self, legs: Legs, name: str) -> None:
+    @classmethod
+    def misfit(cls, legs: Legs) -> str | None:
+        """Why it does not hold for these legs; None if it does."""
         axis, offset = legs.axis, legs.offset
-        if axis.shape[1] != 6 or not np.array_equal(np.abs(axis).argmax(-1), np.tile(self.ORDER, (len(axis), 1))):
-            raise ConfigError(f"{name}: legs: the gait needs legs of yaw, roll, pitch, knee, ankle pitch, ankle roll")
+        if axis.shape[1] != 6 or not np.array_equal(np.abs(axis).argmax(-1), np.tile(cls.ORDER, (len(axis), 1))):
+            return "legs are not of yaw, roll, pitch, knee, ankle pitch, ankle roll"
+        if np.abs(axis).max(-1).min() < 1 - 1e-6 or not legs.level:
+            return "an axis or a sole is not along the base's axes at zero angles"
         hip = [offset[:, 1, 1], offset[:, 1, 0] + offset[:, 2, 0], offset[:, 2, 2]]  # between the axes
         leg = [offset[:, 3, 0], offset[:, 4, 0], offset[:, 5, 2], offset[:, 2:, 1].sum(-1)]  # off the straight line
         if np.abs([*hip, *leg]).max() > 1e-3:
-            raise ConfigError(f"{name}: legs: the gait needs axes that meet in a point at the hip and at the ankle")
+            return "the axes do not meet in a point at the hip and at the ankle"
+        return None
+
+    def __init__(self, legs: Legs, name: str) -> None:
+        axis, offset = legs.axis, legs.offset
+        if (why := self.misfit(legs)) is not None:
+            raise ConfigError(f"{name}: {why}")
         self.sign = np.take_along_axis(axis, np.tile(self.ORDER, (len(axis), 1))[..., None], -1)[..., 0]
         self.thigh, self.shank = -offset[:, 3, 2], -offset[:, 4, 2]
         # The pitch joints lie beside the leg's plane: their sideways offset is undone at the ankle.

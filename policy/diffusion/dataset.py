@@ -19,8 +19,6 @@ from servoid.policy.recording import DatasetError, Recording
 from servoid.policy.text.captions import MOTIONS, mirrored, motion_of
 from servoid.policy.text.encoder import load_encoder
 
-HELD_OUT = 0.02
-
 
 class Captions:
     """Encoded phrasings of each tick's command: what the windows are told."""
@@ -54,17 +52,15 @@ class Windows:
         recording: Recording,
         robot: Robot,
         config: DenoiserConfig,
+        held_out: float = 0.02,
         emphasis: float = 0.0,
         seed: int = 0,
         latents: LatentActions | None = None,
-        changes: bool = False,
     ) -> None:
-        """A share `HELD_OUT` of the episodes, evenly spread and at least one, is kept for validation.
+        """A share `held_out` of the episodes, evenly spread and at least one, is kept for validation.
 
         `emphasis` of global states, drawn from `seed`: see `features.Emphasis`; 0 for none. With `latents` actions are
-        the posterior means of what was demonstrated, each given the state of its tick, instead of joint targets. With
-        `changes` windows over which the command changes count too: they show starts, stops and turns, and are told
-        nothing, since one that changes on the way leads anywhere.
+        the posterior means of what was demonstrated, each given the state of its tick, instead of joint targets.
         """
         self.config = config
         self.n_joints = len(robot.joints)
@@ -78,13 +74,14 @@ class Windows:
                 f"{len(long)} of {len(spans)} episodes are longer than the {first + last + 1} ticks of a window, "
                 "and two are needed; record longer ones"
             )
-        every = round(1 / HELD_OUT)
+        every = max(2, round(1 / held_out))
         kept = np.arange(len(long)) % every == 0
+        # A window shows what one command does: one that changes on the way leads anywhere, and a robot that stands, and
+        # may start at any tick to come, puts it off for ever. Starts and stops are where a command is new.
         change = np.r_[True, np.any(np.diff(recording.command, axis=0) != 0.0, axis=1)]
         segment = np.cumsum(change)
-        self._steady = torch.from_numpy(segment[:-last] == segment[last - 1 : -1])  # from a row on, through a window
-        self.validation = self._presents(long[kept], first, last, changes)
-        self.training = self._presents(long[~kept], first, last, changes)
+        self.validation = self._presents(long[kept], first, last, segment)
+        self.training = self._presents(long[~kept], first, last, segment)
         if not len(self.training) or not len(self.validation):
             raise DatasetError(f"no command lasts for the {last} ticks that a window looks ahead; use longer ones")
         self._raw = torch.from_numpy(recording.raw)
@@ -98,10 +95,11 @@ class Windows:
             states = Emphasis.of(states, self.n_joints, emphasis, seed)
         self.states, self.actions = states.to_torch(), actions.to_torch()
 
-    def _presents(self, spans: Array, before: int, after: int, changes: bool) -> Tensor:
-        """Rows that can be the present of a window; with `changes` those from which the command changes, too."""
-        rows = torch.from_numpy(np.concatenate([np.arange(a + before, b - after) for a, b in spans]))
-        return rows if changes else rows[self._steady[rows]]
+    @staticmethod
+    def _presents(spans: Array, before: int, after: int, segment: Array) -> Tensor:
+        """Rows that can be the present of a window. `segment` `(rows,)` numbers the commands."""
+        rows = np.concatenate([np.arange(a + before, b - after) for a, b in spans])
+        return torch.from_numpy(rows[segment[rows] == segment[rows + after - 1]])
 
     def _both_sides(self, raw: Array, targets: Array, mirror: Mirror) -> Tensor:
         """Actions of all rows as they are and as a mirror shows them, `(2, rows, action size)` float32."""
@@ -135,25 +133,21 @@ class Windows:
     def draw(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor | None]:
         """A normalised training batch, each window mirrored with probability one half.
 
-        Shapes `(batch, state tokens, state size)`, `(batch, action tokens, action size)`, `(batch, text size)`, NaN for
-        a window that is told nothing; without an encoder the last is None.
+        Shapes `(batch, state tokens, state size)`, `(batch, action tokens, action size)`, `(batch, text size)`;
+        without an encoder the last is None.
         """
         present = self.training[torch.randint(len(self.training), (batch,), generator=generator)]
         mirrored = torch.rand(batch, generator=generator) < 0.5
-        return *self._encode(self._gather(present, mirrored)), self._told(present, mirrored, generator)
+        text = self.captions.of(present, mirrored, generator) if self.captions else None
+        return *self._encode(self._gather(present, mirrored)), text
 
     def held_out(self, count: int) -> tuple[Tensor, Tensor, Tensor | None]:
         """Up to `count` normalised validation windows, the same every time."""
         pick = torch.linspace(0, len(self.validation) - 1, min(count, len(self.validation))).long()
         present = self.validation[pick]
         mirrored = torch.arange(len(present)) % 2 == 1
-        return *self._encode(self._gather(present, mirrored)), self._told(present, mirrored)
-
-    def _told(self, present: Tensor, mirrored: Tensor, generator: torch.Generator | None = None) -> Tensor | None:
-        if self.captions is None:
-            return None
-        text = self.captions.of(present, mirrored, generator)
-        return torch.where(self._steady[present][:, None], text, torch.nan)
+        text = self.captions.of(present, mirrored) if self.captions else None
+        return *self._encode(self._gather(present, mirrored)), text
 
     def _encode(self, window: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         states, actions = window

@@ -109,16 +109,13 @@ def losses(
 ) -> tuple[Tensor, Tensor]:
     """State and action losses of a batch of clean windows: squared error of the predicted clean tokens (x0).
 
-    One window in ten is shown without its instruction `text` `(batch, text_size)`, for classifier-free guidance, and so
-    are those that have none (NaN).
+    One window in ten is shown without its instruction `text` `(batch, text_size)`, for classifier-free guidance.
     """
     config = denoiser.config
     state_levels, action_levels = draw_levels(config, len(states), generator, objective)
     noisy_states = add_noise(states, state_levels, signal, generator)
     noisy_actions = add_noise(actions, action_levels, signal, generator)
     text_mask = torch.rand(len(states), generator=generator) >= UNTOLD
-    if text is not None:
-        text_mask, text = text_mask & text.isfinite().all(1), text.nan_to_num()
     clean_states, clean_actions = denoiser(noisy_states, noisy_actions, state_levels, action_levels, text, text_mask)
     state_weight, weight = (level_weight(x, signal, objective.min_snr) for x in (state_levels, action_levels))
     weight = weight * action_weight(config, objective.near_actions, objective.far_actions)

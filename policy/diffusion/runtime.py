@@ -262,14 +262,24 @@ class Runtime:
             value: Tensor = cost(Trajectory.of(tokens, self._joints, self._dt, self.ticks), instruction)
             return value
 
-        settings = self.settings.guidance
-        shared = self.samples if settings.choose == "mean" else 1
-        return Guidance(of_states, settings.weight, settings.clip, settings.gradient, shared)
+        chosen = self.settings.guidance
+        shared = self.samples if chosen.choose == "mean" else 1
+        return Guidance(
+            of_states,
+            chosen.weight,
+            chosen.clip,
+            chosen.gradient,
+            shared,
+            scaled=chosen.scaled,
+            even=chosen.even,
+            limited=chosen.limited,
+            repeats=chosen.repeats,
+        )
 
 
 def load_runtime(robot: Robot, settings: DiffusionSettings, cost: Cost | None = None) -> Runtime:
     """The runtime of the checkpoint that `settings` name, for `robot`. Raises ConfigError."""
-    return Runtime(load(resolve(settings.checkpoint), robot), settings, robot, cost)
+    return Runtime(load(resolve(settings.checkpoint, robot), robot), settings, robot, cost)
 
 
 def _repeat(instruction: Instruction, samples: int) -> Instruction:

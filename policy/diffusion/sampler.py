@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from servoid.hw.contracts.body import Array
-from servoid.policy.diffusion.guidance import NETWORK, Guidance, Predictor
+from servoid.policy.diffusion.guidance import DenoisingStep, Guidance, Predictor
 from servoid.policy.diffusion.schedule import DenoisingMatrix
 
 
@@ -36,18 +36,6 @@ class Known:
 def draw_noise(generators: Sequence[torch.Generator], tokens: int, features: int) -> Tensor:
     """Noise `(batch, tokens, features)`, one generator a sample, so that a sample does not depend on its batch."""
     return torch.stack([torch.randn(tokens, features, generator=g) for g in generators])
-
-
-@dataclass(frozen=True)
-class DenoisingStep:
-    """One call's step of all tokens; factors are `(tokens, 1)`, the square roots of what they are of."""
-
-    moving: Tensor  # (tokens,) bool: the others are left alone
-    signal_before: Tensor
-    noise_before: Tensor
-    signal_after: Tensor
-    noise_after: Tensor  # of the noise that is kept
-    noise_fresh: Tensor  # of that which is drawn anew
 
 
 class Sampler:
@@ -89,38 +77,15 @@ class Sampler:
             # Once all states are finished, guidance has nothing to move.
             steering = guidance if of_states.moving.any() else None
             levels = shown[0][call], shown[1][call]
-            clean_states, clean_actions = self._call(states, actions, *levels, of_states.moving, steering)
+            if steering is None:
+                clean_states, clean_actions = self._predict(states, actions, *levels)
+            else:
+                clean_states, clean_actions = steering.predict(self._predict, states, actions, levels, of_states)
             if known.impute is not None:
                 clean_states = known.impute(clean_states)
             states = self._step(states, clean_states, of_states, generators)
             actions = self._step(actions, clean_actions, of_actions, generators)
         return states, actions
-
-    def _call(
-        self,
-        states: Tensor,
-        actions: Tensor,
-        state_levels: Tensor,
-        action_levels: Tensor,
-        moving: Tensor,
-        guidance: Guidance | None,
-    ) -> tuple[Tensor, Tensor]:
-        """One network call, its `moving` states moved by guidance."""
-        levels = state_levels, action_levels
-        if guidance is None:
-            return self._predict(states, actions, *levels)
-        if guidance.gradient == NETWORK:
-            with torch.enable_grad():
-                source = states.detach().requires_grad_()
-                clean_states, clean_actions = self._predict(source, actions, *levels)
-                (gradient,) = torch.autograd.grad(guidance.cost(clean_states).sum(), source)
-            clean_states, clean_actions = clean_states.detach(), clean_actions.detach()
-        else:
-            clean_states, clean_actions = self._predict(states, actions, *levels)
-            with torch.enable_grad():
-                source = clean_states.detach().requires_grad_()
-                (gradient,) = torch.autograd.grad(guidance.cost(source).sum(), source)
-        return clean_states - guidance.step(gradient, moving), clean_actions
 
     def _steps(self, rows: Tensor) -> list[DenoisingStep]:
         """The steps between the rows `(calls + 1, tokens)` of a denoising matrix."""

@@ -40,14 +40,19 @@ class GuidanceSettings:
     gradient: str = "analytic"
     samples: int = 1  # windows denoised side by side for one plan
     choose: str = "mean"  # of them. mean: they share the mean gradient, the first is run; best: the cheapest is run
+    scaled: bool = False  # steps are scaled by what is uncertain at their noise level
+    even: bool = False  # each token's gradient has the same norm
+    limited: bool = False  # no step is longer than to where the cost would be zero
+    repeats: int = 1  # gradient steps a network call, which share weight and clip
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.weight) and self.weight >= 0 and self.clip > 0):
             raise ValueError(
                 f"weight must be a number that is not negative and clip positive, not {self.weight}, {self.clip}"
             )
-        if self.samples < 1:
-            raise ValueError(f"samples must be at least 1, not {self.samples}")
+        for name, count in (("samples", self.samples), ("repeats", self.repeats)):
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, not {count}")
         for name, value, known in (
             ("gradient", self.gradient, ("analytic", "network")),
             ("choose", self.choose, ("mean", "best")),

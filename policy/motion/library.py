@@ -20,11 +20,17 @@ class Library:
             raise ConfigError(f"{folder}: no such folder of clips")
         self.robot, self.folder = robot, folder
         self._paths: dict[str, Path] = {}
+        self._robots: dict[str, str] = {}
         for path in sorted(folder.glob(f"*{SUFFIX}")):
-            name = read_about(path)[0]
+            name, _, head = read_about(path)
             if name in self._paths:
                 raise ConfigError(f"{path}: holds a clip called '{name}', and so does {self._paths[name].name}")
-            self._paths[name] = path
+            self._paths[name], self._robots[name] = path, head["robot"]
+
+    @property
+    def fitting(self) -> tuple[str, ...]:
+        """Names of the clips that are of this robot."""
+        return tuple(name for name, robot in self._robots.items() if robot == self.robot.name)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -46,7 +52,7 @@ class Library:
         if not replace and (clip.name in self._paths or path.exists()):
             raise ConfigError(f"{path}: already exists: choose another name, or --replace")
         save(clip, path, self.robot)
-        self._paths[clip.name] = path
+        self._paths[clip.name], self._robots[clip.name] = path, self.robot.name
         return path
 
 

@@ -6,7 +6,7 @@ one robot or many worlds: arrays carry any leading dimensions.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -16,9 +16,11 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Reference, ReferenceFrames
 from servoid.hw.geometry import headed, joined, turned
 from servoid.hw.robot.description import Robot
-from servoid.hw.robot.legs import LegInverse, Legs
+from servoid.hw.robot.inverse import leg_inverse, stance_at_home
+from servoid.hw.robot.legs import Legs
 
 _SMOOTH = 0.3  # of a smooth swing's easing that is left at full speed
+_ANKLE = 0.4  # of a leg's length: joints this near the sole belong to the ankle
 _ACROSS = 5.0  # rad/s of turning that weigh as much as 1 m/s sideways
 
 
@@ -49,8 +51,39 @@ class GaitSettings:
 
 @cache
 def load_gait(name: str = "gait") -> GaitSettings:
-    """By a name in configs/policies/, or by file: `Robot.gait` says which. Raises ConfigError."""
+    """By a name in configs/policies/, or by file. Raises ConfigError."""
     return load_yaml(resolve("policies", name), GaitSettings)
+
+
+def gait_of(robot: Robot) -> GaitSettings:
+    """Settings of the robot's own gait; where it has none, the shipped one's, scaled to its legs and its stance at
+    home, which no one has tried. Raises ConfigError."""
+    if robot.gait:
+        return load_gait(robot.gait)
+    shipped, stance = load_gait(), stance_at_home(robot, Legs(robot))
+    size = stance.height / shipped.height
+    time = float(np.sqrt(size))  # alike robots walk alike: a Froude number keeps lengths, and times to their root
+    beside = np.sign(stance.hip[:, 1]) * (stance.ankle[:, 1] - stance.hip[:, 1])
+    forward, sideways, turning = shipped.max_velocity
+    ahead, aside, around = shipped.acceleration
+    low, high = shipped.even_swing
+    return replace(
+        shipped,
+        cycle=shipped.cycle * time,
+        height=stance.height,
+        foot_forward=float((stance.ankle[:, 0] - stance.hip[:, 0]).mean()),
+        foot_apart=float(beside.mean()),
+        lean=stance.lean,
+        lift=shipped.lift * size,
+        sway=shipped.sway * size,
+        arm_swing=shipped.arm_swing / time,
+        backward_lean=shipped.backward_lean / time,
+        backward_shift=shipped.backward_shift * time,
+        max_velocity=(forward * time, sideways * time, turning / time),
+        max_backward=shipped.max_backward * time,
+        even_swing=(low * time, high * time),
+        acceleration=(ahead, aside, around / size),
+    )
 
 
 class Gait(Reference):
@@ -60,17 +93,13 @@ class Gait(Reference):
     """
 
     def __init__(self, robot: Robot, shape: tuple[int, ...] = (), settings: GaitSettings | None = None) -> None:
-        """`shape` are the leading dimensions; `settings` are by default those of the robot's file.
-
-        Raises ConfigError for legs of another build than `LegInverse` can bend.
-        """
-        self.robot, self.settings = robot, settings or load_gait(robot.gait)
+        """`shape` are the leading dimensions; `settings` are by default those of `gait_of`. Raises ConfigError."""
+        self.robot, self.settings = robot, settings or gait_of(robot)
         settings = self.settings
-        legs = Legs(robot)
-        self._inverse, self._index = LegInverse(legs, robot.name), legs.index
+        self._inverse, self._index = leg_inverse(robot), Legs(robot).index
         self._side = np.sign(self._inverse.hip[:, 1])  # 1 left, -1 right
         self._shift = np.where(self._side > 0, 0.0, 0.5)  # the right foot steps half a cycle later
-        self._arm = [robot.names.index(name) for name in ("l_sho_pitch", "r_sho_pitch") if name in robot.names]
+        self._arms = [(robot.names.index(name), sign) for name, sign in robot.arms.items()]
         self.upper = np.array(settings.max_velocity)  # that can be asked, and the same to the other sides:
         self.lower = -np.array([settings.max_backward, *settings.max_velocity[1:]])
         self._slew = np.array(settings.acceleration) * robot.dt
@@ -188,21 +217,20 @@ class Gait(Reference):
         joints = np.broadcast_to(self.robot.home, (*phase.shape, len(self.robot.home))).copy()
         joints[..., self._index] = legs
         swing = s.arm_swing * velocity[..., 0] * np.sin(2 * np.pi * phase) * activity
-        for arm in self._arm:  # the two shoulders' axes oppose, so one sign swings them against each other
-            joints[..., arm] += swing
+        for arm, sign in self._arms:
+            joints[..., arm] += sign * swing
         contact = np.where(swinging & (activity > 0)[..., None], 0.0, 1.0)
         return joints, contact
 
 
 class GyroFeedback:
-    """Adds to the ankles what the gyro says: the baseline's only balance."""
+    """Adds to the ankles what the gyro says: the baseline's only balance. An ankle that does not roll, or pitch, cannot
+    help."""
 
     def __init__(self, robot: Robot, settings: GaitSettings | None = None) -> None:
-        settings = settings or load_gait(robot.gait)
-        inverse = LegInverse(Legs(robot), robot.name)
-        index = Legs(robot).index
-        self._pitch, self._pitch_sign = index[:, 4], inverse.sign[:, 4]
-        self._roll, self._roll_sign = index[:, 5], inverse.sign[:, 5]
+        settings = settings or gait_of(robot)
+        self._pitch, self._pitch_sign = _ankles(robot, 1)
+        self._roll, self._roll_sign = _ankles(robot, 0)
         self._gains = settings.ankle_pitch_gain, settings.ankle_roll_gain
 
     def __call__(self, joints: Array, angular_velocity: Array) -> Array:
@@ -211,3 +239,19 @@ class GyroFeedback:
         out[..., self._pitch] += self._gains[0] * angular_velocity[..., 1:2] * self._pitch_sign
         out[..., self._roll] += self._gains[1] * angular_velocity[..., 0:1] * self._roll_sign
         return out
+
+
+def _ankles(robot: Robot, axis: int) -> tuple[Array, Array]:
+    """Numbers of the legs' last joints that turn a foot about this axis of the base at home, and their signs."""
+    legs = Legs(robot)
+    q = legs.pick(robot.home)
+    soles, (_, _, origins, axes) = legs.soles(q)[0], legs.forward(q)
+    length = np.linalg.norm(origins[:, 0] - soles, axis=-1)
+    numbers, signs = [], []
+    for leg, joints in enumerate(legs.index):
+        near = np.linalg.norm(origins[leg] - soles[leg], axis=-1) < _ANKLE * length[leg]
+        found = np.flatnonzero(near & (np.abs(axes[leg, :, axis]) > 0.7))
+        if len(found):
+            numbers.append(joints[found[-1]])
+            signs.append(np.sign(axes[leg, found[-1], axis]))
+    return np.array(numbers, int), np.array(signs)

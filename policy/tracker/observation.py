@@ -9,10 +9,12 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import ReferenceFrames, State
+from servoid.hw.geometry import up_vector
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.mirror import Mirror
 
-AHEAD = np.array([0, 3, 8])  # ticks ahead that the tracker sees of its reference
+AHEAD = np.array([0, 3, 8])  # ticks ahead that a tracker of the gait sees of it
+FURTHER = np.array([0, 3, 8, 16])  # and one of any reference
 RESIDUAL = 0.3  # rad of joint target for an action of one
 _HISTORY = 4  # past ticks of joints and gyro
 # Past commands before the last one: a command takes up to 40 ms to the motor, and what it does up to 12 ms back.
@@ -20,29 +22,37 @@ _COMMANDS = 3
 
 
 class TrackerObservation:
-    """Builds observations `(..., size)` float32; keeps the short history. `shape` are the leading dimensions."""
+    """Builds observations `(..., size)` float32; keeps the short history. `shape` are the leading dimensions.
 
-    def __init__(self, robot: Robot, shape: tuple[int, ...] = ()) -> None:
-        self._home, self._walking = robot.home, robot.walking
+    With `clips` they are those of a tracker of any reference, which may lie, turn over and hurry; else of the gait.
+    """
+
+    def __init__(self, robot: Robot, shape: tuple[int, ...] = (), *, clips: bool = False) -> None:
+        self._home, self._walking, self._clips = robot.home, robot.walking, clips
+        self.ahead = FURTHER if clips else AHEAD  # ticks that `frames` are to be asked for
         n, feet = len(robot.joints), len(robot.feet)
         self._past = np.zeros((*shape, _HISTORY, n + 3))
         self._before = np.zeros((*shape, _COMMANDS, n))  # newest first
         self._fresh = np.ones(shape, bool)
-        self.size = 3 + 3 + 2 + 1 + feet + (3 + _COMMANDS) * n + _HISTORY * (n + 3) + len(AHEAD) * (n + 4 + feet)
-        joints, swapped, look = Mirror.joints(robot), Mirror.feet(robot), len(AHEAD)
+        look = len(self.ahead)
+        self.size = 3 + 3 + 2 + 1 + feet + (3 + _COMMANDS) * n + _HISTORY * (n + 3) + look * (n + 4 + feet)
+        joints, swapped = Mirror.joints(robot), Mirror.feet(robot)
         self.mirror = Mirror.join(
             Mirror.VECTOR, Mirror.ROTATION, Mirror.PLANAR, Mirror.SCALAR, swapped, *[joints] * (3 + _COMMANDS),
             *[joints, Mirror.ROTATION] * _HISTORY,
             *[joints] * look, *[Mirror.PLANAR] * look, *[Mirror.FLIPPED] * look, *[Mirror.SCALAR] * look,
             *[swapped] * look,
         )  # fmt: skip
+        if clips:
+            self.size += 3 * look + n
+            self.mirror = Mirror.join(self.mirror, *[Mirror.VECTOR] * look, joints)
 
     def reset(self, where: Array | None = None) -> None:
         """Forget the history in the worlds `where` (default: all)."""
         self._fresh = np.ones_like(self._fresh) if where is None else self._fresh | where
 
     def __call__(self, state: State, applied: Array, frames: ReferenceFrames) -> Array:
-        """Observe, once a tick. `applied` `(..., n_joints)` rad is what was commanded last; `frames` are at AHEAD."""
+        """Observe, once a tick. `applied` `(..., n_joints)` rad is what was commanded last; `frames` are at `ahead`."""
         joints = state.position - self._home
         row = np.concatenate([joints, 0.25 * state.angular_velocity], -1)
         if self._fresh.any():
@@ -51,6 +61,14 @@ class TrackerObservation:
             self._fresh = np.zeros_like(self._fresh)
         lead, m = state.yaw.shape, self._walking
         rise = 2.5 / m.height  # heights are seen from that of walking, speeds as shares of the fastest
+        reference = (
+            []
+            if not self._clips
+            else [
+                -up_vector(frames.root_orientation).reshape(*lead, -1),
+                0.1 * frames.joint_velocity[..., 0, :],
+            ]
+        )
         observation = np.concatenate(
             [
                 state.gravity,
@@ -68,6 +86,7 @@ class TrackerObservation:
                 frames.yaw_rate,
                 rise * (frames.height - m.height),
                 frames.contact.reshape(*lead, -1),
+                *reference,
             ],
             -1,
         ).astype(np.float32)

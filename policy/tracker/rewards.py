@@ -34,6 +34,10 @@ class Step:
     reference_height: Array  # (n,)
     reference_joints: Array  # (n, n_joints)
     reference_contact: Array  # (n, n_feet)
+    reference_gravity: Array  # (n, 3) base frame of the reference
+    residual: Array  # (n, n_joints) rad: what the tracker added to the reference, the last three, newest first
+    residual1: Array
+    residual2: Array
     fallen: Array  # (n,)
     walking: Walking  # of the robot: what is far, fast and high depends on its size
     weight: float  # N
@@ -43,15 +47,20 @@ def _kernel(squared: Array, width: float) -> Array:
     return np.exp(-squared / width**2)
 
 
+def _near(squared: Array, wide: float, narrow: float) -> Array:
+    """A wide kernel to find the way and a narrow one to hold it, of squared errors."""
+    return 0.5 * _kernel(squared, wide) + 0.5 * _kernel(squared, narrow)
+
+
 def _carries(s: Step) -> Array:
     """Whether a foot bears more than a thirtieth of the weight `(n, n_feet)`."""
     return s.foot_force > s.weight / 30.0
 
 
 def velocity(s: Step) -> Array:
-    """Planar velocity near the reference's: a wide kernel to find it and a narrow one to hold it."""
+    """Planar velocity near the reference's."""
     error = ((s.velocity - s.reference_velocity) ** 2).sum(-1)
-    return 0.5 * _kernel(error, 0.3 * s.walking.forward) + 0.5 * _kernel(error, 0.1 * s.walking.forward)
+    return _near(error, 0.3 * s.walking.forward, 0.1 * s.walking.forward)
 
 
 def progress(s: Step) -> Array:
@@ -64,12 +73,33 @@ def progress(s: Step) -> Array:
 def yaw_rate(s: Step) -> Array:
     """Yaw rate near the reference's."""
     error = (s.yaw_rate - s.reference_yaw_rate) ** 2
-    return 0.5 * _kernel(error, 0.6 * s.walking.turning) + 0.5 * _kernel(error, 0.2 * s.walking.turning)
+    return _near(error, 0.6 * s.walking.turning, 0.2 * s.walking.turning)
 
 
 def pose(s: Step) -> Array:
     """Joints near the reference's."""
     return _kernel(((s.joints - s.reference_joints) ** 2).mean(-1), 0.25)
+
+
+def joints(s: Step) -> Array:
+    """Joints near the reference's: closer than `pose` asks for."""
+    return _near(((s.joints - s.reference_joints) ** 2).mean(-1), 0.3, 0.12)
+
+
+def orientation(s: Step) -> Array:
+    """Gravity near the reference's, seen from the base: tilted as it, lying as it."""
+    return _near(((s.gravity - s.reference_gravity) ** 2).sum(-1), 0.6, 0.2)
+
+
+def base_height(s: Step) -> Array:
+    """Base as high as the reference's, to a fifth of the height of walking."""
+    return _kernel((s.height - s.reference_height) ** 2, 0.2 * s.walking.height)
+
+
+def travel(s: Step) -> Array:
+    """Velocity and yaw rate near the reference's, while that is upright: a heading says little of who lies."""
+    upright = s.reference_gravity[:, 2] < -0.8
+    return np.where(upright, 0.5 * velocity(s) + 0.5 * yaw_rate(s), 0.0)
 
 
 def contact(s: Step) -> Array:
@@ -123,6 +153,21 @@ def target_acceleration(s: Step) -> Array:
     return ((s.target - 2 * s.target1 + s.target2) ** 2).sum(-1)
 
 
+def residual(s: Step) -> Array:
+    """Squared residual [rad2]."""
+    return (s.residual**2).sum(-1)
+
+
+def residual_rate(s: Step) -> Array:
+    """Squared change of the residual [rad2]: of a clip's targets, which hurry by themselves, the part not asked for."""
+    return ((s.residual - s.residual1) ** 2).sum(-1)
+
+
+def residual_acceleration(s: Step) -> Array:
+    """Squared second difference of the residual [rad2]."""
+    return ((s.residual - 2 * s.residual1 + s.residual2) ** 2).sum(-1)
+
+
 def effort(s: Step) -> Array:
     """Squared torque [N2 m2]."""
     return (s.effort**2).sum(-1)
@@ -136,7 +181,8 @@ def fall(s: Step) -> Array:
 TERMS: Mapping[str, Callable[[Step], Array]] = {
     term.__name__: term
     for term in (
-        velocity, progress, yaw_rate, pose, contact, clearance, upright, height, sway_rate, slip, level_feet, impact,
-        target_rate, target_acceleration, effort, fall,
+        velocity, progress, yaw_rate, pose, joints, orientation, base_height, travel, contact, clearance, upright,
+        height, sway_rate, slip, level_feet, impact, target_rate, target_acceleration, residual, residual_rate,
+        residual_acceleration, effort, fall,
     )
 }  # fmt: skip

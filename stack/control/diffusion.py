@@ -28,8 +28,8 @@ from servoid.policy.diffusion.model.config import check_fit
 from servoid.policy.diffusion.settings import DiffusionSettings, load_settings
 from servoid.policy.features import raw_row
 from servoid.stack.control.base import BasePolicy
-from servoid.stack.control.plan_buffer import History, Pace, PlanBuffer
-from servoid.stack.control.planner import Answer, InlinePlanner, Planner, ProcessPlanner
+from servoid.stack.control.planning.plan_buffer import History, Pace, PlanBuffer
+from servoid.stack.control.planning.planner import Answer, InlinePlanner, Planner, ProcessPlanner
 from servoid.stack.control.trim import Trim
 from servoid.stack.safety.min_jerk import MinJerk
 from servoid.stack.tasks.terms.guidance import Stopping
@@ -157,7 +157,7 @@ def diffusion_policy(
     settings and robot do not fit.
     """
     settings = settings or load_settings()
-    path = resolve(settings.checkpoint)
+    path = resolve(settings.checkpoint, robot)
     settings = replace(settings, checkpoint=str(path))
     cost = None if cost is None else Stopping(cost)
     head = read_header(path)

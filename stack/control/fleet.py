@@ -47,6 +47,7 @@ class Fleet:
         self.applied = np.tile(robot.home, (n, 1))
         self.rngs = [np.random.default_rng(0)] * n
         self._episodes = np.zeros(n, int)  # begun
+        self._drawn = np.zeros(n, bool)  # worlds whose next episode has its stream already
         self._seed = seed
         self._ones = np.ones((n, len(robot.joints)))
         self.state: State
@@ -61,6 +62,17 @@ class Fleet:
         """A seed `(n,)` for who drives each world in its present episode."""
         return self._seed + np.arange(self.n) + self.n * np.maximum(self._episodes - 1, 0)
 
+    def draw(self, where: Array) -> None:
+        """Give the worlds `where` `(n,)` bool the streams of their next episodes, for whoever draws how they begin; the
+        `reset` that follows goes on with them."""
+        for i in np.flatnonzero(where).tolist():
+            self._draw(i)
+            self._drawn[i] = True
+
+    def _draw(self, i: int) -> None:
+        self.rngs[i] = generator(*self._stream, int(i), int(self._episodes[i]))
+        self._episodes[i] += 1
+
     def reset(self, where: Array, start: Start | None = None) -> None:
         """Begin new episodes in the worlds `where` `(n,)` bool; `start` has a row for every world.
 
@@ -69,9 +81,9 @@ class Fleet:
         ids = np.flatnonzero(where)
         if not len(ids):
             return
-        for i in ids:
-            self.rngs[i] = generator(*self._stream, int(i), int(self._episodes[i]))
-            self._episodes[i] += 1
+        for i in ids[~self._drawn[ids]].tolist():
+            self._draw(i)
+        self._drawn[ids] = False
         start = Start() if start is None else start.of(ids)
         self.worlds.reset(ids, [self.rngs[i] for i in ids], start)
         bias = np.zeros((self.n, 3))

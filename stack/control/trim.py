@@ -13,7 +13,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import Robot
-from servoid.policy.references.gait import load_gait
+from servoid.policy.references.gait import gait_of
 
 # Of the shipped robot, m/s, m/s, rad/s; others have the same shares of their top speeds.
 _JUMP = np.array([0.05, 0.05, 0.2])  # a larger change of what is asked begins anew
@@ -27,7 +27,7 @@ class Trim:
         """`rate` [1/s] is the share of the difference that is added a second; 0 turns the correction off."""
         self._step = rate * robot.dt
         self._jump, self._limit = robot.walking.relative * _JUMP, robot.walking.relative * _LIMIT
-        self._cycle = round(load_gait(robot.gait).cycle / robot.dt)  # ticks: within a cycle, every walk sways
+        self._cycle = round(gait_of(robot).cycle / robot.dt)  # ticks: within a cycle, every walk sways
         self._differences: deque[Array] = deque(maxlen=self._cycle)
         self._asked = np.zeros((*shape, 3))
         self._since = np.zeros(shape, int)  # ticks

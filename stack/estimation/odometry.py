@@ -8,7 +8,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
-from servoid.policy.checkpoint import resolve
+from servoid.policy.checkpoint import CHECKPOINTS, read_header, resolve
 from servoid.policy.mlp import Mlp
 
 # Ticks back that the network sees: dense lately, then a whole cycle of steps.
@@ -65,9 +65,22 @@ class OdometryFeatures:
 
 
 def load_odometry(robot: Robot, name: str | Path = "odometry") -> Mlp:
-    """The correction `(..., 3)` m/s of the base velocity, heading frame: the shipped one, or of a file.
+    """The correction `(..., 3)` m/s of the base velocity, heading frame: the robot's own, else the shipped one, or of a
+    file.
 
     Raises CheckpointError.
     """
     inputs = len(OFFSETS) * OdometryFeatures(robot).size
-    return Mlp.load(resolve(name), "odometry", robot, inputs)[0]
+    return Mlp.load(resolve(name, robot), "odometry", robot, inputs)[0]
+
+
+def odometry_of(robot: Robot) -> tuple[Mlp | None, str | None]:
+    """The correction of a robot, or None where it has none that was trained for its joints, and what a person should
+    know then. Raises CheckpointError for one of its own that cannot be used."""
+    path = resolve("odometry", robot)
+    if path.parent == CHECKPOINTS and list(read_header(path)["joints"]) != list(robot.names):
+        return None, (
+            f"odometry goes by the legs alone: {robot.name} has none in {robot.folder} yet "
+            "(servoid train odometry --policy gait), so distances are only rough"
+        )
+    return load_odometry(robot), None

@@ -21,7 +21,12 @@ class TraceBuffer:
         self._joints = joints
         self._rows: Array = np.full((min(ticks, _LONGEST) + 1, sum(_COLUMNS.values()) + joints), np.nan)
         self._length = 0
-        self._seen: dict[str, list[Array]] = {"goal": [], "obstacles": [], "robots": []}  # where there was something
+        self._seen: dict[str, list[Array]] = {
+            "goal": [],
+            "obstacles": [],
+            "robots": [],
+            "objects": [],
+        }  # where there was something
 
     def __len__(self) -> int:
         return self._length
@@ -63,6 +68,7 @@ class TraceBuffer:
             goal=self._stacked("goal"),
             obstacles=self._stacked("obstacles"),
             robots=self._stacked("robots"),
+            objects=self._stacked("objects"),
         )
 
     def _stacked(self, name: str) -> Array | None:

@@ -8,6 +8,8 @@ from typing import Annotated
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import DistanceMap, State
+from servoid.hw.geometry import to_heading
 from servoid.hw.setting import Setting, check
 
 _CELL = 0.05 / 0.17  # of the robot's half width: cells of a grid that is not much finer than the robot
@@ -68,6 +70,10 @@ class PotentialField:
                 return self.goal.copy()
             i, j = best
         return self._low + self._size * np.array([i, j])
+
+    def seen_from(self, state: State) -> DistanceMap:
+        """The potential in the heading frame of `state`."""
+        return DistanceMap(to_heading(self._low, state), -float(state.yaw), self._size, self._potential)
 
     def _covers(self, place: Array) -> bool:
         cell = (place - self._low) / self._size

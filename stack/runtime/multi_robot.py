@@ -14,7 +14,7 @@ from servoid.hw.contracts.task import Assignment, Behaviour
 from servoid.hw.seeds import teammate_seed
 from servoid.stack.control.policies import make_policy
 from servoid.stack.estimation.estimator import Estimator
-from servoid.stack.estimation.odometry import load_odometry
+from servoid.stack.estimation.odometry import odometry_of
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.clock import Schedule
 from servoid.stack.runtime.interrupt import Interrupt, Stops
@@ -70,7 +70,7 @@ class Teammates:
             sensors, motors = other.connect()
             self._open.callback(other.close)
             guard = Guard(robot, motors, settings.gain)
-            controlled = ControlledRobot(robot, sensors, Estimator(robot, load_odometry(robot)), guard)
+            controlled = ControlledRobot(robot, sensors, Estimator(robot, odometry_of(robot)[0]), guard)
             phases = Phases(controlled, unpushed, behaviour, policy, other.simulation)
             schedule, stops = Schedule(other.clock, robot.rate), Stops(Interrupt(), script=self._heard)
             loop = Loop(controlled, phases, schedule, interrupt, stops, (self._listener(number),))

@@ -9,6 +9,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Policy
 from servoid.hw.robot.description import Robot
 from servoid.stack.control.clip import ClipPolicy
+from servoid.stack.control.tracker import Tracker
 from servoid.stack.skills.skill import Skill, clip_of
 
 
@@ -26,9 +27,11 @@ def _clip(skill: Skill, robot: Robot) -> Performer:
 
 
 def _tracker(skill: Skill, robot: Robot) -> Performer:
-    raise ConfigError(
-        f"skill '{skill.name}': policy: tracker needs a tracker of clips, and none is shipped: write policy: clip"
-    )
+    try:
+        tracker = Tracker(robot, skill.tracker, clips=True)
+    except ConfigError as error:
+        raise ConfigError(f"skill '{skill.name}': policy: tracker: {error}: write policy: clip") from error
+    return ClipPolicy(robot, clip_of(skill, robot), tracker=tracker)
 
 
 PERFORMERS: dict[str, Callable[[Skill, Robot], Performer]] = {"clip": _clip, "tracker": _tracker}

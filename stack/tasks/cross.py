@@ -15,14 +15,14 @@ from servoid.hw.geometry import to_heading, turned
 from servoid.hw.setting import Setting
 from servoid.stack.navigation.collision_avoidance import AvoidanceSettings, MeanVelocity, bearing_past
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
-from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, FreeSettings
 from servoid.stack.tasks.terms import metrics as measures
 
 _ROOM = 0.7  # m between neighbours at the start and at the end: none is in the way of another who stands
 
 
 @dataclass(frozen=True)
-class CrossSettings(Settings):
+class CrossSettings(FreeSettings):
     robots: Annotated[int, Setting("number of robots", least=2, most=4)] = 3
     circle: Annotated[float, Setting("radius of the circle on which they start", "m", above=0)] = 1.1
     spread: Annotated[float, Setting("how far a start may be from its even place on the circle", "rad", least=0)] = 0.2
@@ -136,14 +136,14 @@ class _CrossOver(BaseBehaviour):
         velocity = turned(self._motion.update(robots[:, :2]), -state.yaw)
         self.arrived = bool(np.linalg.norm(goal) <= (1.0 if self.arrived else 0.7) * s.radius)
         if self.arrived:
-            return Instruction(velocity=np.zeros(3), goal=goal)
+            return Instruction(velocity=np.zeros(3), goal=goal, stand=True)
         bearing = bearing_past(
             goal, np.column_stack([near, velocity]), s.approach.speed, self._bearing - float(state.yaw), s.passing
         )
         self._bearing = bearing + float(state.yaw)
         target = np.linalg.norm(goal) * np.array([math.cos(bearing), math.sin(bearing)])
         obstacles = np.column_stack([near, np.full(len(near), s.body), velocity])
-        return Instruction(velocity=go_to_point(target, s.approach), goal=goal, obstacles=obstacles)
+        return s.asked(Instruction(velocity=go_to_point(target, s.approach), goal=goal, obstacles=obstacles))
 
     def done(self, state: State) -> bool:
         """For the first robot, when it and all others have arrived, or cannot any more. The others stand meanwhile."""

@@ -17,7 +17,7 @@ from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Setting
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.navigation.potential_field import FieldSettings, PotentialField
-from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, FreeSettings
 from servoid.stack.tasks.terms import metrics as measures
 
 Pillar = tuple[float, float, float]
@@ -26,7 +26,7 @@ _TRIES = 10_000  # draws of a pillar's place before the area counts as full
 
 
 @dataclass(frozen=True)
-class ForestSettings(Settings):
+class ForestSettings(FreeSettings):
     pillars: Annotated[int, Setting("number of pillars", least=0)] = 15
     pillar_radius: Annotated[float, Setting("radius of a pillar", "m", above=0)] = 0.05
     width: Annotated[float, Setting("width of the forest, across the robot's way", "m", above=0)] = 2.2
@@ -148,10 +148,14 @@ class _GoBetween(BaseBehaviour):
         way = to_heading(self._field.downhill(place), state)
         goal = to_heading(self._seen, state)
         far = way * np.linalg.norm(goal) / max(float(np.linalg.norm(way)), 1e-9)  # to slow down at the goal alone
-        return Instruction(
-            velocity=go_to_point(far, self._settings.approach),
-            goal=goal,
-            obstacles=np.pad(to_heading(pillars, state), ((0, 0), (0, 2))),  # they stand
+        s = self._settings
+        return s.asked(
+            Instruction(
+                velocity=go_to_point(far, s.approach),
+                goal=goal,
+                obstacles=np.pad(to_heading(pillars, state), ((0, 0), (0, 2))),  # they stand
+                distances=self._field.seen_from(state) if s.weights.way else None,
+            )
         )
 
     def done(self, state: State) -> bool:

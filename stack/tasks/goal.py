@@ -19,13 +19,13 @@ from servoid.hw.robot.description import Robot
 from servoid.hw.setting import Range, Setting
 from servoid.policy.text.captions import MOTIONS
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
-from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, FreeSettings
 from servoid.stack.tasks.terms import metrics as measures
 from servoid.stack.tasks.text import understood
 
 
 @dataclass(frozen=True)
-class GoalSettings(Settings):
+class GoalSettings(FreeSettings):
     distance: Annotated[Range, Setting("distance of the goal; it is drawn at any bearing", "m", least=0)] = (0.5, 1.5)
     x: Annotated[float | None, Setting("ahead of the start: fixes the goal (y is 0 unless given)", "m")] = None
     y: Annotated[float | None, Setting("to the left of the start: fixes the goal (x is 0 unless given)", "m")] = None
@@ -109,7 +109,7 @@ class _GoAndStand(BaseBehaviour):
         self._stopped = distance <= (s.leave if self._stopped else s.arrive)
         velocity = np.zeros(3) if self._stopped else go_to_point(ahead, s.approach)
         text = None if self._stopped else s.text  # a robot that has arrived is told to stand
-        return Instruction(velocity=velocity, goal=ahead, text=text)
+        return s.asked(Instruction(velocity=velocity, goal=ahead, text=text, stand=self._stopped))
 
     def done(self, state: State) -> bool:
         """Arrived, and standing for 1 s where that is asked."""

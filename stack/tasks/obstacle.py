@@ -13,12 +13,12 @@ from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.setting import Setting
-from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, FreeSettings
 from servoid.stack.tasks.terms import metrics as measures
 
 
 @dataclass(frozen=True)
-class ObstacleSettings(Settings):
+class ObstacleSettings(FreeSettings):
     distance: Annotated[float, Setting("distance of the sphere's middle at the start", "m", above=0)] = 0.55
     bearing: Annotated[
         float | None, Setting("bearing of the sphere at the start, to the left (none: drawn)", "rad")
@@ -103,7 +103,7 @@ class _GetAway(BaseBehaviour):
             ]
         )
         rolling = -s.sphere_speed * obstacles[:, :2] / np.linalg.norm(obstacles[:, :2], axis=1, keepdims=True)
-        return Instruction(velocity=velocity, obstacles=np.concatenate([obstacles, rolling], -1))
+        return s.asked(Instruction(velocity=velocity, obstacles=np.concatenate([obstacles, rolling], -1)))
 
     def done(self, state: State) -> bool:
         """Escaped, as the robot sees it, with something to spare."""

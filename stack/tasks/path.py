@@ -14,7 +14,7 @@ from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.geometry import to_heading
 from servoid.hw.setting import Setting
-from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, FreeSettings
 from servoid.stack.tasks.terms import metrics as measures
 
 Point = tuple[float, float]
@@ -22,7 +22,7 @@ _SPACING = 0.01  # m between the points of a path
 
 
 @dataclass(frozen=True)
-class PathSettings(Settings):
+class PathSettings(FreeSettings):
     shape: Annotated[Literal["s", "circle", "waypoints"], Setting("s, circle or waypoints")] = "s"
     radius: Annotated[float, Setting("radius of the arcs of an S, or of the circle", "m", above=0)] = 0.4
     waypoints: Annotated[tuple[Point, ...], Setting("points after the start: x,y:x,y:...", "m")] = (
@@ -124,7 +124,8 @@ class _Follow(BaseBehaviour):
         if abs(bearing) > 0.5 * math.pi:
             turn = math.copysign(s.yaw_rate, bearing)
         turn = min(max(turn, -s.yaw_rate), s.yaw_rate)
-        return Instruction(velocity=np.array([forward, 0.0, turn]), goal=to_heading(points[-1], state), path=path)
+        velocity = np.array([forward, 0.0, turn])
+        return s.asked(Instruction(velocity=velocity, goal=to_heading(points[-1], state), path=path))
 
     def done(self, state: State) -> bool:
         """At the end of the path."""

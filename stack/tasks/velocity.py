@@ -16,12 +16,12 @@ from servoid.hw.contracts.world import Percept
 from servoid.hw.geometry import turned
 from servoid.hw.setting import Range, Setting
 from servoid.policy.references.gait import load_gait
-from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, FreeSettings
 from servoid.stack.tasks.terms import metrics as measures
 
 
 @dataclass(frozen=True)
-class VelocitySettings(Settings):
+class VelocitySettings(FreeSettings):
     seconds: Annotated[float, Setting("length of an episode", "s", above=0)] = 183.0
     speed: Annotated[Range, Setting("speed over the ground", "m/s", least=0, asks="forward")] = (0.0, 0.44)
     turn: Annotated[Range, Setting("how far the direction changes each time", "rad")] = (-1.0, 1.0)
@@ -115,4 +115,4 @@ class _FaceAndWalk(BaseBehaviour):
         turn = min(max(s.turn_gain * off, -s.yaw_rate), s.yaw_rate)
         if not velocity.any() and abs(off) < 0.05:
             turn = 0.0  # asked to stand, and facing the right way: no stepping on the spot
-        return Instruction(velocity=np.array([max(float(ahead[0]), 0.0), 0.0, turn]), ground=ahead)
+        return s.asked(Instruction(velocity=np.array([max(float(ahead[0]), 0.0), 0.0, turn]), ground=ahead))

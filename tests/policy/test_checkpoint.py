@@ -61,8 +61,31 @@ def test_a_checkpoint_that_does_not_fit_is_refused_with_the_reason(tmp_path: Pat
     assert "train" not in str(error.value)
     with pytest.raises(CheckpointError, match=reason) as error:
         checkpoint.check(tmp_path / "odometry.safetensors", head() | {"kind": "odometry"}, "odometry", change(ROBOT))
-    command = f"servoid train odometry --policy gait --robot FILE --out {tmp_path}/odometry.safetensors"
-    assert str(error.value).endswith(f"; train it once: {command}"), "every run of the robot needs it"
+    command = f"servoid train odometry --policy gait --robot FILE --out {ROBOT.folder}/odometry.safetensors"
+    assert str(error.value).endswith(f"; train it once: {command}"), (
+        "into its own folder: it never replaces another robot's"
+    )
+
+
+def test_a_checkpoint_of_another_robot_is_not_written_over(tmp_path: Path) -> None:
+    """An odometry that was trained for a robot of one's own replaced the OP3's."""
+    path = tmp_path / "odometry.safetensors"
+    checkpoint.write(path, {}, head())
+    checkpoint.write(path, {}, head())
+    for attempt in (
+        lambda: checkpoint.check_out(path, ["knee"]),
+        lambda: checkpoint.write(path, {}, head() | {"joints": []}),
+    ):
+        with pytest.raises(CheckpointError, match="is a checkpoint of op3, which has other joints"):
+            attempt()
+
+
+def test_a_robots_own_folder_comes_before_what_is_shipped(tmp_path: Path) -> None:
+    robot = replace(ROBOT, folder=str(tmp_path))
+    assert checkpoint.resolve("odometry", robot) == checkpoint.CHECKPOINTS / "odometry.safetensors"
+    checkpoint.write(tmp_path / "odometry.safetensors", {}, head())
+    assert checkpoint.resolve("odometry", robot) == tmp_path / "odometry.safetensors"
+    assert checkpoint.resolve("odometry") == checkpoint.CHECKPOINTS / "odometry.safetensors"
 
 
 def test_another_kind_is_refused_and_another_name_of_the_robot_is_not() -> None:

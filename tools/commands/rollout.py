@@ -163,10 +163,11 @@ def _prepare(args: argparse.Namespace, name: str) -> _Policy:
 
 
 def _made_of(chosen: RunSettings) -> tuple[Any, ...]:
+    from servoid.hw.robot.description import load_robot
     from servoid.stack.control.policies import policy_fingerprint
     from servoid.tools.evaluate.code_hash import read_anew
 
-    return *read_anew(chosen.robot), policy_fingerprint(chosen.policy)
+    return *read_anew(chosen.robot), policy_fingerprint(chosen.policy, load_robot(chosen.robot))
 
 
 def _file_name(policy: str) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Trace
-from servoid.hw.geometry import turned
+from servoid.hw.geometry import headed, turned
 from servoid.sim.truth import FALL_TILT
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.guard import Phase
@@ -33,7 +33,7 @@ class Falls:
     def watch(self, record: TickRecord, standing: bool) -> None:
         """`standing`: whether the robot stands at this tick."""
         before, phase, self._before = self._before, record.phase, record.phase
-        if phase is Phase.FALLEN and before is Phase.RUNNING:
+        if phase is Phase.FALLEN and before in {Phase.READY, Phase.RUNNING}:
             self.falls, self._rose = self.falls + 1, None
         if phase is Phase.RECOVERING and self._rose is None:
             self._rose = record.tick
@@ -58,6 +58,7 @@ class GroundTruth:
         self._up: list[Array] = []
         self._obstacles: list[Array] = []
         self._robots: list[Array] = []
+        self._objects: list[Array] = []
         self._low = low
         self._fallen = self._touched = self.fell_ending = False
         self._ever = False  # whether it has fallen
@@ -82,6 +83,7 @@ class GroundTruth:
         if self._surroundings is not None:
             self._touched |= bool(truth.touching.any())
             self._obstacles.append(self._surroundings.obstacles)
+            self._objects.append(truth.objects[0])
             self._robots.append(np.column_stack([truth.position[1:, :2], truth.yaw[1:]]))
         rate = -float(truth.gravity[0] @ truth.angular_velocity[0])
         self._rows.append(
@@ -115,8 +117,16 @@ class GroundTruth:
             goal=goal,
             obstacles=turned(np.array(self._obstacles) - origin, -heading) if self._obstacles else None,
             robots=turned(np.array(self._robots) - [*origin[:2], heading], -heading) if self._others() else None,
+            objects=self._seen_objects(origin, heading),
             touched=self._touched if self._obstacles else None,
         )
+
+    def _seen_objects(self, origin: Array, heading: float) -> Array | None:
+        if not self._objects or not len(self._objects[0]):
+            return None
+        poses = np.array(self._objects)
+        turn = np.full(poses.shape[:2], -heading)
+        return np.concatenate([turned(poses[..., :3] - origin, -heading), headed(poses[..., 3:], turn)], -1)
 
     def _others(self) -> bool:
         return bool(self._robots) and len(self._robots[0]) > 0

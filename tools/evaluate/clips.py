@@ -21,12 +21,12 @@ def recipe(robot: str) -> dict[str, Any]:
 
     from servoid.hw.robot.description import load_robot
     from servoid.policy.checkpoint import resolve
-    from servoid.policy.references.gait import load_gait
+    from servoid.policy.references.gait import gait_of
     from servoid.stack.log.provenance import fingerprint, sha256
 
     return {
-        "expert": sha256(resolve("expert")),
-        "gait": asdict(load_gait(load_robot(robot).gait)),
+        "expert": sha256(resolve("expert", load_robot(robot))),
+        "gait": asdict(gait_of(load_robot(robot))),
         "robot": fingerprint(load_robot(robot)),
         "seconds": SECONDS,
         "seed": SEED,

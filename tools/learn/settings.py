@@ -12,6 +12,7 @@ from typing import Annotated, ClassVar, Literal
 
 from servoid.hw.config import nearest
 from servoid.policy.diffusion.model.config import DenoiserShape, TrainingObjective
+from servoid.policy.diffusion.prefix.config import PlannerShape
 from servoid.policy.latent.actions import LatentConfig
 from servoid.policy.tracker.rewards import TERMS
 
@@ -110,7 +111,6 @@ class DiffusionNetwork(DenoiserShape):
 
     text: Annotated[str, "encoder of instructions; empty: a model without instructions"] = "words"
     emphasis: Annotated[float, "emphasis of global states; 0: no projection"] = 5.0
-    changes: Annotated[bool, "learn from windows over which the command changes too, which are told nothing"] = False
 
 
 @dataclass(frozen=True)
@@ -153,6 +153,45 @@ class LatentTraining(Optimiser, LatentConfig, DataRun):
             part.__post_init__(self)
         if min(self.beta) <= 0 or self.change < 0:
             raise ValueError("beta must be positive, and change must not be negative")
+
+
+@dataclass(frozen=True)
+class PlannerTakes:
+    """What the planner learns from."""
+
+    clips: Annotated[tuple[str, ...], "clips of the library to learn; none: all that are of this robot"] = ()
+    clip_takes: Annotated[int, "takes of three clips each"] = 500
+    walk_takes: Annotated[int, "walks of the gait"] = 200
+    walk_seconds: Annotated[float, "seconds of each of these walks"] = 30.0
+    untold: Annotated[float, "share of windows over which what is asked changes, which are told nothing"] = 0.1
+    licence: Annotated[str, "licence of the data beside the clips, kept in the checkpoint"] = "Apache-2.0"
+
+    def __post_init__(self) -> None:
+        if min(self.clip_takes, self.walk_takes) < 1 or self.walk_seconds <= 0:
+            raise ValueError("clip_takes, walk_takes and walk_seconds must be positive")
+        if not 0.0 <= self.untold <= 1.0:
+            raise ValueError(f"untold must be a share of 0 to 1, not {self.untold:g}")
+
+
+@dataclass(frozen=True)
+class PlannerTraining(DecayedOptimiser, PlannerTakes, PlannerShape, StepRun):
+    """`servoid train planner`."""
+
+    minutes: float = 60.0
+    evaluate_every: float = 10.0
+    batch: int = 64
+    learning_rate: float = 4e-4
+    text: Annotated[str, "encoder of sentences"] = "words"
+    target_weight: Annotated[float, "weight of the target loss"] = 1.0
+    warmup_steps: Annotated[int, "steps over which the learning rate rises"] = 200
+    average: Annotated[float, "decay of the averaged weights, which are the ones saved"] = 0.999
+    precision: Annotated[Literal["bf16", "fp32"], "arithmetic of the network"] = "bf16"
+
+    def __post_init__(self) -> None:
+        for part in (StepRun, PlannerShape, PlannerTakes, Optimiser):
+            part.__post_init__(self)
+        if self.target_weight < 0 or self.warmup_steps < 1:
+            raise ValueError("target_weight must not be negative, and warmup_steps must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -220,6 +259,14 @@ class TrackingSettings:
     backward: Annotated[
         float, "share of commands that walk backward while turning and side-stepping, where falls were most frequent"
     ] = 0.25
+    clips: Annotated[tuple[str, ...], "clips of the library to learn; none: all that are of this robot"] = ()
+    clip_share: Annotated[float, "share of episodes that begin with a clip, and of walks that lead to one"] = 0.5
+    rates: Annotated[Range, "how fast clips are played, of their own speed; the fastest grows over the first half"] = (
+        0.9,
+        1.2,
+    )
+    get_up_rates: Annotated[Range, "the same of clips that begin lying"] = (0.9, 1.6)
+    walk_seconds: Annotated[Range, "seconds of walking between two clips"] = (1.5, 6.0)
     rewards: Annotated[dict[str, float], "weights of reward terms, per tick (policy/tracker/rewards.py)"] = field(
         default_factory=lambda: {
             "velocity": 3.0,
@@ -240,11 +287,33 @@ class TrackingSettings:
             "fall": -10.0,
         }
     )
+    clip_rewards: Annotated[dict[str, float], "the same, while a clip is followed"] = field(
+        default_factory=lambda: {
+            "joints": 1.0,
+            "orientation": 2.0,
+            "base_height": 1.5,
+            "travel": 1.0,
+            "slip": -0.3,
+            "impact": -0.1,
+            "residual": -0.01,
+            "residual_rate": -0.3,
+            "residual_acceleration": -0.1,
+            "effort": -0.005,
+            "fall": -10.0,
+        }
+    )
 
     def __post_init__(self) -> None:
-        for name in self.rewards:
-            if name not in TERMS:
-                raise ValueError(f"rewards.{name}: no such reward term; {nearest(name, TERMS)}")
+        for table in ("rewards", "clip_rewards"):
+            for name in getattr(self, table):
+                if name not in TERMS:
+                    raise ValueError(f"{table}.{name}: no such reward term; {nearest(name, TERMS)}")
+        if not 0.0 <= self.clip_share <= 1.0:
+            raise ValueError(f"clip_share must be 0 to 1, not {self.clip_share:g}")
+        for name in ("rates", "get_up_rates", "walk_seconds"):
+            low, high = getattr(self, name)
+            if not 0.0 < low <= high:
+                raise ValueError(f"{name} must be positive and rising, not {low:g} {high:g}")
         if min(self.stand, self.forward, self.single, self.backward) < 0 or (
             self.stand + self.forward + self.single + self.backward > 1.0
         ):
@@ -252,8 +321,8 @@ class TrackingSettings:
 
 
 @dataclass(frozen=True)
-class ExpertTraining(TrackingSettings, Ppo):
-    """`servoid train expert`."""
+class TrackerTraining(TrackingSettings, Ppo):
+    """`servoid train tracker`."""
 
     plain_odometry: Annotated[bool, "estimate without the learned correction of odometry"] = False
 
@@ -302,8 +371,9 @@ class OdometryTraining(DecayedOptimiser, Layers, OdometryWalks, StepRun):
 TITLES: Mapping[type, str] = {  # of the help, in its order
     TrainingRun: "run", StepRun: "run", DataRun: "run", SampleRun: "run",
     OdometryWalks: "walks",
+    PlannerTakes: "takes", PlannerShape: "network", PlannerTraining: "optimiser",
     DenoiserShape: "network", DiffusionNetwork: "network", LatentConfig: "network", Layers: "network",
     TrainingObjective: "objective", LatentTraining: "objective", OdometryTraining: "objective", Ppo: "objective (PPO)",
     Optimiser: "optimiser", DecayedOptimiser: "optimiser", DiffusionTraining: "optimiser",
-    TrackingSettings: "episodes and rewards", ExpertTraining: "episodes and rewards",
+    TrackingSettings: "episodes and rewards", TrackerTraining: "episodes and rewards",
 }  # fmt: skip

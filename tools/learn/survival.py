@@ -71,11 +71,11 @@ def survival_of(policy: Policy, fleet: Fleet, seconds: float) -> dict[str, float
     Returns `survival`, the share of worlds that never fell, and `velocity_error`, the mean planar error [m/s] of
     those, smoothed over a cycle, from 2 s after each command.
     """
-    from servoid.policy.references.gait import load_gait
+    from servoid.policy.references.gait import gait_of
 
     robot, worlds = fleet.robot, fleet.n
     everything = np.ones(worlds, bool)
-    cycle, low, high = load_gait(robot.gait).cycle, _LOW * robot.walking.scale, _HIGH * robot.walking.scale
+    cycle, low, high = gait_of(robot).cycle, _LOW * robot.walking.scale, _HIGH * robot.walking.scale
     fleet.reset(everything)
     policy.reset(None, fleet.seeds)
     command = np.zeros((worlds, 3))

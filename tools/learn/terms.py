@@ -57,7 +57,11 @@ class Terms(Generic[Step]):
         for term in self._stateful:
             term.reset(where)
 
-    def __call__(self, step: Step) -> tuple[Array, dict[str, float]]:
-        """The sum `(n,)`, and the mean of each weighted term over the worlds."""
+    def __call__(self, step: Step, where: Array | None = None) -> tuple[Array, dict[str, float]]:
+        """The sum `(n,)`, and the mean of each weighted term over the worlds `where` `(n,)` bool (default: all)."""
         parts = {name: weight * self._terms[name](step) for name, weight in self._weights.items()}
-        return np.sum(list(parts.values()), axis=0), {name: float(part.mean()) for name, part in parts.items()}
+        count = None if where is None else max(int(where.sum()), 1)
+        means = {
+            name: float(part.mean() if count is None else part[where].sum() / count) for name, part in parts.items()
+        }
+        return np.sum(list(parts.values()), axis=0), means

@@ -97,10 +97,10 @@ def drift(
 ) -> Drift:
     """Walk with commands changed every 5 s and compare the estimate's end with the truth's.
 
-    Counts walks that stayed up and covered more than a metre. The path is measured from cycle to cycle: within one, the
-    gait's sway would add to it, up to its double.
+    Walks count that stayed up and went as far as 2 s at full speed. The path is measured from cycle to cycle: within
+    one, the gait's sway would add to it, up to its double.
     """
-    from servoid.policy.references.gait import load_gait
+    from servoid.policy.references.gait import gait_of
     from servoid.stack.control.fleet import Fleet
 
     fleet = Fleet(robot, walks, odometry, randomise=randomise, seed=seed)
@@ -111,7 +111,7 @@ def drift(
     alive, path, command = everything.copy(), np.zeros(walks), np.zeros((walks, 3))
     turned, start = np.zeros(walks), fleet.truth.position[:, :2].copy()
     last, heading, state = start, fleet.truth.yaw.copy(), fleet.observe()
-    ticks, cycle = round(seconds * robot.rate), round(load_gait(robot.gait).cycle * robot.rate)
+    ticks, cycle = round(seconds * robot.rate), round(gait_of(robot).cycle * robot.rate)
     for k in counted(ticks, "measuring"):
         if k % (5 * robot.rate) == 0:
             low, high = np.array([[-0.2, -0.2, -0.8], [0.6, 0.2, 0.8]]) * robot.walking.scale
@@ -126,7 +126,7 @@ def drift(
         heading = truth.yaw.copy()
         alive &= ~truth.fallen
     error = np.linalg.norm(state.displacement[:, :2] - (last - start), axis=-1)
-    use = alive & (path > 1.0)
+    use = alive & (path > 2.0 * robot.walking.forward)
     if not use.any():
         return Drift(np.nan, np.nan, np.nan, 0)
     share, yaw = (error / path)[use], np.abs(state.yaw - turned)[use] * 60.0 / seconds

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.operator import CommandSource, Intent
 from servoid.hw.contracts.task import Behaviour, Criterion, Episode, Objective, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot, shipped_robot
 from servoid.hw.setting import Setting, asks, check, rescaled
-from servoid.policy.references.gait import load_gait
-from servoid.stack.tasks.terms.guidance import Weights, total_cost
+from servoid.policy.references.gait import gait_of
+from servoid.stack.tasks.terms.guidance import FreeWeights, Weights, total_cost
 
 T = TypeVar("T")
 
@@ -32,10 +33,39 @@ class Settings:
     def __post_init__(self) -> None:
         check(self)
 
+    @property
+    def weights(self) -> Weights:
+        """Of the guidance cost."""
+        return self.cost
+
     @staticmethod
     def completed(typed: dict[str, str]) -> dict[str, str]:
         """Settings as typed on a command line, with those that follow from them."""
         return typed
+
+
+@dataclass(frozen=True)
+class FreeSettings(Settings):
+    """Settings of a task whose way a planner may find by itself."""
+
+    way: Annotated[
+        Literal["script", "cost"],
+        Setting("what finds the way: a script, by a velocity that it asks for, or a planner, by the cost `alone`"),
+    ] = "script"
+    alone: FreeWeights = field(default_factory=FreeWeights)  # of the guidance cost where a planner finds the way
+
+    @property
+    def weights(self) -> Weights:
+        return self.alone if self.way == "cost" else self.cost
+
+    def asked(self, instruction: Instruction) -> Instruction:
+        """The instruction as this way has it: a planner that finds its way is told no sentence but the task's own.
+
+        Its velocity stays, for policies that follow one.
+        """
+        if self.way == "script" or instruction.stand or instruction.text is not None:
+            return instruction
+        return replace(instruction, text="")
 
 
 def beyond(settings: Any, robot: Robot) -> list[str]:
@@ -66,7 +96,7 @@ def fitted(settings: T, robot: Robot) -> T:
             "left": (r.walking.sideways, r.walking.sideways),
             "turning": (r.walking.turning, r.walking.turning),
             "height": (r.walking.height,),
-            "cycle": (load_gait(r.gait).cycle,),
+            "cycle": (gait_of(r).cycle,),
         }
         for r in (robot, shipped_robot())
     )
@@ -106,7 +136,7 @@ class BaseTask:
     @property
     def cycle(self) -> float:
         """Length of a cycle of the robot's gait [s]: within one, every walk sways."""
-        return load_gait((self.robot or shipped_robot()).gait).cycle
+        return gait_of(self.robot or shipped_robot()).cycle
 
     def ticks(self, seconds: float) -> int:
         """The nearest number of ticks, at least one."""
@@ -119,10 +149,16 @@ class BaseTask:
     def behaviour(self, episode: Any) -> Behaviour:
         raise NotImplementedError(f"task {self.name} asks for nothing")
 
+    def open_source(self) -> CommandSource:
+        raise NotImplementedError(f"nobody steers task {self.name}")
+
+    def steered_behaviour(self, episode: Any, wanted: Callable[[], Intent]) -> Behaviour:
+        raise NotImplementedError(f"nobody steers task {self.name}")
+
     @property
     def objective(self) -> Objective | None:
         """The weighted sum of what an instruction holds (`guidance.total_cost`); None where it is always zero."""
-        weights: Weights = self.settings.cost
+        weights: Weights = self.settings.weights
         return None if self.guided_by_velocity_alone and not weights.twist else partial(total_cost, weights=weights)
 
     def criteria(self, trace: Trace, episode: Any) -> Sequence[Criterion]:

@@ -5,6 +5,7 @@ Works on torch tensors through their own methods, so that tasks load without tor
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -12,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.contracts.control import Instruction
+from servoid.hw.contracts.control import DistanceMap, Instruction
 from servoid.hw.setting import Setting, check
 from servoid.policy.features import Trajectory
 
@@ -37,13 +38,21 @@ class Weights:
     facing: Annotated[float, Setting("1 - cos(bearing of the goal), less within 0.1 m of it", least=0)] = 0.0
     waypoint: Annotated[float, Setting("squared distance from the goal", "1/m^2", least=0)] = 0.0
     path: Annotated[float, Setting("squared distance from the place on the path", "1/m^2", least=0)] = 10.0
+    way: Annotated[float, Setting("distance from the goal by a free way", "1/m", least=0)] = 0.0
     repulsion: Annotated[float, Setting("exp(-sharpness distance), for each obstacle", least=0)] = 0.1
     sharpness: Annotated[float, Setting("how steeply repulsion falls", "1/m", above=0)] = 15.0
     avoidance: Annotated[float, Setting("softplus(1 - distance / margin), for each obstacle", least=0)] = 0.0
     margin: Annotated[float, Setting("distance at which avoidance sets in", "m", above=0)] = 0.275
+    width: Annotated[
+        float, Setting("from the robot's middle to its side, for obstacles; 0: its middle alone", "m", least=0)
+    ] = 0.0
+    depth: Annotated[float, Setting("from the robot's middle to its front", "m", least=0)] = 0.0
+    safe: Annotated[float, Setting("distance at which repulsion ends; 0: it has no end", "m", least=0)] = 0.0
 
     def __post_init__(self) -> None:
         check(self)
+        if self.depth > self.width:
+            raise ValueError(f"depth: {self.depth:g} must not be more than width ({self.width:g})")
 
     @property
     def twist(self) -> bool:
@@ -52,6 +61,17 @@ class Weights:
 
 
 _STAND = Weights()
+
+
+@dataclass(frozen=True)
+class FreeWeights(Weights):
+    """Weights for a planner that finds the way by itself: no velocity that a script asks for counts by default."""
+
+    velocity: Annotated[float, Setting("squared error of the mean velocity", "1/(m/s)^2", least=0)] = 0.0
+    yaw_rate: Annotated[float, Setting("squared error of the mean turning rate", "1/(rad/s)^2", least=0)] = 0.0
+    displacement: Annotated[float, Setting("squared error of where the motion ends", "1/m^2", least=0)] = 0.0
+    yaw: Annotated[float, Setting("squared error of the heading at the end", "1/rad^2", least=0)] = 0.0
+    stand: Annotated[float, Setting("squared velocity, where it shall stand", "1/(m/s)^2", least=0)] = 0.0
 
 
 def total_cost(trajectory: Trajectory, instruction: Instruction, weights: Weights) -> Any:
@@ -64,6 +84,8 @@ def total_cost(trajectory: Trajectory, instruction: Instruction, weights: Weight
         cost = cost + ground_cost(trajectory, instruction.ground, weights)
     if instruction.goal is not None and (weights.goal > 0.0 or weights.facing > 0.0 or weights.waypoint > 0.0):
         cost = cost + goal_cost(trajectory, instruction.goal, weights)
+    if instruction.distances is not None and weights.way > 0.0:
+        cost = cost + way_cost(trajectory, instruction.distances, weights)
     if instruction.path is not None:
         cost = cost + path_cost(trajectory, instruction.path, weights)
     if instruction.obstacles is not None and len(instruction.obstacles):
@@ -118,6 +140,25 @@ def ground_cost(trajectory: Trajectory, asked: Array, weights: Weights) -> Any:
     return cost + weights.heading * trajectory.mean(1.0 - (cos * x + sin * y))
 
 
+def way_cost(trajectory: Trajectory, distances: DistanceMap, weights: Weights) -> Any:
+    """Distance of each state from the goal by a free way, between the points of the map: `(batch,)`.
+
+    Beyond the map it is that of its rim, and how far away the rim is.
+    """
+    place = trajectory.displacement.new_tensor(distances.corner)
+    metres = trajectory.displacement.new_tensor(distances.metres)
+    x, y = (trajectory.displacement - place).unbind(-1)
+    cos, sin = math.cos(distances.yaw), math.sin(distances.yaw)
+    at = [(cos * x + sin * y) / distances.size, (cos * y - sin * x) / distances.size]
+    inside = [part.clamp(0.0, count - 1.001) for part, count in zip(at, metres.shape, strict=True)]
+    (i, j), (u, v) = (part.long() for part in inside), (part - part.floor() for part in inside)
+    low = (1.0 - v) * metres[i, j] + v * metres[i, j + 1]
+    high = (1.0 - v) * metres[i + 1, j] + v * metres[i + 1, j + 1]
+    beyond = sum((part - kept) ** 2 for part, kept in zip(at, inside, strict=True))
+    away = distances.size * ((beyond + 1e-9).sqrt() - math.sqrt(1e-9))
+    return weights.way * trajectory.mean((1.0 - u) * low + u * high + away)
+
+
 def path_cost(trajectory: Trajectory, path: Array, weights: Weights) -> Any:
     """Squared distance of each tick from its place on the path `(n, 2)` m (Diffuse-CLoC, eq. 5): `(batch,)`.
 
@@ -132,17 +173,38 @@ def path_cost(trajectory: Trajectory, path: Array, weights: Weights) -> Any:
 def obstacle_cost(trajectory: Trajectory, obstacles: Array, weights: Weights) -> Any:
     """Closeness to obstacles `(n, 5)` that move with constant velocity, summed over them: `(batch,)`.
 
-    With d the signed distance of the base from an obstacle, `exp(-c d)` (Diffuse-CLoC, eq. 3 and 4), and
-    `softplus(1 - d / margin)` (UniPhys, eq. 7, whose margin is 1 m).
+    With d the signed distance of the body from an obstacle, `exp(-c d)` (Diffuse-CLoC, eq. 3 and 4), and
+    `softplus(1 - d / margin)` (UniPhys, eq. 7, whose margin is 1 m). The body is its middle alone or, with a `width`, a
+    bar across the heading with round ends, `depth` thick to either side. With a `safe` distance `exp(-c d)` counts by
+    what it is more than there, and d as zero inside an obstacle: nobody is there, and its slope would outgrow all else.
     """
     as_tensor = trajectory.displacement.new_tensor
     centre, radius, velocity = np.split(np.asarray(obstacles, dtype=float), [2, 3], axis=-1)
     centres = as_tensor(centre + trajectory.times[:, None, None] * velocity)  # (horizon, n, 2)
-    distance = _norm(trajectory.displacement[..., None, :] - centres) - as_tensor(radius[:, 0])
-    cost = weights.repulsion * (-weights.sharpness * distance).exp()
+    apart = trajectory.displacement[..., None, :] - centres
+    if weights.width > 0.0:
+        apart = _from_bar(apart, trajectory.yaw[..., None], weights.width - weights.depth)
+    distance = _norm(apart) - as_tensor(radius[:, 0]) - weights.depth
+    if weights.safe > 0.0:
+        near = (-weights.sharpness * distance.clamp(0.0, weights.safe)).exp()
+        cost = weights.repulsion * (near - math.exp(-weights.sharpness * weights.safe))
+    else:
+        cost = weights.repulsion * (-weights.sharpness * distance).exp()
     if weights.avoidance > 0.0:
         cost = cost + weights.avoidance * (1.0 + (1.0 - distance / weights.margin).exp()).log()
     return trajectory.mean(cost.sum(-1))
+
+
+def _from_bar(vectors: Any, yaw: Any, half: float) -> Any:
+    """`vectors` `(..., 2)` m from a bar of `half` a length to either side of its middle, whose normal has that `yaw`.
+
+    They are in the bar's own frame, and begin at its nearest point.
+    """
+    cos, sin = yaw.cos()[..., None], yaw.sin()[..., None]
+    x, y = vectors[..., :1], vectors[..., 1:]
+    across = cos * y - sin * x
+    beside = across - across.clamp(-half, half)
+    return (cos * x + sin * y) * vectors.new_tensor([1.0, 0.0]) + beside * vectors.new_tensor([0.0, 1.0])
 
 
 def _norm(vectors: Any) -> Any:

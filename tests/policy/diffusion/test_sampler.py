@@ -206,6 +206,49 @@ def test_known_states_do_not_use_up_the_guidance_step() -> None:
     torch.testing.assert_close(states[0, :, 0], torch.tensor([0.0, -0.5]))
 
 
+@pytest.mark.parametrize("deviation", [0.3, 1.0])
+def test_scaled_guidance_moves_the_mean_of_a_normal_distribution_to_where_theory_puts_it(deviation: float) -> None:
+    """N(m, s^2) exp(-c x) is N(m - c s^2, s^2): whatever the levels, and whatever the spread of the data."""
+    sampler = Sampler(mixture(torch.tensor([1.0]), torch.tensor([0.7]), deviation), cosine_signal(LEVELS))
+    matrix, known, slope = full_sequence(LEVELS, 50, 1, 1), unknown(2000), 0.8
+    guidance = Guidance(lambda s: slope * s.sum((1, 2)), 1.0, clip=100.0, gradient="network", scaled=True)
+    plain, _ = sampler.sample(matrix, known, generators(2000))
+    guided, _ = sampler.sample(matrix, known, generators(2000), guidance)
+    assert (plain - guided).mean().item() == pytest.approx(slope * deviation**2, rel=0.06)
+    assert guided.std().item() == pytest.approx(deviation, rel=0.06)
+
+
+def fixed(value: float, guidance: Guidance, tokens: int = 1) -> Tensor:
+    """What a network that predicts `value` for all states samples under guidance, in one call, `(tokens,)`."""
+    sampler = Sampler(lambda s, a, ks, ka: (torch.full_like(s, value), a), cosine_signal(LEVELS))
+    return sampler.sample(full_sequence(LEVELS, 1, tokens, 1), unknown(1, tokens), generators(1), guidance)[0][0, :, 0]
+
+
+def test_a_limited_step_does_not_go_beyond_where_the_cost_would_be_zero() -> None:
+    def cost(s: Tensor) -> Tensor:
+        return s.abs().sum((1, 2))  # zero at 0
+
+    assert fixed(1.0, Guidance(cost, 5.0, clip=100.0)).item() == pytest.approx(-4.0)
+    assert fixed(1.0, Guidance(cost, 5.0, clip=100.0, limited=True)).item() == pytest.approx(0.0, abs=1e-6)
+    assert fixed(1.0, Guidance(cost, 0.4, clip=100.0, limited=True)).item() == pytest.approx(0.6)
+
+
+def test_steps_repeated_at_a_level_follow_the_gradient_as_it_changes() -> None:
+    def cost(s: Tensor) -> Tensor:
+        return s.square().sum((1, 2))
+
+    assert fixed(1.0, Guidance(cost, 0.8, clip=100.0)).item() == pytest.approx(1.0 - 1.6)  # beyond the least cost
+    assert fixed(1.0, Guidance(cost, 0.8, clip=100.0, repeats=4)).item() == pytest.approx(0.6**4)
+
+
+def test_even_gradients_move_each_token_as_far() -> None:
+    def cost(s: Tensor) -> Tensor:
+        return (s[..., 0] * torch.tensor([1.0, 3.0])).sum(1)
+
+    assert fixed(0.0, Guidance(cost, 1.0, clip=100.0), tokens=2).tolist() == pytest.approx([-1.0, -3.0])
+    assert fixed(0.0, Guidance(cost, 1.0, clip=100.0, even=True), tokens=2).tolist() == pytest.approx([-2.0, -2.0])
+
+
 def test_a_cost_without_a_finite_gradient_is_an_error() -> None:
     sampler = Sampler(lambda s, a, ks, ka: (torch.zeros_like(s), a), cosine_signal(LEVELS))
     guidance = Guidance(lambda s: s.norm(dim=(1, 2)).sqrt(), weight=1.0, clip=1.0)

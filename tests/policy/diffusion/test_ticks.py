@@ -120,34 +120,11 @@ def test_neighbours_are_the_next_ticks_that_have_tokens() -> None:
     assert mask[0, :3].tolist() == [True, True, False]
 
 
-def test_windows_hold_the_states_of_their_ticks_and_those_that_change_are_told_nothing(
-    synthetic_dataset: Path,
-) -> None:
-    pytest.importorskip("wordllama")
+def test_windows_hold_the_states_of_their_ticks(synthetic_dataset: Path) -> None:
     recording = read_recording(synthetic_dataset, ROBOT)
-    command = np.zeros_like(recording.command)
-    for start, end in recording.spans:
-        command[(start + end) // 2 : end, 0] = 0.2
-    recording = replace(recording, command=command)
-    size = load_size()
-    config = DenoiserConfig(54, 20, "words", size, width=32, **SHAPE)
-    steady, every = (Windows(recording, ROBOT, config, changes=changes) for changes in (False, True))
-    assert len(every.training) > len(steady.training)
-    text = every.draw(400, torch.Generator().manual_seed(0))[2]
-    assert text is not None
-    told = text.isfinite().all(1)
-    assert 0.05 < 1.0 - told.float().mean() < 0.95
-    text = steady.draw(400, torch.Generator().manual_seed(0))[2]
-    assert text is not None
-    assert text.isfinite().all()
-    present = every.training[:1]
-    states, _ = every._gather(present, torch.zeros(1, dtype=torch.bool))
+    windows = Windows(recording, ROBOT, DenoiserConfig(54, 20, width=32, **SHAPE))
+    present = windows.training[:1]
+    states, _ = windows._gather(present, torch.zeros(1, dtype=torch.bool))
     row = raw_layout(20).slice("position")
     raw = recording.raw[int(present[0]) + np.array(TICKS)][:, row]
     np.testing.assert_allclose(states[0, 4:, 14:34].numpy(), raw, atol=1e-6)
-
-
-def load_size() -> int:
-    from servoid.policy.text.encoder import load_encoder
-
-    return load_encoder("words").size

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from servoid.hw.config import ConfigError
+from servoid.hw.config import CONFIGS, ConfigError
 from servoid.hw.geometry import turned, up_vector, yaw_of
 from servoid.hw.robot.description import load_robot
+from servoid.hw.robot.inverse import NumericInverse
 from servoid.hw.robot.legs import LegInverse, Legs
 from servoid.policy.references.gait import Gait, GaitSettings, GyroFeedback, load_gait
 from servoid.stack.control.fleet import Fleet
@@ -244,22 +246,105 @@ def test_gyro_feedback_turns_both_ankles_the_same_way_in_space() -> None:
     np.testing.assert_array_equal(feedback(home, np.zeros(3)), home)
 
 
-def test_legs_whose_axes_do_not_meet_are_refused() -> None:
-    """Their inverse kinematics would be silently wrong."""
-    for joint, change in ((1, (0.0, 0.02, 0.0)), (2, (0.02, 0.0, 0.0)), (5, (0.0, 0.0, -0.02))):
-        legs = Legs(ROBOT)
-        legs.offset = legs.offset.copy()
-        legs.offset[:, joint] += change
-        with pytest.raises(ConfigError, match="meet in a point"):
-            LegInverse(legs, "own")
+@pytest.mark.parametrize(
+    ("part", "joint", "change", "said"),
+    [
+        ("offset", 1, (0.0, 0.02, 0.0), "meet in a point"),
+        ("offset", 2, (0.02, 0.0, 0.0), "meet in a point"),
+        ("offset", 5, (0.0, 0.0, -0.02), "meet in a point"),
+        ("axis", 0, (0.0, 0.5, 0.134), "not along the base's axes"),
+    ],
+)
+def test_legs_that_the_analytic_inverse_does_not_hold_for_are_refused_by_it(
+    part: str, joint: int, change: tuple[float, float, float], said: str
+) -> None:
+    """It would be silently wrong: by 18 mm for an axis that is tilted by 30 degrees."""
+    legs = Legs(ROBOT)
+    changed = getattr(legs, part).copy()
+    changed[:, joint] += change
+    setattr(legs, part, changed)
+    with pytest.raises(ConfigError, match=said):
+        LegInverse(legs, "own")
 
 
-def test_a_robot_with_other_arms_can_walk() -> None:
-    joints = tuple(replace(j, name=j.name.replace("sho_pitch", "shoulder")) for j in ROBOT.joints)
-    joints = tuple(replace(j, mirror=j.mirror.replace("sho_pitch", "shoulder")) for j in joints)
-    gait = Gait(replace(ROBOT, joints=joints))
-    walked(gait, np.array([0.3, 0.0, 0.0]), 30)
-    assert np.isfinite(gait.frames(NOW).position).all()
+def test_the_numeric_inverse_takes_the_gaits_steps_as_the_analytic_one_does() -> None:
+    joints, _ = pose(PHASES, np.array([0.3, 0.05, 0.3]))
+    legs, numeric, analytic = Legs(ROBOT), NumericInverse(ROBOT, Legs(ROBOT)), LegInverse(Legs(ROBOT), "op3")
+    at, turn, _, _ = legs.forward(legs.pick(joints))
+    np.testing.assert_allclose(numeric(at, turn), legs.pick(joints), atol=3e-4)  # it leans toward home a little
+    ankle = at + np.einsum("...ij,...j->...i", turn, analytic.ankle)
+    np.testing.assert_allclose(analytic(ankle, turn), legs.pick(joints), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "joints"),
+    [
+        (
+            [
+                ('<body name="l_knee_link" pos="0 0', '<body name="l_knee_link" pos="0.01 0'),
+                ('<body name="r_knee_link" pos="0 0', '<body name="r_knee_link" pos="0.01 0'),
+            ],
+            6,
+        ),
+        (
+            [
+                ('<joint name="l_hip_yaw" axis="0 0 -1"', '<joint name="l_hip_yaw" axis="0 -0.5 -0.866"'),
+                ('<joint name="r_hip_yaw" axis="0 0 -1"', '<joint name="r_hip_yaw" axis="0 0.5 -0.866"'),
+            ],
+            6,
+        ),
+        (
+            [
+                ('        <joint name="l_hip_yaw" axis="0 0 -1"/>', ""),
+                ('        <joint name="r_hip_yaw" axis="0 0 -1"/>', ""),
+            ],
+            5,
+        ),
+        (
+            [
+                ('                  <joint name="l_ank_roll" axis="1 0 0"/>', ""),
+                ('                  <joint name="r_ank_roll" axis="1 0 0"/>', ""),
+            ],
+            5,
+        ),
+    ],
+    ids=["knee-forward", "yaw-tilted", "no-yaw", "no-ankle-roll"],
+)
+def test_legs_of_another_build_take_the_same_steps(tmp_path: Path, changes: list[tuple[str, str]], joints: int) -> None:
+    """As far as they can: without a yaw, or a roll at the ankle, feet still go where they should and do not pitch."""
+    text, source = Path(ROBOT.mjcf).read_text(), (CONFIGS / "robots" / "op3.yaml").read_text()
+    for old, new in changes:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    gone = [name for name in ROBOT.names if f'name="{name}"' not in text]
+    source = "\n".join(row for row in source.splitlines() if not any(f"name: {name}," in row for name in gone))
+    (tmp_path / "op3.xml").write_text(text)
+    (tmp_path / "op3.yaml").write_text(source)
+    robot = load_robot(tmp_path / "op3.yaml")
+    assert robot.leg_index.shape == (2, joints)
+    velocity = np.broadcast_to([0.2, 0.0, 0.0], (len(PHASES), 3))
+    legs, gait = Legs(robot), Gait(robot)
+    assert isinstance(gait._inverse, NumericInverse)
+    pose, _ = gait.pose(PHASES, velocity, np.ones(len(PHASES)))
+    own, _ = Gait(ROBOT).pose(PHASES, velocity, np.ones(len(PHASES)))
+    here, there = legs.soles(legs.pick(pose))[0], LEGS.soles(LEGS.pick(own))[0]
+    np.testing.assert_allclose(np.ptp(here, axis=0)[:, [0, 2]], np.ptp(there, axis=0)[:, [0, 2]], atol=2e-3)
+    turn = legs.forward(legs.pick(pose))[1]
+    pitch = np.arctan2(-turn[..., 2, 0], turn[..., 0, 0])
+    np.testing.assert_allclose(pitch, pitch.mean(), atol=0.01)
+
+
+def test_arms_are_found_by_geometry(tmp_path: Path) -> None:
+    for name in ("op3.xml", "op3.yaml"):
+        text = (CONFIGS / "robots" / name).read_text()
+        (tmp_path / name).write_text(text.replace("l_sho_pitch", "l_swing").replace("r_sho_pitch", "r_swing"))
+    robot = load_robot(tmp_path / "op3.yaml")
+    assert ROBOT.arms == {"l_sho_pitch": 1.0, "r_sho_pitch": 1.0}
+    assert robot.arms == {"l_swing": 1.0, "r_swing": 1.0}
+    np.testing.assert_array_equal(walked(Gait(robot), FORWARD, 30), walked(Gait(ROBOT), FORWARD, 30))
+
+
+FORWARD = np.array([0.3, 0.0, 0.0])
 
 
 @pytest.mark.slow

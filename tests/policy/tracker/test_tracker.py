@@ -166,6 +166,10 @@ def step(**changes: Any) -> Step:
         "reference_height": np.full(2, 0.259),
         "reference_joints": joints,
         "reference_contact": feet + 1.0,
+        "reference_gravity": np.tile([0.0, 0.0, -1.0], (2, 1)),
+        "residual": np.zeros((2, 20)),
+        "residual1": np.zeros((2, 20)),
+        "residual2": np.zeros((2, 20)),
         "fallen": np.zeros(2, bool),
         "walking": ROBOT.walking,
         "weight": 30.0,
@@ -175,7 +179,8 @@ def step(**changes: Any) -> Step:
 
 def test_a_perfect_step_earns_all_and_pays_nothing() -> None:
     for name, term in TERMS.items():
-        expected = 1.0 if name in ("velocity", "progress", "yaw_rate", "pose", "contact") else 0.0
+        full = ("velocity", "progress", "yaw_rate", "pose", "contact", "joints", "orientation", "base_height", "travel")
+        expected = 1.0 if name in full else 0.0
         assert term(step()) == pytest.approx([expected, expected]), name
 
 
@@ -188,6 +193,13 @@ FIRST = np.array([1.0, 0.0])
     [
         ("pose", {"joints": ROBOT.home + 0.25 * FIRST[:, None] * np.ones(20)}, np.exp(-1)),
         ("contact", {"foot_force": 15 - 15 * FEET}, 0.5),
+        ("joints", {"joints": ROBOT.home + 0.3 * FIRST[:, None] * np.ones(20)}, (np.exp(-1) + np.exp(-6.25)) / 2),
+        ("orientation", {"gravity": np.array([[0.6, 0.0, -1.0], [0, 0, -1]])}, (np.exp(-1) + np.exp(-9)) / 2),
+        ("base_height", {"height": 0.259 + 0.2 * ROBOT.walking.height * FIRST}, np.exp(-1)),
+        ("travel", {"reference_gravity": np.array([[1.0, 0.0, 0.0], [0, 0, -1]])}, 0.0),
+        ("residual", {"residual": 0.1 * FIRST[:, None] * np.ones(20)}, 0.2),
+        ("residual_rate", {"residual1": 0.1 * FIRST[:, None] * np.ones(20)}, 0.2),
+        ("residual_acceleration", {"residual1": 0.1 * FIRST[:, None] * np.ones(20)}, 0.8),
         ("clearance", {"reference_contact": 1 - FEET, "foot_height": 0.01 * FEET}, 0.5),
         ("clearance", {"reference_contact": 1 - FEET, "foot_height": 0.09 * FEET}, 1.0),
         ("clearance", {"foot_height": 0.01 * FEET}, 0.0),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,9 @@ from servoid.hw.robot.description import load_robot
 from servoid.policy.motion.library import SHIPPED
 from servoid.stack.control.clip import ClipPolicy
 from servoid.stack.control.fleet import Fleet
+from servoid.stack.control.policies import make_policy
 from servoid.stack.log.flightlog import read_log
+from servoid.stack.tasks import load_task
 from servoid.tools.cli import main
 
 ROBOT = load_robot()
@@ -42,10 +43,10 @@ def test_it_enters_plays_and_stays_in_the_last_pose_in_each_world() -> None:
     assert np.abs(np.diff(other, axis=0)).max() > 1e-3, "and anew where an episode begins"
 
 
-def test_a_clip_that_begins_lying_is_refused() -> None:
-    lying = replace(CLIP, about=replace(CLIP.about, begins="lying on the back"))
-    with pytest.raises(ConfigError, match="clip 'circle' begins lying on the back, and a run begins standing"):
-        ClipPolicy(ROBOT, lying)
+def test_a_clip_that_begins_lying_is_no_policy_of_a_run() -> None:
+    path = str(SHIPPED / "get-up-back.safetensors")
+    with pytest.raises(ConfigError, match="'get-up-back' begins lying on the back, and a run begins standing"):
+        make_policy(path, ROBOT, load_task("stand", {}, ROBOT.dt), False)
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ ROBOT = load_robot("op3")
 @pytest.fixture(autouse=True)
 def plain_odometry(monkeypatch):
     """The fake body does not move: what a network adds to its odometry is not what is tested here."""
-    monkeypatch.setattr("servoid.stack.runtime.run.load_odometry", lambda robot: None)
+    monkeypatch.setattr("servoid.stack.runtime.run.odometry_of", lambda robot: (None, None))
 
 
 class Still(BasePolicy):
@@ -251,7 +251,7 @@ def test_odometry_that_does_not_fit_is_refused_before_the_robot_is_asked(monkeyp
     def unfit(robot):
         raise CheckpointError("made for another robot")
 
-    monkeypatch.setattr("servoid.stack.runtime.run.load_odometry", unfit)
+    monkeypatch.setattr("servoid.stack.runtime.run.odometry_of", unfit)
     with pytest.raises(CheckpointError):
         stand(never_connected(), settings={"start": True})
 

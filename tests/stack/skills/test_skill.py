@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from fake_body import StillEstimator, observation
 
 from servoid.hw.config import ConfigError
+from servoid.hw.contracts.control import Instruction
 from servoid.hw.robot.description import load_robot
+from servoid.policy.checkpoint import header
+from servoid.policy.mlp import Mlp
 from servoid.policy.motion.library import Library
+from servoid.policy.tracker.observation import RESIDUAL, TrackerObservation
 from servoid.stack.skills.performers import perform
 from servoid.stack.skills.skill import load_skills, steps, way
 
@@ -56,7 +62,28 @@ def test_the_way_to_a_skill_leads_through_the_poses_that_it_begins_in() -> None:
         way("lying on the front", "upright", SKILLS)
 
 
-def test_a_tracker_is_one_word_in_the_file_and_refused_while_there_is_none(tmp_path: Path) -> None:
-    (tmp_path / "wave.yaml").write_text("about: w\nclip: wave\nphrases: [w]\npolicy: tracker\n")
-    with pytest.raises(ConfigError, match="skill 'wave': policy: tracker needs a tracker of clips"):
+def network(path: Path, config: dict[str, object], *, clips: bool) -> Path:
+    """A tracker that was never trained: its residual is the same for all it sees."""
+    inputs, joints = TrackerObservation(ROBOT, clips=clips).size, len(ROBOT.joints)
+    layer = (np.zeros((inputs, joints), np.float32), np.full(joints, 0.1, np.float32))
+    head = header("tracker", ROBOT, config=config, data="none", licence="Apache-2.0", results={})
+    Mlp([layer], np.zeros(inputs), np.ones(inputs)).save(path, head)
+    return path
+
+
+def test_a_tracker_of_clips_performs_where_the_file_says_so(tmp_path: Path) -> None:
+    path = network(tmp_path / "clips.safetensors", {"clips": ["wave"]}, clips=True)
+    (tmp_path / "wave.yaml").write_text(f"about: w\nclip: wave\nphrases: [w]\npolicy: tracker\ntracker: {path}\n")
+    performer = perform(load_skills(ROBOT, tmp_path)["wave"], ROBOT)
+    performer.reset(None, np.zeros((), int))
+    state = StillEstimator(ROBOT).update(observation(ROBOT, 0, ROBOT.home), ROBOT.home)
+    goals = [performer.act(state, ROBOT.home, Instruction(np.zeros(3))) for _ in range(Library(ROBOT)["wave"].ticks)]
+    assert performer.ended
+    np.testing.assert_allclose(goals[-1] - Library(ROBOT)["wave"].joints[-1], 0.1 * RESIDUAL, atol=1e-3)
+
+
+def test_a_tracker_of_the_gait_alone_is_refused(tmp_path: Path) -> None:
+    path = network(tmp_path / "gait.safetensors", {}, clips=False)
+    (tmp_path / "wave.yaml").write_text(f"about: w\nclip: wave\nphrases: [w]\npolicy: tracker\ntracker: {path}\n")
+    with pytest.raises(ConfigError, match=r"skill 'wave': policy: tracker: .*a tracker of the gait alone"):
         perform(load_skills(ROBOT, tmp_path)["wave"], ROBOT)

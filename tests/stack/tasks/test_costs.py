@@ -9,10 +9,12 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from task_bodies import DT, moves
+from task_bodies import DT, Drawn, moves, state
 
-from servoid.hw.contracts.control import Instruction
+from servoid.hw.contracts.control import DistanceMap, Instruction, State
+from servoid.hw.geometry import to_heading
 from servoid.policy.features import Trajectory
+from servoid.stack.navigation.potential_field import FieldSettings, PotentialField
 from servoid.stack.tasks import load_settings, load_task
 from servoid.stack.tasks.terms.guidance import (
     Stopping,
@@ -22,6 +24,7 @@ from servoid.stack.tasks.terms.guidance import (
     obstacle_cost,
     path_cost,
     total_cost,
+    way_cost,
 )
 
 TWIST = tuple(f"cost.{name}" for name in ("velocity", "yaw_rate", "displacement", "yaw", "stand"))
@@ -52,6 +55,48 @@ def test_obstacle_cost_meets_a_moving_obstacle_where_it_will_be() -> None:
     at_end = 0.5 - 0.4 * DT * horizon
     alone = obstacle_cost(moves(np.zeros((1, 2))), np.array([[at_end + 0.4 * DT, 0, 0.1, -0.4, 0]]), weights)
     assert value(alone) == pytest.approx(np.exp(-15 * (at_end - 0.1)), rel=1e-4)
+
+
+def test_a_body_has_a_width_across_its_heading_and_is_thin_along_it() -> None:
+    weights = Weights(repulsion=1.0, sharpness=10.0, width=0.17, depth=0.05)
+    ahead, beside = (np.array([[x, y, 0.05, 0.0, 0.0]]) for x, y in ((0.3, 0.0), (0.0, 0.3)))
+    here, turned = moves(np.zeros((2, 2))), moves(np.zeros((2, 2)), yaw=np.pi / 2)
+    assert value(obstacle_cost(here, ahead, weights)) == pytest.approx(np.exp(-10 * 0.2), rel=1e-3)
+    assert value(obstacle_cost(here, beside, weights)) == pytest.approx(np.exp(-10 * 0.08), rel=1e-3)
+    assert value(obstacle_cost(turned, ahead, weights)) == pytest.approx(np.exp(-10 * 0.08), rel=1e-3)
+    slanting = moves(np.zeros((2, 2)), yaw=0.3)
+    slanting.yaw.requires_grad_()
+    (gradient,) = torch.autograd.grad(obstacle_cost(slanting, beside, weights).sum(), slanting.yaw)
+    assert (gradient < 0).all()  # turned further, its side is further from what stands beside it
+    with pytest.raises(ValueError, match=r"depth: 0.2 must not be more than width \(0.1\)"):
+        Weights(width=0.1, depth=0.2)
+
+
+def test_repulsion_ends_at_the_safe_distance_and_does_not_grow_inside() -> None:
+    weights = Weights(repulsion=1.0, sharpness=10.0, safe=0.2)
+    costs = [
+        value(obstacle_cost(moves(np.zeros((1, 2))), np.array([[x, 0.0, 0.1, 0, 0]]), weights))
+        for x in (0.31, 0.2, 0.1, 0.02)
+    ]
+    assert costs[0] == 0.0
+    assert costs[1] == pytest.approx(np.exp(-1) - np.exp(-2), rel=1e-3)
+    assert costs[2:] == pytest.approx([1.0 - np.exp(-2)] * 2, rel=1e-3)
+
+
+def test_the_way_to_the_goal_is_measured_past_what_stands_between() -> None:
+    wall = np.array([[0.5, y, 0.08] for y in np.arange(-0.6, 0.31, 0.1)])
+    for yaw in (0.0, 2.0):  # whichever way the robot faces, the map is seen from there
+        here = state(yaw=yaw)
+        field = PotentialField(np.array([1.0, 0.0]), wall, np.zeros(2), FieldSettings())
+        seen, weights = field.seen_from(here), Weights(way=1.0)
+
+        def cost(x: float, y: float, seen: DistanceMap = seen, here: State = here, weights: Weights = weights) -> float:
+            return value(way_cost(moves(to_heading(np.array([[x, y]]), here)), seen, weights))
+
+        assert cost(1.0, 0.0) < 0.2
+        assert cost(1.0, 0.3) < cost(0.5, 0.8) < cost(0.2, 0.0)
+        assert cost(0.2, 0.4) < cost(0.2, -0.2)  # nearer to the end of the wall
+        assert cost(-3.0, 0.0) > cost(-2.0, 0.0) > cost(-1.0, 0.0)  # beyond the map
 
 
 def test_goal_cost_wants_to_be_near_and_to_face_the_goal() -> None:
@@ -186,6 +231,23 @@ def test_weights_choose_the_terms_and_zero_leaves_the_planner_to_itself() -> Non
     )
     with pytest.raises(ValueError, match="margin: must be positive"):
         Weights(margin=0.0)
+
+
+@pytest.mark.parametrize("name", ["goal-near", "goal-far", "goal", "velocity", "path", "forest", "obstacle", "cross"])
+def test_a_planner_that_finds_the_way_is_told_no_velocity_and_no_sentence(name: str) -> None:
+    task = Drawn(load_task(name, {"way": "cost"}, DT), 1)
+    weights = task.settings.weights
+    assert not weights.twist
+    asked = task.instruct(0, state(), task.percept(state()))
+    assert asked.text == ""
+    assert asked.velocity.shape == (3,)  # for policies that follow one
+    walk = moves(0.1 * np.ones((5, 2)), velocity=(0.2, 0.0))
+    assert task.objective is not None
+    costs = {value(task.objective(walk, replace(asked, velocity=np.array([v, 0.0, 0.0])))) for v in (0.0, 0.3)}
+    assert len(costs) == 1
+    assert costs != {0.0}
+    scripted = Drawn(load_task(name, {"way": "script"}, DT), 1)
+    assert scripted.instruct(0, state(), scripted.percept(state())).text is None
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def test_a_robot_names_the_file_of_its_gait(tmp_path: Path) -> None:
     own = (CONFIGS / "policies" / "gait.yaml").read_text().replace("cycle: 0.48", "cycle: 0.72")
     (tmp_path / "mine.yaml").write_text(own)
     text = (CONFIGS / "robots" / "op3.yaml").read_text().replace("mjcf: op3.xml", f"mjcf: {ROBOT.mjcf}")
-    (tmp_path / "robot.yaml").write_text("gait: mine.yaml\n" + text)
+    (tmp_path / "robot.yaml").write_text(text.replace("gait: gait ", "gait: mine.yaml "))
     robot = load_robot(tmp_path / "robot.yaml")
     assert Gait(robot).settings == load_gait(str(tmp_path / "mine.yaml")) != load_gait()
     assert load_settings("walk", robot=robot).cycle == pytest.approx(0.72)

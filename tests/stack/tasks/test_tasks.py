@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
-from types import SimpleNamespace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from servoid.hw.contracts.control import State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import load_robot
+from servoid.policy.features import Trajectory
 from servoid.policy.text.captions import caption
 from servoid.stack.navigation.go_to_point import SpeedProfile
 from servoid.stack.tasks import find, load_settings, load_task, names
@@ -81,7 +81,8 @@ def test_every_task_has_a_file_that_agrees_with_its_defaults() -> None:
     for name in names():
         settings = load_settings(name)
         if find(name).cls.name == name:  # the others are the same class with other settings
-            assert settings == type(settings)(seconds=settings.seconds, cost=settings.cost), name
+            files = {"seconds", "cost", "alone"} & {f.name for f in fields(settings)}
+            assert settings == type(settings)(**{key: getattr(settings, key) for key in files}), name
     assert [load_task(name).seconds for name in names()[:3]] == [10.0, 30.0, 60.0]
     assert {load_task(name).name for name in names()} == set(names())
 
@@ -312,15 +313,18 @@ def test_constant_twist_equals_small_steps() -> None:
             assert angle == pytest.approx(twist[2] * t)
 
 
-def follows(twist: Array, batch: int = 3, horizon: int = 16) -> SimpleNamespace:
+def follows(twist: Array, batch: int = 3, horizon: int = 16) -> Trajectory:
     """Trajectories that move with `twist` exactly."""
     place, yaw = integrate_twist(twist, DT * np.arange(1, horizon + 1))
     expand = lambda values: torch.tensor(np.broadcast_to(values, (batch, *values.shape)).copy())  # noqa: E731
-    return SimpleNamespace(
+    return Trajectory(
         displacement=expand(place).requires_grad_(),
         yaw=expand(yaw),
         velocity=expand(np.tile(twist[:2], (horizon, 1))),
         yaw_rate=expand(np.full(horizon, twist[2])),
+        height=expand(np.full(horizon, 0.26)),
+        joints=expand(np.zeros((horizon, 20))),
+        ticks=np.arange(1, horizon + 1),
         dt=DT,
     )
 

@@ -41,7 +41,7 @@ def test_help_loads_nothing_that_is_slow_to_load() -> None:
     [
         (["tsaks"], "servoid: unknown command 'tsaks'; did you mean 'tasks'?"),
         (["xyzzy"], "servoid: unknown command 'xyzzy'; known: tasks, doctor, run"),
-        (["train", "expret"], "servoid train: unknown command 'expret'; did you mean 'expert'?"),
+        (["train", "trackr"], "servoid train: unknown command 'trackr'; did you mean 'tracker'?"),
         (["tasks", "--jsno"], "servoid tasks: unknown option '--jsno'; did you mean '--json'?"),
         (["tasks", "goal", "walk"], "servoid tasks: unknown argument 'walk'"),
         (["tasks", "gaol"], "servoid: unknown task 'gaol': did you mean 'goal'?"),

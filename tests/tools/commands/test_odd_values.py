@@ -35,7 +35,7 @@ ODD = (
 NEEDED = {
     "run": "walk", "rollout": "walk --workers 1", "replay": "a.mcap", "export": "a.mcap --csv", "plot": "a.mcap",
     "evaluate": "papers --rows uniphys/goal-near --workers 1", "collect": "--out o", "completion": "bash",
-    "train expert": "--out o", "train odometry": "--policy gait", "train latent": "--data d --out o",
+    "train tracker": "--out o", "train odometry": "--policy gait", "train latent": "--data d --out o",
     "train diffusion": "--data d --out o", "motions import": "a.mcap --name n --caption c --licence MIT --out lib",
     "motions list": "--library lib", "motions play": "k --library lib", "motions check": "k --library lib",
     "motions author": "authored --out o", "motions retarget": "a.bvh --licence MIT --out o",

@@ -16,18 +16,20 @@ from servoid.tools.learn.flags import add_setting_flags, plain, read_settings
 from servoid.tools.learn.settings import (
     TITLES,
     DiffusionTraining,
-    ExpertTraining,
     LatentTraining,
     OdometryTraining,
+    PlannerTraining,
+    TrackerTraining,
     TrainingRun,
 )
-from servoid.tools.learn.trainers import diffusion, expert, latent, odometry
+from servoid.tools.learn.trainers import diffusion, latent, odometry, planner, tracker
 
 METHODS: list[tuple[ModuleType, TrainingRun]] = [
-    (expert, ExpertTraining()),
+    (tracker, TrackerTraining()),
     (odometry, OdometryTraining()),
     (latent, LatentTraining()),
     (diffusion, DiffusionTraining()),
+    (planner, PlannerTraining()),
 ]
 
 
@@ -69,12 +71,12 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
     settings = read(DiffusionTraining(), "--config", str(file), "--width", "32", "--steps", "5")
     assert settings == replace(DiffusionTraining(), width=32, horizon=8, monotone=0.1, steps=5)
     assert read(LatentTraining(), "--beta", "0.1", "0.2") == replace(LatentTraining(), beta=(0.1, 0.2))
-    assert read(ExpertTraining(), "--noise", "0.3", "0.1", "--plain-odometry", "--hidden", "32", "16") == replace(
-        ExpertTraining(), noise=(0.3, 0.1), plain_odometry=True, hidden=(32, 16)
+    assert read(TrackerTraining(), "--noise", "0.3", "0.1", "--plain-odometry", "--hidden", "32", "16") == replace(
+        TrackerTraining(), noise=(0.3, 0.1), plain_odometry=True, hidden=(32, 16)
     )
-    changed = read(ExpertTraining(), "--rewards", "slip=-1", "fall=-3")
-    assert isinstance(changed, ExpertTraining)
-    assert changed.rewards == {**ExpertTraining().rewards, "slip": -1.0, "fall": -3.0}
+    changed = read(TrackerTraining(), "--rewards", "slip=-1", "fall=-3")
+    assert isinstance(changed, TrackerTraining)
+    assert changed.rewards == {**TrackerTraining().rewards, "slip": -1.0, "fall": -3.0}
 
 
 def test_minutes_that_are_typed_count_where_steps_are_the_default() -> None:
@@ -100,11 +102,11 @@ def test_a_file_is_refused_by_line_and_key(tmp_path: Path, text: str, message: s
 
 
 def test_a_reward_that_is_no_term_is_refused_by_file_line_and_nearest_name(tmp_path: Path) -> None:
-    text = (CONFIGS / "training" / "expert.yaml").read_text().replace("  slip: -0.5", "  slipp: -0.5")
-    (tmp_path / "expert.yaml").write_text(text)
+    text = (CONFIGS / "training" / "tracker.yaml").read_text().replace("  slip: -0.5", "  slipp: -0.5")
+    (tmp_path / "tracker.yaml").write_text(text)
     line = text.splitlines().index("  slipp: -0.5") + 1
-    with pytest.raises(ConfigError, match=rf"expert.yaml:{line}: .*slipp: no such reward term; did you mean 'slip'"):
-        read(ExpertTraining(), "--config", str(tmp_path / "expert.yaml"))
+    with pytest.raises(ConfigError, match=rf"tracker.yaml:{line}: .*slipp: no such reward term; did you mean 'slip'"):
+        read(TrackerTraining(), "--config", str(tmp_path / "tracker.yaml"))
 
 
 @pytest.mark.parametrize(
@@ -125,7 +127,7 @@ def test_what_makes_no_sense_is_refused_by_its_flag(words: list[str], message: s
 @pytest.mark.parametrize(
     ("base", "changes"),
     [
-        (ExpertTraining(), {"minutes": 200.0, "samples": 40e6}),
+        (TrackerTraining(), {"minutes": 200.0, "samples": 40e6}),
         (DiffusionTraining(), {"minutes": 60.0, "width": 128, "horizon": 24}),
         (LatentTraining(), {}),
         (OdometryTraining(), {"worlds": 240, "seconds": 45.0, "steps": 4000}),
@@ -140,7 +142,7 @@ def test_shipped_files_differ_from_the_defaults_where_they_say_so_alone(
 
 
 def test_shipped_files_are_of_the_networks_that_ship() -> None:
-    made = load_yaml(CONFIGS / "training" / "expert.yaml", ExpertTraining)
+    made = load_yaml(CONFIGS / "training" / "tracker.yaml", TrackerTraining)
     head = read_header(resolve("expert"))
     assert head["config"] == {"hidden": list(made.hidden), "rewards": made.rewards}
     model, head = (

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.world import SceneObject
 from servoid.hw.geometry import headed, joined, turned, yaw_of
 from servoid.policy.features import raw_layout
 from servoid.stack.log.flightlog import FlightLog
@@ -44,6 +45,14 @@ def robots(log: FlightLog) -> Array | None:
     """Where the other robots were seen at each tick of the task, `(ticks, n, 3)`: x, y m, heading rad, odometry
     frame."""
     return _seen(log, "robots")
+
+
+def objects(log: FlightLog) -> tuple[list[SceneObject], Array] | None:
+    """The scene's objects, and where each was seen at each tick of the task `(ticks, n, 7)`, odometry frame."""
+    poses = _seen(log, "objects")
+    held = (log.header.get("scene") or {}).get("objects") or []
+    made = [SceneObject(**{**each, "place": tuple(each["place"]), "size": tuple(each["size"])}) for each in held]
+    return None if poses is None else (made, poses)
 
 
 def got_up(log: FlightLog) -> list[int]:

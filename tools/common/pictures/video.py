@@ -81,6 +81,7 @@ def _frames(log: FlightLog, rows: Array) -> list[Frame]:
     goal, goals = flightpath.goal(log), flightpath.goals(log)
     obstacles, robots = flightpath.obstacles(log), flightpath.robots(log)
     pushes, keyframes = flightpath.pushes(log), flightpath.keyframes(log)
+    objects = flightpath.objects(log)
     rolling = len((log.header.get("scene") or {"spheres": ()})["spheres"])  # the last ones of the obstacles
     pillars = 0 if obstacles is None else obstacles.shape[1] - rolling
     shown, held = [], PUSHED * log.header["robot"]["rate"]
@@ -99,6 +100,7 @@ def _frames(log: FlightLog, rows: Array) -> list[Frame]:
                 plan=running[-1] if running else None,
                 pillars=None if obstacles is None else obstacles[now][:pillars],
                 spheres=None if obstacles is None else obstacles[now][pillars:],
+                objects=() if objects is None else tuple(zip(objects[0], objects[1][now], strict=True)),
                 robots=None if robots is None else robots[now],
                 reach=reach,
                 path=None if path is None else path + flightpath.drift(log, now),

@@ -127,8 +127,8 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
     policy = GaitPolicy(robot, shape) if args.policy == "gait" else ExpertPolicy(robot, args.policy, shape)
     odometry = None if args.plain_odometry else load_odometry(robot)
     sources = {
-        "policy": {"name": "gait"} if args.policy == "gait" else _source(resolve(args.policy)),
-        "odometry": {"name": "legs"} if odometry is None else _source(resolve("odometry")),
+        "policy": {"name": "gait"} if args.policy == "gait" else _source(resolve(args.policy, robot)),
+        "odometry": {"name": "legs"} if odometry is None else _source(resolve("odometry", robot)),
     }
     settings = DisturbanceSettings(scale=(args.noise[0], args.noise[1]))
     schema = Schema(robot.name, robot.rate, _features(robot), tuple(skill.text for skill in SKILLS))

@@ -1,57 +1,82 @@
-"""The environment that the tracker learns in: a fleet following the gait under changing commands and pushes."""
+"""The environment that the tracker learns in: a fleet following the gait under changing commands, and clips, pushed."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.robot.description import Robot, Walking
+from servoid.hw.contracts.control import ReferenceFrames
+from servoid.hw.geometry import up_vector
+from servoid.hw.robot.description import Robot
+from servoid.hw.robot.legs import Legs
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.mlp import Mlp
-from servoid.policy.references.gait import Gait
-from servoid.policy.tracker.observation import AHEAD, RESIDUAL, TrackerObservation
+from servoid.policy.motion.clip import About, Clip
+from servoid.policy.tracker.observation import RESIDUAL, TrackerObservation
 from servoid.policy.tracker.rewards import TERMS, Step
 from servoid.stack.control.fleet import Fleet
+from servoid.tools.learn.envs.motions import Motions
 from servoid.tools.learn.settings import TrackingSettings
 from servoid.tools.learn.terms import Terms
 
-_MIXED_SPEED = 0.7  # of the top speed forward
+_LYING_PUSH = 0.4  # of a push, on a robot whose reference is not upright
 
 
 class Tracking:
     """`n` worlds: see `servoid.tools.learn.trainers.ppo.Environment`. The critic sees privileged truth as well."""
 
-    def __init__(self, robot: Robot, n: int, odometry: Mlp | None, settings: TrackingSettings, seed: int = 0) -> None:
-        """Call `reset` first."""
+    def __init__(
+        self,
+        robot: Robot,
+        n: int,
+        odometry: Mlp | None,
+        settings: TrackingSettings,
+        seed: int = 0,
+        clips: Sequence[Clip] = (),
+    ) -> None:
+        """Call `reset` first. Without `clips` it follows the gait alone."""
         self.robot, self.n, self.settings = robot, n, settings
         self.fleet = Fleet(robot, n, odometry, randomise=settings.randomised, seed=seed)
-        self.gait = Gait(robot, (n,))
-        self.observation = TrackerObservation(robot, (n,))
+        share = settings.clip_share if clips else 0.0
+        self.motions = Motions(robot, clips or [_still(robot)], n, replace(settings, clip_share=share), seed)
+        self.reference = self.motions.reference
+        self.observation = TrackerObservation(robot, (n,), clips=True)
         joints, feet = Mirror.joints(robot), Mirror.feet(robot)
         critic = Mirror.join(
             self.observation.mirror, Mirror.VECTOR, feet, Mirror.vectors(feet),
             *[Mirror.PLANAR, Mirror.FLIPPED] * 2, *[Mirror.SCALAR] * 4, joints,
+            Mirror.SCALAR, Mirror.SCALAR, Mirror.VECTOR, Mirror.SCALAR,
         )  # fmt: skip
         self.mirrors = {"action": joints, "actor": self.observation.mirror, "critic": critic}
         self.action_size = len(robot.joints)
+        self.acting = ~heads(robot)
         self.ticks = np.zeros(n, int)
         self._weight = robot.weight or self.fleet.worlds.weight
         self.limit = round(settings.episode_seconds / robot.dt)
         self.push_scale = 1.0
-        self.reward = Terms(settings.rewards, TERMS)
+        self._walk_reward, self._clip_reward = Terms(settings.rewards, TERMS), Terms(settings.clip_rewards, TERMS)
         self.terms: dict[str, float] = {}
-        self._next_command, self._next_push = np.zeros(n, int), np.zeros(n, int)
+        self._next_push = np.zeros(n, int)
         # Of the last cycle, newest at `ticks % cycle`: velocity and yaw rate, measured and asked.
-        self._cycle = self.gait.cycle_ticks  # over which velocity is judged: within one, a walk sways
+        self._cycle = self.reference.gait.cycle_ticks  # over which velocity is judged: within one, a walk sways
         self._twists = np.zeros((self._cycle, n, 6))
         self._twist = np.zeros((n, 6))
-        self._targets = np.zeros((3, n, len(robot.joints)))
+        self._targets = np.zeros((3, n, len(robot.joints)))  # the last three, newest first
+        self._residuals = np.zeros_like(self._targets)
         self.observations: dict[str, Array] = {}
 
     @property
     def term_names(self) -> tuple[str, ...]:
-        """Of the terms that count."""
-        return self.reward.names
+        """Of the terms that count: of walking, and of clips."""
+        return (*self._walk_reward.names, *(f"clip/{name}" for name in self._clip_reward.names))
+
+    @property
+    def measures(self) -> dict[str, float]:
+        """Share of tries that do well, of each clip."""
+        return {f"success/{name}": value for name, value in self.motions.successes.items()}
 
     def reset(self) -> None:
         """Begin a new episode in every world."""
@@ -61,22 +86,24 @@ class Tracking:
     def schedule(self, progress: float) -> None:
         """Pushes grow over the first fifth of the training."""
         self.push_scale = min(1.0, 0.25 + 0.75 * progress / 0.2)
+        self.motions.schedule(progress)
 
     def _reset(self, where: Array) -> None:
         fleet = self.fleet
-        fleet.reset(where)
-        self.gait.reset(where)
+        fleet.draw(where)
+        fleet.reset(where, self.motions.begin(where, fleet.rngs))
+        self.motions.enter(where, fleet.rngs)
         self.observation.reset(where)
-        self.reward.reset(where)
-        self.ticks[where] = self._next_command[where] = 0
+        self.ticks[where] = 0
         self._next_push[where] = 25
         self._twists[:, where], self._twist[where] = 0.0, 0.0
-        self._targets[:, where] = fleet.applied[where]
+        self._targets[:, where], self._residuals[:, where] = fleet.applied[where], 0.0
 
     def _observe(self) -> None:
         state = self.fleet.observe()
-        frames = self.gait.frames(AHEAD)
-        self._reference = frames
+        frames = self.reference.frames(self.observation.ahead)
+        self.frames = frames
+        self._upright = -up_vector(frames.root_orientation[:, 0])
         actor = self.observation(state, self.fleet.applied, frames)
         truth, worlds = self.fleet.truth, self.fleet.worlds
         bodies = worlds.bodies
@@ -94,20 +121,18 @@ class Tracking:
                     ]
                 ),
                 np.array([b.zero for b in bodies if b]) * 30,
+                self.motions.on_clip[:, None],
+                np.where(self.motions.on_clip, self.reference.clip.phase, 0.0)[:, None],
+                truth.gravity - self._upright,
+                (truth.position[:, 2:] - frames.height[:, :1]) * (2.5 / self.robot.walking.height),
             ],
             -1,
         ).astype(np.float32)
         self.observations = {"actor": actor, "critic": np.concatenate([actor, privileged], -1)}
 
-    def _instruct(self) -> None:
-        """Draw new commands and pushes where they are due, each world from its own stream."""
+    def _push(self) -> None:
+        """Push where it is due, each world by its own stream, and less where the reference is not upright."""
         s, rate = self.settings, self.robot.rate
-        command = self.gait.target.copy()
-        for i in np.flatnonzero(self.ticks >= self._next_command):
-            rng = self.fleet.rngs[i]
-            command[i] = _draw(rng, s, self.robot.walking)
-            self._next_command[i] = self.ticks[i] + round(rng.uniform(*s.command_every) * rate)
-        self.gait.command(command)
         push = np.zeros((self.n, 2))
         for i in np.flatnonzero(self.ticks >= self._next_push):
             rng = self.fleet.rngs[i]
@@ -115,13 +140,14 @@ class Tracking:
                 rng.uniform(0, s.hardest_push * self.push_scale * self.robot.walking.forward),
                 rng.uniform(-np.pi, np.pi),
             )
+            size *= _LYING_PUSH if self._upright[i, 2] > -0.8 else 1.0
             push[i] = size * np.cos(angle), size * np.sin(angle)
             self._next_push[i] = self.ticks[i] + round(rng.uniform(*s.push_every) * rate)
         self.fleet.worlds.push(push)
 
     def _measure(self) -> None:
         """Average what was measured and what was asked over the last cycle."""
-        truth, asked = self.fleet.truth, self._reference
+        truth, asked = self.fleet.truth, self.frames
         now = np.concatenate(
             [
                 truth.velocity[:, :2],
@@ -137,15 +163,30 @@ class Tracking:
 
     def step(self, action: Array) -> tuple[Array, Array, Array]:
         """Act for a tick with residuals `(n, n_joints)`. Returns reward a tick, done and time-out `(n,)`."""
-        reference = self._reference.position[:, 0]
-        contact = self._reference.contact[:, 0]
-        self.fleet.step(reference + RESIDUAL * action)
-        self._targets[1:] = self._targets[:-1].copy()
-        self._targets[0] = self.fleet.applied
+        frames, residual = self.frames, RESIDUAL * action * self.acting
+        self.fleet.step(frames.position[:, 0] + residual)
+        for past, now in ((self._targets, self.fleet.applied), (self._residuals, residual)):
+            past[1:] = past[:-1].copy()
+            past[0] = now
         self.ticks += 1
         truth = self.fleet.truth
-        fallen = truth.fallen
+        failed = self.motions.failed(truth, frames)
         self._measure()
+        reward = self._judge(frames, failed)
+        late = ((self.ticks >= self.limit) | self.motions.closing) & ~failed
+        done = failed | late
+        self._push()
+        self.motions.go_on(self.ticks, self.fleet.applied, self.fleet.rngs)
+        late |= self.motions.closing & ~done
+        done |= late
+        if done.any():
+            self._reset(done)
+        self._observe()
+        return reward * self.robot.dt, done, late
+
+    def _judge(self, frames: ReferenceFrames, failed: Array) -> Array:
+        """The tick's reward `(n,)`, by the terms of what each world follows."""
+        truth = self.fleet.truth
         step = Step(
             velocity=self._twist[:, 0:2],
             yaw_rate=self._twist[:, 2],
@@ -157,46 +198,41 @@ class Tracking:
             target=self._targets[0],
             target1=self._targets[1],
             target2=self._targets[2],
+            residual=self._residuals[0],
+            residual1=self._residuals[1],
+            residual2=self._residuals[2],
             foot_force=truth.foot_force,
             foot_height=truth.foot_position[..., 2],
             foot_velocity=truth.foot_velocity,
             foot_up=truth.foot_up,
             reference_velocity=self._twist[:, 3:5],
             reference_yaw_rate=self._twist[:, 5],
-            reference_height=self._reference.height[:, 0],
-            reference_joints=reference,
-            reference_contact=contact,
-            fallen=fallen,
+            reference_height=frames.height[:, 0],
+            reference_joints=frames.position[:, 0],
+            reference_contact=frames.contact[:, 0],
+            reference_gravity=self._upright,
+            fallen=failed,
             walking=self.robot.walking,
             weight=self._weight,
         )
-        reward, self.terms = self.reward(step)
-        late = (self.ticks >= self.limit) & ~fallen
-        done = fallen | late
-        self._instruct()
-        self.gait.advance()
-        if done.any():
-            self._reset(done)
-        self._observe()
-        return reward * self.robot.dt, done, late
+        on_clip = self.motions.on_clip
+        walk, clip = self._walk_reward(step, ~on_clip), self._clip_reward(step, on_clip)
+        self.terms = {**walk[1], **{f"clip/{name}": value for name, value in clip[1].items()}}
+        return np.where(on_clip, clip[0], walk[0])
 
 
-def _draw(rng: np.random.Generator, s: TrackingSettings, walking: Walking) -> Array:
-    """A command `(3,)`: standing, straight ahead, along one other axis, backward, or any mixture."""
-    command = rng.uniform(walking.lower, walking.upper)
-    slowest, fastest = -walking.backward, walking.forward
-    kind = rng.random()
-    shares = np.cumsum([s.stand, s.forward, s.single, s.backward])
-    if kind < shares[0]:
-        return np.zeros(3)
-    if kind < shares[1]:
-        fast = rng.uniform(fastest - (fastest - slowest) / 3, fastest)
-        return np.array([fast if rng.random() < 0.5 else command[0], 0.0, 0.0])
-    if kind < shares[2]:
-        command[0] = rng.uniform(slowest, 0.0)
-        return np.where(np.arange(3) == rng.integers(3), command, 0.0)
-    if kind < shares[3]:
-        command[0] = rng.uniform(slowest, 0.0)
-    elif command[0] > _MIXED_SPEED * fastest:  # no fast walking while turning or side-stepping
-        command[0] -= _MIXED_SPEED * fastest
-    return command
+def heads(robot: Robot) -> Array:
+    """Joints `(n_joints,)` bool in the mirror's plane that carry no leg: they follow the reference alone, so that what
+    is looked at stays in sight."""
+    alone = robot.mirror[0] == np.arange(len(robot.joints))
+    alone[robot.leg_index.reshape(-1)] = False
+    return alone
+
+
+def _still(robot: Robot) -> Clip:
+    """What a robot without clips has one of: it stands at home."""
+    height, orientation = Legs(robot).stand(robot.home)
+    return Clip(
+        "stand", np.tile(robot.home, (2, 1)), np.tile([0.0, 0.0, float(height)], (2, 1)), np.tile(orientation, (2, 1)),
+        np.ones((2, len(robot.feet))), About(("stand",), "this program", "Apache-2.0"),
+    )  # fmt: skip

@@ -72,15 +72,7 @@ def main(args: argparse.Namespace) -> int:
 
         planning(config, asdict(settings))
     recording = read_recording(args.data, robot)
-    windows = Windows(
-        recording,
-        robot,
-        config,
-        emphasis=settings.emphasis,
-        seed=settings.seed,
-        latents=latents,
-        changes=settings.changes,
-    )
+    windows = Windows(recording, robot, config, emphasis=settings.emphasis, seed=settings.seed, latents=latents)
     trainer = DiffusionTrainer(windows, robot, settings, args.out, source_of(args.data, recording), judge)
     trainer.start(args.resume, args.init)
     trainer.run()

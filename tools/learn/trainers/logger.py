@@ -64,8 +64,13 @@ class Logger:
                     axis.plot(*zip(*points, strict=True), marker="o" if len(points) < 50 else None, ms=3, label=name)
             axis.grid(alpha=0.3)
             if axis.lines:
-                axis.legend()
+                beside = {
+                    "loc": "upper left",
+                    "bbox_to_anchor": (1.0, 1.0),
+                    "fontsize": 6,
+                    "ncols": len(names) // 16 + 1,
+                }
+                axis.legend(**(beside if len(names) > 4 else {}))
         axes[-1, 0].set_xlabel(x)
-        figure.tight_layout()
-        figure.savefig(path, dpi=110)
+        figure.savefig(path, dpi=110, bbox_inches="tight")
         plt.close(figure)

@@ -62,8 +62,9 @@ def main(args: argparse.Namespace) -> int:
         _refuse_unused(args)
         measure(robot, makers, load_odometry(robot, args.measure), settings)
         return 0
+    checkpoint.check_out(args.out, robot.names)
     trainer = OdometryTrainer(
-        robot, names, partial(walked, robot, makers, settings), settings, args.out, _source(names), args.threads
+        robot, names, partial(walked, robot, makers, settings), settings, args.out, _source(robot, names), args.threads
     )
     trainer.judge = lambda path: measure(robot, makers, load_odometry(robot, path), settings)
     trainer.start(args.resume)
@@ -91,6 +92,9 @@ def measure(
             walks, seconds = settings.walks, settings.walk_seconds
             print(f"{name}, {title}: {walks} walks of {seconds:g} s ...", file=sys.stderr)
             result = drift(robot, make, odometry, walks=walks, seconds=seconds, seed=settings.seed + 1)
+            if not result.walks:
+                print(f"{name}, {title}: no walk of {seconds:g} s stayed up and went anywhere: nothing to measure")
+                continue
             key = f"drift_p90_{name}" + ("_legs_alone" if odometry is None else "")
             results[key] = round(result.p90, 4)
             print(
@@ -253,12 +257,13 @@ class OdometryTrainer(Trainer):
         self._saved = saved
 
 
-def _source(names: Iterable[str]) -> str:
+def _source(robot: Robot, names: Iterable[str]) -> str:
     """What walks, by the hash of its network, and the odometry that it knows where it is by."""
     from servoid.stack.log.provenance import sha256
 
-    files = {name: checkpoint.CHECKPOINTS / f"{name}.safetensors" for name in (*names, SHIPPED) if name != "gait"}
-    hashes = {name: sha256(path if path.is_file() else Path(name)) for name, path in files.items()}
+    others = [name for name in (*names, SHIPPED) if name != "gait"]
+    files = {name: Path(name) if name.endswith(".safetensors") else checkpoint.resolve(name, robot) for name in others}
+    hashes = {name: sha256(path) for name, path in files.items()}
     return "walks of " + ", ".join(["gait", *(f"{name} {str(value)[:12]}" for name, value in hashes.items())])
 
 

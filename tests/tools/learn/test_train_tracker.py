@@ -1,4 +1,4 @@
-"""The expert's training: its world, what it saves, how it goes on, and what it exports."""
+"""The tracker's training: its world, what it saves, how it goes on, and what it exports."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ import pytest
 
 from servoid.hw.config import ConfigError, load_yaml
 from servoid.hw.robot.description import load_robot
-from servoid.policy.checkpoint import CheckpointError, read_header
+from servoid.policy.checkpoint import CheckpointError, read_header, resolve
 from servoid.policy.mlp import Mlp
 from servoid.policy.tracker.observation import TrackerObservation
 from servoid.stack.control.fleet import Fleet
-from servoid.tools.learn.envs.tracking import Tracking, _draw
-from servoid.tools.learn.settings import ExpertTraining
-from servoid.tools.learn.trainers.expert import ExpertTrainer
+from servoid.tools.learn.envs.motions import _draw
+from servoid.tools.learn.envs.tracking import Tracking, heads
+from servoid.tools.learn.settings import TrackerTraining
 from servoid.tools.learn.trainers.ppo import tensors
+from servoid.tools.learn.trainers.tracker import TrackerTrainer
 
 ROBOT = load_robot()
 SETTINGS = replace(
-    ExpertTraining(), hidden=(32, 16), horizon=6, mini_batches=2, episode_seconds=1.0, samples=1e6, worlds=8
+    TrackerTraining(), hidden=(32, 16), horizon=6, mini_batches=2, episode_seconds=1.0, samples=1e6, worlds=8
 )
 
 
@@ -35,9 +36,9 @@ def environment(n: int = 8) -> Tracking:
     return env
 
 
-def trainer(out: Path, resume: bool = True, init: Path | None = None, **changes: Any) -> ExpertTrainer:
+def trainer(out: Path, resume: bool = True, init: Path | None = None, **changes: Any) -> TrackerTrainer:
     settings = replace(SETTINGS, **changes)
-    made = ExpertTrainer(Tracking(ROBOT, settings.worlds, None, settings), settings, out)
+    made = TrackerTrainer(Tracking(ROBOT, settings.worlds, None, settings), settings, out)
     made.start(resume, init)
     return made
 
@@ -48,8 +49,8 @@ def rows(out: Path) -> list[float]:
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ExpertTrainer]:
-    out = tmp_path_factory.mktemp("expert")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrackerTrainer]:
+    out = tmp_path_factory.mktemp("tracker")
     first = trainer(out)
     first.prepare()
     before = first.ppo.actor.mlp[0].weight.detach().clone()
@@ -63,7 +64,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ExpertTrain
 
 
 def test_two_iterations_are_saved_with_their_curve(
-    trained: tuple[Path, ExpertTrainer], capsys: pytest.CaptureFixture[str]
+    trained: tuple[Path, TrackerTrainer], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, first = trained
     assert first.step == 2 * 6 * 8
@@ -74,10 +75,10 @@ def test_two_iterations_are_saved_with_their_curve(
     trainer(out, samples=96.0, evaluate_every=0.0).run()  # the same command, where nothing is left to do
     said = capsys.readouterr().err
     assert "nothing is left to train" in said
-    assert said.splitlines()[-1] == f"next: servoid rollout walk --policy {out / 'expert.safetensors'} --episodes 50"
+    assert said.splitlines()[-1] == f"next: servoid rollout walk --policy {out / 'tracker.safetensors'} --episodes 50"
 
 
-def test_it_goes_on_where_it_was(trained: tuple[Path, ExpertTrainer], tmp_path: Path) -> None:
+def test_it_goes_on_where_it_was(trained: tuple[Path, TrackerTrainer], tmp_path: Path) -> None:
     out, first = trained
     shutil.copytree(out, tmp_path / "copy")
     again = trainer(tmp_path / "copy", samples=144.0, evaluate_every=0.0)
@@ -89,35 +90,39 @@ def test_it_goes_on_where_it_was(trained: tuple[Path, ExpertTrainer], tmp_path: 
     assert rows(tmp_path / "copy")[-1] == 144
 
 
-def test_the_export_acts_as_the_trained_actor(trained: tuple[Path, ExpertTrainer]) -> None:
+def test_the_export_acts_as_the_trained_actor(trained: tuple[Path, TrackerTrainer]) -> None:
     import torch
 
     out, first = trained
-    network, head = Mlp.load(out / "expert.safetensors", "tracker", ROBOT, TrackerObservation(ROBOT).size)
+    network, head = Mlp.load(out / "tracker.safetensors", "tracker", ROBOT, TrackerObservation(ROBOT, clips=True).size)
     first.ppo.actor.eval()
     with torch.inference_mode():
         expected = first.ppo.actor(tensors(first.env)).numpy()
-    np.testing.assert_allclose(network(first.env.observations["actor"]), expected, atol=1e-4)
+    still = heads(ROBOT)
+    acted = network(first.env.observations["actor"])
+    np.testing.assert_allclose(acted[:, ~still], expected[:, ~still], atol=1e-4)
+    assert (acted[:, still] == 0.0).all(), "the head follows the reference alone"
+    assert still.sum() == 2
     assert np.abs(expected).max() > 0.01
     assert head["results"]["samples"] == 96
     assert head["config"]["rewards"] == SETTINGS.rewards
     assert head["training"]["hidden"] == [32, 16]
     # What was used is in the folder, as a file that another run takes.
-    assert load_yaml(out / "settings.yaml", ExpertTraining) == replace(SETTINGS, samples=96.0, evaluate_every=0.0)
+    assert load_yaml(out / "settings.yaml", TrackerTraining) == replace(SETTINGS, samples=96.0, evaluate_every=0.0)
 
 
-def test_a_tracker_is_trained_further(trained: tuple[Path, ExpertTrainer], tmp_path: Path) -> None:
+def test_a_tracker_is_trained_further(trained: tuple[Path, TrackerTrainer], tmp_path: Path) -> None:
     """With --init the run begins with what the checkpoint does, less noise, and a critic that learns alone at first."""
     import torch
 
     out, _ = trained
-    source = out / "expert.safetensors"
+    source = out / "tracker.safetensors"
     further = trainer(tmp_path / "further", init=source)
-    network, _ = Mlp.load(source, "tracker", ROBOT, TrackerObservation(ROBOT).size)
+    network, _ = Mlp.load(source, "tracker", ROBOT, TrackerObservation(ROBOT, clips=True).size)
     further.ppo.actor.eval()
     with torch.inference_mode():
         acted = further.ppo.actor(tensors(further.env)).numpy()
-    np.testing.assert_allclose(acted, network(further.env.observations["actor"]), atol=1e-3)
+    np.testing.assert_allclose(further.env.acting * acted, network(further.env.observations["actor"]), atol=1e-3)
     further.prepare()
     critic = further.ppo.critic.mlp[0].weight.detach().clone()
     row = further.learn()
@@ -128,7 +133,7 @@ def test_a_tracker_is_trained_further(trained: tuple[Path, ExpertTrainer], tmp_p
         np.testing.assert_array_equal(layer.weight.detach().numpy().T, weight)
     further.save()
     further.ship(tmp_path / "further.safetensors", further.progress)
-    _, head = Mlp.load(tmp_path / "further.safetensors", "tracker", ROBOT, TrackerObservation(ROBOT).size)
+    _, head = Mlp.load(tmp_path / "further.safetensors", "tracker", ROBOT, TrackerObservation(ROBOT, clips=True).size)
     assert head["results"]["begun_with"]["results"]["samples"] == 96
     again = trainer(tmp_path / "further", init=source)  # the same command goes on
     assert again.begun_with == further.begun_with
@@ -138,18 +143,30 @@ def test_a_tracker_is_trained_further(trained: tuple[Path, ExpertTrainer], tmp_p
     assert not torch.equal(again.ppo.actor.mlp[0].weight, further.ppo.actor.mlp[0].weight)  # the actor learns too
 
 
-def test_a_tracker_with_other_layers_is_not_trained_further(
-    trained: tuple[Path, ExpertTrainer], tmp_path: Path
+def test_a_tracker_with_other_layers_or_inputs_is_not_trained_further(
+    trained: tuple[Path, TrackerTrainer], tmp_path: Path
 ) -> None:
     with pytest.raises(CheckpointError, match=r"hidden layers are \[32, 16\]; give --hidden 32 16"):
-        trainer(tmp_path, init=trained[0] / "expert.safetensors", hidden=(16, 16))
+        trainer(tmp_path, init=trained[0] / "tracker.safetensors", hidden=(16, 16))
+    with pytest.raises(CheckpointError, match="a tracker of the gait alone, which sees less"):
+        trainer(tmp_path, init=resolve("expert"), hidden=(256, 128))
 
 
-def test_a_folder_of_another_run_is_not_gone_on_with(trained: tuple[Path, ExpertTrainer], tmp_path: Path) -> None:
+def test_training_begins_with_the_references_as_they_are(tmp_path: Path) -> None:
+    import torch
+
+    begun = trainer(tmp_path)
+    begun.ppo.actor.eval()
+    with torch.inference_mode():
+        acted = begun.ppo.actor(tensors(begun.env)).numpy()
+    assert 0.0 < np.abs(acted).max() < 0.1
+
+
+def test_a_folder_of_another_run_is_not_gone_on_with(trained: tuple[Path, TrackerTrainer], tmp_path: Path) -> None:
     """Neither for --init, which would be ignored, nor under other settings, nor where an older program began it."""
     out, _ = trained
     with pytest.raises(ConfigError, match=r"did not start from .*--no-resume"):
-        trainer(out, init=out / "expert.safetensors")
+        trainer(out, init=out / "tracker.safetensors")
     with pytest.raises(
         ConfigError, match=r"hidden was \(32, 16\), is \(16, 16\); hardest_push was 0.9, is 0.5.*--no-resume"
     ):
@@ -171,7 +188,7 @@ def test_an_interrupted_run_leaves_its_newest_network(tmp_path: Path) -> None:
     run.learn = interrupted  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
         run.run()
-    assert read_header(tmp_path / "expert.safetensors")["results"]["samples"] == 48
+    assert read_header(tmp_path / "tracker.safetensors")["results"]["samples"] == 48
     assert trainer(tmp_path).step == 48
 
 
@@ -237,7 +254,7 @@ def test_falls_and_time_outs_end_episodes_and_only_time_outs_are_late() -> None:
 def test_the_actor_sees_nothing_of_the_truth_that_the_critic_sees() -> None:
     env = environment(2)
     actor, critic = env.observations["actor"], env.observations["critic"]
-    assert actor.shape == (2, TrackerObservation(ROBOT).size)
+    assert actor.shape == (2, TrackerObservation(ROBOT, clips=True).size)
     assert critic.shape[1] > actor.shape[1]
     np.testing.assert_array_equal(critic[:, : actor.shape[1]], actor)
 

@@ -1,0 +1,74 @@
+"""Things in a MuJoCo model: balls that roll, bags that stand and fall, and seats, which are fixed to the floor."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.world import SceneObject
+
+COLOURS = {"ball": (0.95, 0.55, 0.10, 1.0), "bag": (0.35, 0.30, 0.65, 1.0), "seat": (0.55, 0.42, 0.32, 1.0)}
+POSE, RATE = 7, 6  # numbers of a free body's pose and velocity
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+_ROLLING = 0.0005  # m: a ball of 0.07 m slows down by 0.1 m/s2
+
+
+def shape(thing: SceneObject) -> tuple[mujoco.mjtGeom, list[float]]:
+    """Kind and half sizes [m] of an object's geom."""
+    x, y, z = (part / 2 for part in thing.size)
+    return (mujoco.mjtGeom.mjGEOM_SPHERE, [x, 0, 0]) if thing.kind == "ball" else (mujoco.mjtGeom.mjGEOM_BOX, [x, y, z])
+
+
+def pose(thing: SceneObject) -> Array:
+    """Where an object stands as the scene has it `(7,)`: x, y, z m of the middle, quaternion w x y z."""
+    half = thing.heading / 2
+    return np.array([*thing.place, thing.height, math.cos(half), 0.0, 0.0, math.sin(half)])
+
+
+def add_object(model: mujoco.MjSpec, name: str, thing: SceneObject) -> None:
+    """Add an object under a name. It meets all that collides with the floor, and other objects."""
+    at = pose(thing)
+    body = model.worldbody.add_body(name=name, pos=at[:3], quat=at[3:])
+    kind, size = shape(thing)
+    more: dict[str, Any] = {"mass": thing.mass} if thing.movable else {}
+    if thing.kind == "ball":  # rolling friction counts in contacts of six dimensions, and against the floor's own
+        more |= {"condim": 6, "priority": 2, "friction": [0.8, 0.005, _ROLLING]}
+    if thing.movable:
+        body.add_freejoint(name=name)
+    body.add_geom(type=kind, size=size, rgba=COLOURS[thing.kind], contype=1, conaffinity=1, solref=[0.008, 1.0], **more)
+
+
+class ObjectsOf:
+    """Where the objects of a model's scene are in its arrays. `movable` says which of them are free bodies."""
+
+    def __init__(self, model: mujoco.MjModel, beginning: str) -> None:
+        """`beginning` is that of their bodies' names."""
+        bodies = [model.body(i) for i in range(model.nbody) if model.body(i).name.startswith(beginning)]
+        joints = [model.joint(int(body.jntadr[0])) if body.jntnum[0] else None for body in bodies]
+        self.movable = np.array([joint is not None for joint in joints], dtype=bool)
+        free = [joint for joint in joints if joint is not None]
+        self.qpos = _columns([int(joint.qposadr[0]) for joint in free], POSE)
+        self.qvel = _columns([int(joint.dofadr[0]) for joint in free], RATE)
+        self.begin = model.qpos0[self.qpos]  # (movable objects, 7)
+        self._fixed = np.array([[*body.pos, *body.quat] for body in bodies]).reshape(-1, POSE)
+
+    def poses(self, qpos: Array) -> Array:
+        """Poses `(n, objects, 7)` in worlds of generalised positions `(n, nq)`."""
+        poses = np.repeat(self._fixed[None], len(qpos), 0)
+        poses[:, self.movable] = qpos[:, self.qpos]
+        return poses
+
+    def put(self, qpos: Array, qvel: Array, ids: Array, poses: Array) -> None:
+        """Write poses `(k, movable objects, 7)` of the worlds `ids`, at rest, into bound arrays of a batch."""
+        if not len(self.qpos):
+            return
+        qpos[ids[:, None, None], self.qpos] = poses
+        qvel[ids[:, None, None], self.qvel] = 0.0
+
+
+def _columns(starts: list[int], width: int) -> Array:
+    return np.array(starts, dtype=int)[:, None] + np.arange(width)

@@ -1,0 +1,120 @@
+"""How episodes on clips begin: along a clip as it really goes, or lying, settled, however a fall may end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from servoid.hw.contracts.body import Array, Command, Mode
+from servoid.hw.contracts.world import Start
+from servoid.hw.geometry import turned, up_vector
+from servoid.hw.robot.description import Robot
+from servoid.policy.motion.clip import Clip
+from servoid.policy.references.clip import ClipReference
+from servoid.sim.truth import SimulatedTruth
+from servoid.sim.worlds import Worlds
+from servoid.stack.control.fleet import Fleet
+
+_SETTLE_SECONDS = 2.0
+_EVERY = 5  # ticks between states that are kept of a rollout
+_DEVIATION = 0.5  # squared error of gravity, seen from the base, that a rollout may have come to
+_HEIGHT_DEVIATION = 0.3  # of the standing height, likewise
+
+
+@dataclass(frozen=True)
+class States:
+    """`k` states of bodies to begin in, above the origin, and what they are states of."""
+
+    joints: Array  # (k, n_joints) rad
+    position: Array  # (k, 3) m of the base: 0, 0 and its height
+    orientation: Array  # (k, 4) quaternion w x y z
+    velocity: Array  # (k, 3) m/s of the base, world frame
+    angular_velocity: Array  # (k, 3) rad/s, base frame
+    joint_velocity: Array  # (k, n_joints) rad/s
+    clip: Array  # (k,) index of the clip; -1: none
+    time: Array  # (k,) ticks into it
+
+    @classmethod
+    def of(cls, truth: SimulatedTruth, rows: Array, clip: Array, time: float) -> States:
+        """Of the bodies `rows` now, `time` ticks into the clips `clip` `(k,)`."""
+        return cls(
+            joints=truth.joints[rows],
+            position=truth.position[rows] * np.array([0.0, 0.0, 1.0]),
+            orientation=truth.orientation[rows],
+            velocity=turned(truth.velocity[rows], truth.yaw[rows]),
+            angular_velocity=truth.angular_velocity[rows],
+            joint_velocity=truth.joint_velocity[rows],
+            clip=clip,
+            time=np.full(len(rows), time),
+        )
+
+    def only(self, rows: Array) -> States:
+        """Those of `rows`, `(k,)` bool or indices."""
+        return States(*(getattr(self, field.name)[rows] for field in fields(States)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[States]) -> States:
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(States)))
+
+    @property
+    def front(self) -> Array:
+        """Which of them lie on their front, or nearer to that than to their back `(k,)`: ahead is down."""
+        return up_vector(self.orientation)[:, 0] < 0.0
+
+
+def lying(robot: Robot, n: int, seed: int) -> States:
+    """`n` nominal robots dropped in any orientation and pose and left to settle, every other one limp."""
+    rng = np.random.default_rng([seed, n])
+    worlds = Worlds(robot, n)
+    reach = rng.uniform(0.1, 1.0, (n, 1))
+    joints = robot.home + reach * (rng.uniform(robot.lower, robot.upper, (n, len(robot.joints))) - robot.home)
+    quaternion = rng.normal(size=(n, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    ids = np.arange(n)
+    streams = [np.random.default_rng([seed, i]) for i in range(n)]
+    worlds.reset(ids, streams, Start(joints=joints, orientation=quaternion))
+    modes = np.where(ids % 2 == 0, Mode.OFF, Mode.ACTIVE)
+    # What holds, holds a pose that a run may end in: where the guard's targets are.
+    ones = np.ones((n, len(robot.joints)))
+    for _ in range(round(_SETTLE_SECONDS * robot.rate)):
+        worlds.step(Command(joints, ones, Mode.ACTIVE), modes)
+    truth = worlds.truth
+    still = np.linalg.norm(truth.angular_velocity, axis=-1) < 0.3
+    flat = truth.gravity[:, 2] > -0.5  # it did not come to sit or stand
+    keep = np.flatnonzero(still & flat)
+    return States.of(truth, keep, np.full(len(keep), -1), 0.0)
+
+
+def along(robot: Robot, clips: Sequence[Clip], each: int, seed: int) -> States:
+    """States of rollouts of the clips, open loop, `each` of a clip, half of them of randomised robots: of those that do
+    as the clip does from its beginning to its end."""
+    n = each * len(clips)
+    fleet = Fleet(robot, n, None, randomise=0.5, seed=seed)
+    which = np.repeat(np.arange(len(clips)), each)
+    reference = ClipReference(robot, clips, (n,))
+    pose = np.stack([clips[i].joints[0] for i in which.tolist()])
+    first = Start(
+        joints=pose,
+        position=np.tile([0.0, 0.0, np.nan], (n, 1)),
+        orientation=np.stack([clips[i].root_orientation[0] for i in which.tolist()]),
+    )
+    fleet.reset(np.ones(n, bool), first)
+    for _ in range(round(0.5 * robot.rate)):
+        fleet.step(pose)
+    reference.play(which)
+    good, kept = np.ones(n, bool), []
+    for tick in range(max(clip.ticks for clip in clips)):
+        running = ~reference.ended
+        frames = reference.frames(np.zeros(1, int))
+        if tick % _EVERY == 0:
+            rows = np.flatnonzero(running)
+            kept.append((rows, States.of(fleet.truth, rows, which[rows], float(tick))))
+        fleet.step(frames.position[:, 0])
+        truth = fleet.truth
+        off = ((truth.gravity + up_vector(frames.root_orientation[:, 0])) ** 2).sum(-1) > _DEVIATION
+        low = np.abs(truth.position[:, 2] - frames.height[:, 0]) > _HEIGHT_DEVIATION * robot.standing_height
+        good &= ~((off | low) & running)
+        reference.advance()
+    return States.joined([states.only(good[rows]) for rows, states in kept])
