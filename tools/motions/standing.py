@@ -13,7 +13,7 @@ from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import LegInverse, Legs
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.motion.clip import Clip
-from servoid.sim.statics import Statics
+from servoid.sim.poses.statics import Statics
 from servoid.tools.motions.physics import play
 
 _ROUNDS = 60  # of moving the base until the centre of mass is in its place; each leaves about half of the error
