@@ -21,7 +21,7 @@ _SWINGING = 0.05  # weight of a foot in the air, to one that stands
 
 
 @dataclass(frozen=True)
-class Weights:
+class FollowWeights:
     feet: float
     base: float  # of its height
     balance: float  # of the base's place, level, over the feet
@@ -45,7 +45,7 @@ class FollowedPoints:
 class Inverse:
     """Raises ConfigError where mink is not installed. `narrower` are ranges [rad] of joints within their own."""
 
-    def __init__(self, robot: Robot, weights: Weights, narrower: Mapping[str, tuple[float, float]]) -> None:
+    def __init__(self, robot: Robot, weights: FollowWeights, narrower: Mapping[str, tuple[float, float]]) -> None:
         try:
             import mink
         except ModuleNotFoundError:

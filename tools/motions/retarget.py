@@ -18,8 +18,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import rotate
 from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import About, Clip
-from servoid.sim.poses.inverse import FollowedPoints, Inverse, Weights
-from servoid.tools.motions.human.key_points import SIDES, KeyPoints
+from servoid.sim.poses.inverse import FollowedPoints, Inverse, FollowWeights
+from servoid.tools.motions.human.key_points import SIDES, CapturedMotion
 from servoid.tools.motions.standing import Standing
 
 FROUDE = 0.524  # of a person's times: those of a body of the robot's size at equal weight and inertia
@@ -48,7 +48,7 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class Body:
+class Proportions:
     """`configs/motions/retarget/ROBOT.yaml`."""
 
     stance: float
@@ -56,18 +56,18 @@ class Body:
     stride: float
     stretched: dict[str, tuple[float, float]]
     arms: dict[str, Arm]
-    weights: Weights
+    weights: FollowWeights
 
 
-def load_body(robot: Robot) -> Body:
+def load_body(robot: Robot) -> Proportions:
     """Raises ConfigError for a robot that nobody has described so."""
     kind = "motions/retarget"
     if robot.name not in available(kind):
         raise ConfigError(f"{robot.name}: no configs/{kind}/{robot.name}.yaml says where its arms are: write one")
-    return load_yaml(resolve(kind, robot.name), Body)
+    return load_yaml(resolve(kind, robot.name), Proportions)
 
 
-def retarget(motion: KeyPoints, robot: Robot, name: str, about: About, *, pace: float = 1.0) -> Clip:
+def retarget(motion: CapturedMotion, robot: Robot, name: str, about: About, *, pace: float = 1.0) -> Clip:
     """The clip of a motion, `pace` times as fast as bodies of its size move. Raises ConfigError."""
     standing, body = Standing(robot), load_body(robot)
     _check(motion, robot, name)
@@ -95,7 +95,7 @@ def retarget(motion: KeyPoints, robot: Robot, name: str, about: About, *, pace: 
     )
 
 
-def _check(motion: KeyPoints, robot: Robot, name: str) -> None:
+def _check(motion: CapturedMotion, robot: Robot, name: str) -> None:
     """Raises ConfigError for a motion that leaves the ground, or is not on its feet."""
     if (flight := motion.flight()) > MOST_FLIGHT:
         raise ConfigError(
@@ -148,7 +148,7 @@ def _resampled(asked: FollowedPoints, at: Array) -> FollowedPoints:
     )
 
 
-def _asked(motion: KeyPoints, standing: Standing, body: Body) -> FollowedPoints:
+def _asked(motion: CapturedMotion, standing: Standing, body: Proportions) -> FollowedPoints:
     """What the robot is to follow, at its own size."""
     robot, legs = standing.robot, standing.legs
     p, stands = motion.points, motion.stands()
@@ -230,12 +230,12 @@ def _planted(at: Array, heading: Array, stands: Array) -> tuple[Array, Array]:
     return out, yaw
 
 
-def _at_rate(motion: KeyPoints, rate: float) -> KeyPoints:
+def _at_rate(motion: CapturedMotion, rate: float) -> CapturedMotion:
     """Resampled to `rate` ticks a second of the motion's own time."""
     times = np.arange(int((motion.ticks - 1) / motion.rate * rate) + 1) / rate * motion.rate
     if len(times) < 2:
         raise ConfigError("the motion is shorter than two of the robot's ticks")
-    return KeyPoints(rate, {name: _between(at, times) for name, at in motion.points.items()})
+    return CapturedMotion(rate, {name: _between(at, times) for name, at in motion.points.items()})
 
 
 def _between(values: Array, at: Array) -> Array:

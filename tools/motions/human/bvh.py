@@ -10,7 +10,7 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
-from servoid.tools.motions.human.key_points import SIDES, KeyPoints
+from servoid.tools.motions.human.key_points import SIDES, CapturedMotion
 
 # Names that skeletons give to a point, without spaces, case and prefix: CMU's, Daz's, Mixamo's and Blender's.
 _CENTRE = {"hips": ("hip", "hips", "pelvis", "root"), "neck": ("neck", "lowerneck", "neck1", "spine3", "thorax")}
@@ -36,7 +36,7 @@ class _Joint:
     end: Array | None = None  # of its End Site
 
 
-def read_bvh(path: Path, text: str) -> KeyPoints:
+def read_bvh(path: Path, text: str) -> CapturedMotion:
     """Key points of a BVH file, z up, whichever of y and z is up there. Raises ConfigError naming what is wrong."""
     head, found, motion = text.partition("MOTION")
     if "HIERARCHY" not in head or not found:
@@ -47,7 +47,7 @@ def read_bvh(path: Path, text: str) -> KeyPoints:
     turn = _upright(path, joints, which)
     places = _places(joints, frames)
     points = {name: places[key] @ turn.T for name, key in which.items()}
-    return _without_rest_pose(KeyPoints(rate, points))
+    return _without_rest_pose(CapturedMotion(rate, points))
 
 
 def _hierarchy(path: Path, text: str) -> list[_Joint]:
@@ -189,7 +189,7 @@ def _about(axis: int, angle: Array) -> Array:
     return out
 
 
-def _without_rest_pose(motion: KeyPoints) -> KeyPoints:
+def _without_rest_pose(motion: CapturedMotion) -> CapturedMotion:
     """Without the first frames where they jump: some files begin with their rest pose."""
     step = np.max([np.linalg.norm(np.diff(at, axis=0), axis=-1) for at in motion.points.values()], axis=0)
     if len(step) <= 2 * _LEADING:

@@ -10,7 +10,7 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import multiply, rotate
-from servoid.tools.motions.human.key_points import KeyPoints
+from servoid.tools.motions.human.key_points import CapturedMotion
 
 # Where a joint is in its parent, m, x forward, y up, z right; columns of a frame that hold its turn: a quaternion
 # w x y z, or an angle about z. From the character's file.
@@ -37,7 +37,7 @@ NUMBERS = 44
 RATE = 60.0  # ticks a second that frames of uneven length are resampled at
 
 
-def read_deepmimic(path: Path, text: str) -> KeyPoints:
+def read_deepmimic(path: Path, text: str) -> CapturedMotion:
     """Key points of a clip. Raises ConfigError naming what is wrong."""
     try:
         rows = json.loads(text)["Frames"]
@@ -58,7 +58,7 @@ def read_deepmimic(path: Path, text: str) -> KeyPoints:
     points = {
         name: np.stack([np.interp(at, times, column) for column in place.T], -1) for name, place in places.items()
     }
-    return KeyPoints(RATE, points)
+    return CapturedMotion(RATE, points)
 
 
 def _places(frames: Array) -> dict[str, Array]:

@@ -21,7 +21,7 @@ _SHORTEST = 0.08  # s: what is shorter is noise, standing or not
 
 
 @dataclass(frozen=True)
-class KeyPoints:
+class CapturedMotion:
     """A motion as places of `POINTS`, each `(ticks, 3)`, z up, in a unit of the file's own; x and y as they come."""
 
     rate: float  # ticks a second
@@ -40,8 +40,8 @@ class KeyPoints:
     def ticks(self) -> int:
         return len(self.points["hips"])
 
-    def cut(self, first: int, last: int) -> KeyPoints:
-        return KeyPoints(self.rate, {name: at[first:last] for name, at in self.points.items()})
+    def cut(self, first: int, last: int) -> CapturedMotion:
+        return CapturedMotion(self.rate, {name: at[first:last] for name, at in self.points.items()})
 
     def stands(self) -> Array:
         """When each foot is flat on the ground `(ticks, 2)` bool: heel and toes low and slow.
@@ -89,7 +89,7 @@ def _without_short(flags: Array, ticks: int) -> Array:
     return flags
 
 
-def read(path: Path) -> KeyPoints:
+def read(path: Path) -> CapturedMotion:
     """A motion by the kind of its file: .bvh, or .txt and .json of DeepMimic. Raises ConfigError."""
     from servoid.tools.motions.human.bvh import read_bvh
     from servoid.tools.motions.human.deepmimic import read_deepmimic
