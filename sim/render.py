@@ -18,8 +18,8 @@ from servoid.sim.marks import Frame, draw
 from servoid.sim.model import spec
 from servoid.sim.multi_robot import prefix
 
-AZIMUTH, ELEVATION, DISTANCE = 140.0, -20.0, 1.3  # degrees and m, of the camera that follows the robot
-CLOSE, LOOK = 0.95, 0.2  # m: how near a camera of a given azimuth is, and how high it looks
+AZIMUTH, ELEVATION, DISTANCE = 140.0, -20.0, 5.02  # degrees and standing heights, of the camera that follows the robot
+CLOSE, LOOK = 3.67, 0.77  # standing heights: how near a camera of a given azimuth is, and how high it looks
 ABOVE, ROOM = -40.0, 0.8  # degrees, and m for each m between robots, of the camera that shows several of them
 ASIDE = 30.0  # degrees that it looks past the goal, where there is one: both are in the picture all the way
 FOLLOW = 0.08  # share of the way to the robot that the camera goes each frame: calm, yet never far behind
@@ -62,9 +62,9 @@ def render(
         flags = renderer.scene.flags
         flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows is not False
-        camera = _camera(frames[0]) if frames else mujoco.MjvCamera()
+        camera = _camera(robot, frames[0]) if frames else mujoco.MjvCamera()
         if azimuth is not None:
-            camera.azimuth, camera.distance = azimuth, CLOSE
+            camera.azimuth, camera.distance = azimuth, CLOSE * robot.standing_height
         trail: list[Array] = []
         for number, frame in enumerate(frames):
             _pose(model, data, robot, frame)
@@ -76,7 +76,7 @@ def render(
             places = _places(frame)
             camera.lookat[:2] += FOLLOW * (places.mean(0) - camera.lookat[:2])
             if azimuth is not None:
-                camera.lookat[:] = *frame.place[:2], LOOK
+                camera.lookat[:] = *frame.place[:2], LOOK * robot.standing_height
             renderer.update_scene(data, camera)
             if not trail or np.linalg.norm(frame.place[:2] - trail[-len(places)]) > 0.02:
                 trail += list(places)
@@ -96,10 +96,10 @@ def _seconds(renderer: mujoco.Renderer) -> float:
     return time.perf_counter() - began
 
 
-def _camera(first: Frame) -> mujoco.MjvCamera:
+def _camera(robot: Robot, first: Frame) -> mujoco.MjvCamera:
     """One that follows the robot, or several."""
     camera = mujoco.MjvCamera()
-    camera.azimuth, camera.elevation, camera.distance = AZIMUTH, ELEVATION, DISTANCE
+    camera.azimuth, camera.elevation, camera.distance = AZIMUTH, ELEVATION, DISTANCE * robot.standing_height
     camera.lookat[:] = first.place
     if first.goal is not None:
         ahead = first.goal - first.place[:2]
@@ -107,7 +107,7 @@ def _camera(first: Frame) -> mujoco.MjvCamera:
     if first.robots is not None and len(first.robots):
         places = _places(first)
         camera.lookat[:2], camera.elevation = places.mean(0), ABOVE
-        camera.distance = DISTANCE + ROOM * float(np.ptp(places, axis=0).max())
+        camera.distance += ROOM * float(np.ptp(places, axis=0).max())
     return camera
 
 

@@ -18,7 +18,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import rotate
 from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import About, Clip
-from servoid.sim.poses.inverse import FollowedPoints, Inverse, FollowWeights
+from servoid.sim.poses.inverse import FollowedPoints, FollowWeights, Inverse
 from servoid.tools.motions.human.key_points import SIDES, CapturedMotion
 from servoid.tools.motions.standing import Standing
 

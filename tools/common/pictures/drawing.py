@@ -21,7 +21,7 @@ def prepare(path: Path, size: str) -> tuple[int, int]:
     """
     _check_new(path)
     chosen = _size(size)
-    choose_drawing()
+    _choose_drawing()
     return chosen
 
 
@@ -50,22 +50,25 @@ def _size(text: str) -> tuple[int, int]:
     return size
 
 
-def choose_drawing(option: str = "--video") -> None:
-    """Find a way to draw, for MuJoCo to take when it is loaded. Raises ConfigError naming what is missing, of `option`.
-
-    It is tried in a process of its own: some ways that do not work end the process, and none is to be left open while
-    a robot runs.
-    """
+def _choose_drawing() -> None:
+    """Find packages and a way to draw a film. Raises ConfigError naming what is missing."""
     if any(find_spec(name) is None for name in ("av", "matplotlib", "PIL")):
-        raise ConfigError(f"{option}: this needs the 'video' extra: pip install 'servoid[video]'")
+        raise ConfigError("--video: this needs the 'video' extra: pip install 'servoid[video]'")
     import av
 
     try:
         av.Codec("libx264", "w")
     except av.error.FFmpegError:
-        raise ConfigError(
-            f"{option}: the installed 'av' cannot write H.264: pip install --force-reinstall av"
-        ) from None
+        raise ConfigError("--video: the installed 'av' cannot write H.264: pip install --force-reinstall av") from None
+    choose_drawing("--video")
+
+
+def choose_drawing(what: str) -> None:
+    """Find a way to draw, for MuJoCo to take when it is loaded. Raises ConfigError where there is none for `what`.
+
+    It is tried in a process of its own: some ways that do not work end the process, and none is to be left open while
+    a robot runs.
+    """
     asked = os.environ.get("MUJOCO_GL")
     ways = (asked,) if asked else ("glfw", "egl", "osmesa") if os.environ.get("DISPLAY") else ("egl", "osmesa")
     for way in ways:
@@ -79,4 +82,4 @@ def choose_drawing(option: str = "--video") -> None:
             return
     others = " or ".join(f"MUJOCO_GL={way}" for way in ("egl", "osmesa") if way != asked)
     hint = f"try {others}" if asked else "install libegl1 (or libosmesa6)"
-    raise ConfigError(f"{option}: cannot draw on this machine with {', '.join(ways)}: {hint}")
+    raise ConfigError(f"{what}: cannot draw on this machine with {', '.join(ways)}: {hint}")

@@ -7,6 +7,7 @@ file in the folder --out, called as the clip.
 from __future__ import annotations
 
 import argparse
+from importlib.util import find_spec
 from pathlib import Path
 
 from servoid.hw.config import ConfigError
@@ -34,6 +35,8 @@ def main(args: argparse.Namespace) -> int:
             raise ConfigError(f"--out {args.out}: cannot be created ({error.strerror})") from None
         from servoid.tools.common.pictures.drawing import choose_drawing
 
+        if any(find_spec(name) is None for name in ("av", "PIL")):
+            raise ConfigError("film: this needs the 'video' extra: pip install 'servoid[video]'")
         choose_drawing("film")  # before MuJoCo is imported, which a robot's file does
         from servoid.sim.render import RenderError
         from servoid.tools.motions.film import film
