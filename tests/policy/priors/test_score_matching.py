@@ -163,3 +163,15 @@ def test_folders_of_datasets_are_styles(tmp_path: Path, synthetic_dataset: Path)
     write_dataset(tmp_path / "data" / "wide", ROBOT, episodes=2, ticks=30)
     assert list(read_by_style(tmp_path / "data", ROBOT)) == ["wide"]
     assert list(read_by_style(synthetic_dataset, ROBOT)) == [""]
+
+
+def test_the_shipped_prior_knows_motion_of_this_robot() -> None:
+    found = load_prior(checkpoint.resolve("prior"), ROBOT, limbs_of(ROBOT))
+    results = found.header["results"]
+    assert results["reversed_error"] > 5.0 * results["error"]
+    drawn = generate(found, 8, Style(), 0)
+    still = drawn[:, -1:].expand_as(drawn)
+    score = Score(found, Style(), 0)
+    assert score(still).mean() > 2.0 * score(drawn).mean()
+    speeds, cadences = found.manner["speed"], found.manner["cadence"]
+    assert len(speeds) == len(cadences) >= 3

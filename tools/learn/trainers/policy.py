@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from servoid.policy.priors.score_matching.model import Prior, Style
     from servoid.tools.learn.envs.score_term import Rival
 
-_JUDGED = 64  # worlds
+_JUDGED = 32  # worlds
 _DISCRIMINATOR = "discriminator.safetensors"  # beside the policy
 
 
@@ -53,6 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--init", type=Path, metavar="CHECKPOINT", help="start from this task policy")
     run.add_argument(
         "--demonstrations", type=Path, metavar="DIR", help="start from a network that imitates this dataset"
+    )
+    run.add_argument(
+        "--measure", action="store_true", help="train nothing: measure the policy that training would begin with"
     )
     run.add_argument(
         "--adversarial",
@@ -90,6 +93,10 @@ def main(args: argparse.Namespace) -> int:
     trainer.start(args.resume, args.init)
     if args.demonstrations is not None and not trainer.begun_with:
         trainer.imitate(args.demonstrations)
+    if args.measure:
+        for name, value in trainer.measured().items():
+            print(f"{name:16} {value:.3f}")
+        return 0
     trainer.run()
     return 0
 
@@ -156,10 +163,16 @@ class PolicyTrainer(PpoTrainer):
         self.critic_alone = settings.critic_alone
         nominal = replace(settings, randomised=0.0, generated=0.0, starts=1, unlike=0.0)
         judged = environment(env.task.name, env.score.prior, style, nominal, _JUDGED, settings.seed + 1)
-        self.judge = lambda _: measure(judged, lambda seen: self.actor()(seen["actor"]))
+        self._judged = judged
+        self.judge = lambda _: self.measured()
         measured = ("return", "falls", "prior_error", "amplitude", "amplitude_error", "cadence")
         self.columns = (*self.columns, *measured)
         self.panels = (*self.panels, ("return", "falls"), ("prior_error",), ("amplitude", "cadence"))
+
+    def measured(self) -> dict[str, float]:
+        """What the newest actor does, from standing, on the nominal robot: see `measure`."""
+        actor = self.actor()
+        return measure(self._judged, lambda seen: actor(seen["actor"]))
 
     def learn(self) -> dict[str, float]:
         row = super().learn()
