@@ -61,6 +61,17 @@ VERBS: dict[str, Verb] = {
         },
     ),
     "skills": Verb("list skills, or explain one", "servoid.tools.commands.skills"),
+    "robot": Verb(
+        "describe a robot of your own",
+        verbs={
+            "import": Verb("draft a robot's file from an MJCF or URDF", "servoid.tools.robots.import_robot"),
+            "check": Verb("compare a robot's file with its model", "servoid.tools.robots.check"),
+        },
+    ),
+    "tune": Verb(
+        "search for what suits a robot best",
+        verbs={"gait": Verb("search for the steps that a robot walks best by", "servoid.tools.robots.tune_gait")},
+    ),
     "collect": Verb("record demonstrations as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
         "train a network",

@@ -220,6 +220,7 @@ class Robot:
     standing_height: float = math.nan  # m of the base above the ground at the home pose
     legs: dict[str, tuple[Link, ...]] = field(default_factory=dict)  # of each foot, from the base on
     walking: Walking = Walking()
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, of the base's frame, in that of its body in the MJCF
     passive: tuple[str, ...] = ()  # joints that no servo drives: not commanded, not read
     weight: float | None = None  # N; None: the file does not say it
     # Settings of its gait: a name in configs/policies/, or a .yaml file beside the robot's; empty: none of its own.
