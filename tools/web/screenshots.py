@@ -25,7 +25,7 @@ PATIENCE = 120.0  # s
 @contextmanager
 def command(*words: str) -> Iterator[str]:
     """A `servoid` command with a page, at any free port: the page's address. Raises ConfigError where none comes up."""
-    line = [sys.executable, "-m", "servoid.tools.cli", *words, "--view-port", "0"]
+    line = [str(Path(sys.executable).with_name("servoid")), *words, "--view-port", "0"]
     process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
     said = ""
@@ -48,7 +48,7 @@ def main(folder: Path) -> None:
     with sync_playwright() as playwright, tempfile.TemporaryDirectory() as at:
         browser = playwright.chromium.launch(executable_path=chromium, args=list(WEBGL))
         log = str(Path(at) / "run.mcap")
-        walk = ["goal", "--set", "x=6", "--policy", "diffusion", "--seconds", "90", "--seed", "1"]
+        walk = ["path", "--set", "shape=circle", "--policy", "gait", "--seconds", "600"]
         with command("run", *walk, "--view", "--record", log) as url:
             page = _open(browser, url)
             page.wait_for_function("document.querySelector('#phase').textContent == 'running'")
@@ -79,6 +79,8 @@ def _open(browser: Any, url: str) -> Any:
     page = browser.new_page(viewport=SIZE, bypass_csp=True)
     page.set_default_timeout(1e3 * PATIENCE)
     page.goto(url + "#picture")
+    page.wait_for_function("document.querySelector('#robot').textContent")
+    page.frame_locator("#view").locator(".mantine-Notification-closeButton").click()  # that it draws in software
     return page
 
 
