@@ -48,7 +48,7 @@ def main(folder: Path) -> None:
     with sync_playwright() as playwright, tempfile.TemporaryDirectory() as at:
         browser = playwright.chromium.launch(executable_path=chromium, args=list(WEBGL))
         log = str(Path(at) / "run.mcap")
-        walk = ["path", "--set", "shape=circle", "--policy", "gait", "--seconds", "600"]
+        walk = ["goal", "--set", "x=40", "--set", "y=2", "--policy", "gait", "--seconds", "600"]
         with command("run", *walk, "--view", "--record", log) as url:
             page = _open(browser, url)
             page.wait_for_function("document.querySelector('#phase').textContent == 'running'")

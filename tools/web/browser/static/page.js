@@ -22,7 +22,7 @@ function connect() {
   const scheme = location.protocol === "https:" ? "wss:" : "ws:";
   socket = new WebSocket(`${scheme}//${location.host}${location.pathname}control`);
   socket.onmessage = (event) => hear(JSON.parse(event.data));
-  socket.onopen = () => { lost = false; sequence = 0; send("look"); banner(); };
+  socket.onopen = () => { lost = false; sequence = 0; byId("events").replaceChildren(); send("look"); banner(); };
   socket.onclose = () => { holder = "nobody"; lost = true; stand(); banner(); setTimeout(connect, 1000); };
 }
 
@@ -174,10 +174,11 @@ byId("moment").oninput = () => send("seek", { at: Number(byId("moment").value) }
 function begin() {
   byId("robot").textContent = hello.robot;
   const run = hello.run;
-  byId("run").textContent = run ? `${run.title}, ${run.policy}, ${run.backend}` : "";
+  byId("run").textContent = run ? [run.title, run.policy, run.backend].filter(Boolean).join(", ") : "";
   if (!hello.history.length && !run?.length) byId("events").replaceChildren();
   byId("timeline").hidden = !run?.length;
   document.body.classList.toggle("looking-back", Boolean(run?.length));
+  document.body.classList.toggle("looking-on", run?.steers === false);
   if (run?.length) byId("moment").max = run.length;
   if (byId("joints").tBodies[0].rows.length !== hello.joints.length) makeTable();
   banner();
