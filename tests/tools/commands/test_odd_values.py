@@ -40,7 +40,8 @@ NEEDED = {
     "train prior": "--data d --out o", "train policy": "--task speed --prior prior --out o",
     "motions import": "a.mcap --name n --caption c --licence MIT --out lib",
     "motions list": "--library lib", "motions play": "k --library lib", "motions check": "k --library lib",
-    "motions author": "authored --out o",
+    "motions author": "authored --out o", "motions retarget": "a.bvh --licence MIT --out o",
+    "motions film": "k --library lib --out o",
     "motions mirror": "k --library lib --out o", "motions blend": "k l --name n --library lib --out o",
     "bringup setup": "l_knee --port virtual", "bringup jog": "l_knee --port virtual",
 }  # fmt: skip
