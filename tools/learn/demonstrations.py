@@ -77,7 +77,7 @@ def cloned(
     observations: Array, actions: Array, mirrors: Mirrors, hidden: tuple[int, ...], steps: int, seed: int
 ) -> Mlp:
     """A network with so many `hidden` units, trained on the squared error of actions `(n, action_size)`, and to decide
-    in a mirror what it decides: PPO on mirrored samples spoils one that does not."""
+    in a mirror what it decides: PPO on mirrored samples made one that did not worse."""
     import torch
     from torch import nn
 
