@@ -30,6 +30,8 @@ $(VENV)/.installed-demo: pyproject.toml | $(BIN)/python
 
 $(VENV)/.installed-test: pyproject.toml | $(BIN)/python
 	$(PIP) install --editable '.[test]'
+	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && apt-get -qq update && apt-get -qq install --yes --no-install-recommends chromium >/dev/null; } || \
+		echo "no chromium: tests of the page in a browser are skipped (apt-get install chromium)" >&2
 	touch $@ $(VENV)/.installed-demo
 
 # Without python3-venv, Debian's Python makes half an environment and fails: the next make must not take it for done.

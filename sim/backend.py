@@ -25,7 +25,16 @@ class SimBackend:
 
     name = "sim"
 
-    def __init__(self, robot: Robot, *, seed: int = 0, randomise: bool = False, scene: Scene | None = None) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        seed: int = 0,
+        randomise: bool = False,
+        scene: Scene | None = None,
+        start: Start | None = None,
+    ) -> None:
+        """`start` says how the robot begins, in one row; others of the scene begin as that says."""
         n = count_robots(scene)
         self._robot = robot
         self._worlds = Worlds(
@@ -35,7 +44,7 @@ class SimBackend:
             generator(seed, Stream.BODY),
             *(generator(seed, Stream.TEAMMATES, number) for number in range(1, n)),
         ]
-        start, places = Start(), np.zeros((n, 3))
+        start, places = start or Start(), np.zeros((n, 3))
         if scene is not None and scene.robots is not None:
             places[1:] = scene.robots[:, :3]
             start = Start(position=places * [1.0, 1.0, np.nan], heading=places[:, 2])

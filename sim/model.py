@@ -45,9 +45,8 @@ def spec(robot: Robot, robots: int = 1) -> mujoco.MjSpec:
 
     Of the MJCF only the robot's base and what hangs on it are taken: its actuators, sensors, keyframes, options, floor
     and other bodies are left out, its defaults hold for its own elements alone. Raises ConfigError naming what the MJCF
-    lacks, or the joint whose servo cannot be simulated beside the others.
+    lacks.
     """
-    _check_delays(robot)
     result = mujoco.MjSpec()
     result.modelname = robot.name
     result.option.timestep = TIMESTEP
@@ -103,19 +102,6 @@ def _align_imu(model: mujoco.MjModel, robot: Robot, number: int) -> None:
     mujoco.mju_negQuat(turn, turn.copy())
     if not np.allclose(site.quat, turn, atol=1e-9):
         site.quat[:], model.site_sameframe[site.id] = turn, mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-
-
-def _check_delays(robot: Robot) -> None:
-    """Refuse servos that differ in what is simulated, and drawn, once for the whole robot."""
-    first = robot.servos[0]
-    for joint, servo in zip(robot.joints, robot.servos, strict=True):
-        for key in ("command_delay", "position_latency"):
-            if getattr(servo, key) != getattr(first, key):
-                raise ConfigError(
-                    f"{robot.name}: {joint.name}: {key} of its servo {servo.name} is {getattr(servo, key):g} s, "
-                    f"that of {robot.names[0]}'s {first.name} {getattr(first, key):g} s: simulation has one for all "
-                    "servos of a robot; write the same in both files"
-                )
 
 
 def _add_floor(model: mujoco.MjSpec) -> None:

@@ -26,7 +26,8 @@ NOMINAL_FRICTION = 0.8
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """One robot. `mass` is `(n_bodies,)`, `zero` `(n_joints,)`, biases and tilt `(3,)` and `(2,)`."""
+    """One robot. Figures of servos are those of the first joint's: other servos differ from it as their files say.
+    `mass` is `(n_bodies,)`, `zero` `(n_joints,)`, biases and tilt `(3,)` and `(2,)`."""
 
     stiffness: float
     voltage: float
@@ -80,6 +81,9 @@ def draw(rng: np.random.Generator, robot: Robot, n_bodies: int, randomise: bool)
 
 def longest(robot: Robot) -> tuple[float, float]:
     """The longest command delay and the longest latency that `draw` gives this robot [s]."""
-    servo = robot.servos[0]
-    latency = max(servo.position_latency, robot.imu.latency)
-    return COMMAND_DELAY[1] * (servo.command_delay / _COMMAND_DELAY), LATENCY[1] * (latency / _LATENCY)
+    first = robot.servos[0]
+    later = max(servo.command_delay for servo in robot.servos) - first.command_delay
+    older = max(servo.position_latency for servo in robot.servos) - first.position_latency
+    latency = max(first.position_latency, robot.imu.latency)
+    delay = COMMAND_DELAY[1] * (first.command_delay / _COMMAND_DELAY)
+    return delay + later, LATENCY[1] * (latency / _LATENCY) + older

@@ -18,7 +18,7 @@ from servoid.sim.marks import Frame, draw
 from servoid.sim.model import spec
 from servoid.sim.multi_robot import prefix
 
-AZIMUTH, ELEVATION, DISTANCE = 140.0, -20.0, 1.3  # degrees and m, of the camera that follows the robot
+AZIMUTH, ELEVATION, DISTANCE = 140.0, -20.0, 5.02  # degrees and standing heights, of the camera that follows the robot
 ABOVE, ROOM = -40.0, 0.8  # degrees, and m for each m between robots, of the camera that shows several of them
 ASIDE = 30.0  # degrees that it looks past the goal, where there is one: both are in the picture all the way
 FOLLOW = 0.08  # share of the way to the robot that the camera goes each frame: calm, yet never far behind
@@ -54,7 +54,7 @@ def render(
         flags = renderer.scene.flags
         flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows is not False
-        camera = _camera(frames[0]) if frames else mujoco.MjvCamera()
+        camera = _camera(robot, frames[0]) if frames else mujoco.MjvCamera()
         trail: list[Array] = []
         for number, frame in enumerate(frames):
             _pose(model, data, robot, frame)
@@ -84,10 +84,10 @@ def _seconds(renderer: mujoco.Renderer) -> float:
     return time.perf_counter() - began
 
 
-def _camera(first: Frame) -> mujoco.MjvCamera:
+def _camera(robot: Robot, first: Frame) -> mujoco.MjvCamera:
     """One that follows the robot, or several."""
     camera = mujoco.MjvCamera()
-    camera.azimuth, camera.elevation, camera.distance = AZIMUTH, ELEVATION, DISTANCE
+    camera.azimuth, camera.elevation, camera.distance = AZIMUTH, ELEVATION, DISTANCE * robot.standing_height
     camera.lookat[:] = first.place
     if first.goal is not None:
         ahead = first.goal - first.place[:2]
@@ -95,7 +95,7 @@ def _camera(first: Frame) -> mujoco.MjvCamera:
     if first.robots is not None and len(first.robots):
         places = _places(first)
         camera.lookat[:2], camera.elevation = places.mean(0), ABOVE
-        camera.distance = DISTANCE + ROOM * float(np.ptp(places, axis=0).max())
+        camera.distance += ROOM * float(np.ptp(places, axis=0).max())
     return camera
 
 

@@ -66,11 +66,15 @@ class Worlds:
         servos = robot.servos
         self._unit = np.array([servo.current_unit * servo.torque_per_ampere for servo in servos])
         self._velocity_unit = np.array([servo.velocity_unit for servo in servos])
-        self._tick_angle = 2 * np.pi / np.array([servo.ticks_per_turn for servo in servos])
+        self._tick_angle = robot.tick_angles
         self._nominal_voltage = np.array([servo.voltage for servo in servos])
         self._nominal_stiffness = np.array([servo.stiffness for servo in servos])
         self._braking = np.array([servo.braking_torque for servo in servos])
-        self._voltage_unit = servos[0].voltage_unit
+        self._voltage_unit = np.array([servo.voltage_unit for servo in servos])
+        # What sets a servo apart from the first joint's, which is the one that a body is drawn for.
+        self._volts = self._nominal_voltage / servos[0].voltage
+        self._later = np.array([servo.command_delay - servos[0].command_delay for servo in servos])
+        self._older = np.array([servo.position_latency - servos[0].position_latency for servo in servos])
 
         # Commands that may still be on their way, and samples that may still be on theirs.
         delay, latency = longest(robot)
@@ -90,8 +94,9 @@ class Worlds:
         self.bodies: list[Body | None] = [None] * n
         self._rngs: list[np.random.Generator] = [np.random.default_rng(0)] * n
         self._stiffness = np.zeros(n)
-        self._supply = np.zeros(n)
-        self._delay, self._joint_age, self._imu_age = np.zeros(n), np.zeros(n, int), np.zeros(n, int)
+        self._supply = np.zeros((n, nj))
+        self._delay, self._imu_age = np.zeros((n, nj)), np.zeros(n, int)
+        self._joint_age = np.zeros((n, nj), int)
         self._zero, self._backlash = np.zeros((n, nj)), np.zeros((n, 1))
         self._gyro_bias, self._acc_bias, self._tilt = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2))
         self._noise, self._noise_block = np.zeros((n, NOISE_ROWS, 6 + nj)), np.full(n, -1)
@@ -163,8 +168,9 @@ class Worlds:
 
     def _place(self, i: int, body: Body) -> None:
         self.bodies[i] = body
-        self._stiffness[i], self._supply[i], self._delay[i] = body.stiffness, body.voltage, body.command_delay
-        self._joint_age[i] = round(body.joint_latency / TIMESTEP)
+        self._stiffness[i], self._supply[i] = body.stiffness, body.voltage * self._volts
+        self._delay[i] = np.maximum(body.command_delay + self._later, 0.0)
+        self._joint_age[i] = np.round(np.maximum(body.joint_latency + self._older, 0.0) / TIMESTEP)
         self._imu_age[i] = max(round(body.imu_latency / TIMESTEP) - 1, 0)  # the recorded IMU is a substep old
         self._zero[i], self._backlash[i] = body.zero, body.backlash
         self._gyro_bias[i], self._acc_bias[i], self._tilt[i] = body.gyro_bias, body.accelerometer_bias, body.imu_tilt
@@ -183,18 +189,18 @@ class Worlds:
         self._commands[:, -1] = command.position
         mode = np.broadcast_to(command.mode if modes is None else modes, self.n)[:, None]
         gain = np.where(mode == Mode.ACTIVE, command.gain, 0.0)
-        scale = (self._supply[:, None] / self._nominal_voltage) * (
+        scale = (self._supply / self._nominal_voltage) * (
             self._stiffness[:, None] * self._nominal_stiffness / self._nominal_stiffness[0]
         )
         self._gain[:, :, _KP] = scale * gain
-        self._gain[:, :, _VMAX] = self._supply[:, None]
+        self._gain[:, :, _VMAX] = self._supply
         limit = np.where(mode == Mode.OFF, 0.0, self._braking)
         self._force[:, :, 0], self._force[:, :, 1] = -limit, limit
 
         # The command in force at a substep is the newest that was written at least `delay` before it.
-        start = np.arange(self.substeps) * TIMESTEP - self._delay[:, None]
+        start = (np.arange(self.substeps) * TIMESTEP)[:, None] - self._delay[:, None, :]
         which = np.clip(np.floor(start / self.robot.dt + 1e-6).astype(int) + self._delayed - 1, 0, self._delayed - 1)
-        control = np.take_along_axis(self._commands, which[:, :, None], 1) - self._zero[:, None]
+        control = np.take_along_axis(self._commands, which, 1) - self._zero[:, None]
         self.batch.rollout(self.substeps, control, record=tuple(self._record), out=self._fresh)
         for key, value in self._record.items():
             value[:, : -self.substeps] = value[:, self.substeps :]
@@ -229,12 +235,15 @@ class Worlds:
         rows, last = np.arange(self.n), self._record["qpos"].shape[1] - 1
         noise = self._draw_noise()
         at = last - self._joint_age
-        q = self._record["qpos"][rows, at][:, self._qpos]
+        column = rows[:, None]
+        q = self._record["qpos"][column, at, self._qpos]
         self._play = np.clip(self._play, q - self._backlash / 2, q + self._backlash / 2)
         position = np.round((self._play + self._zero) / self._tick_angle) * self._tick_angle
-        speed = self._record["qvel"][rows, at][:, self._dof] + VELOCITY_NOISE * noise[:, 6:]
+        speed = self._record["qvel"][column, at, self._dof] + VELOCITY_NOISE * noise[:, 6:]
         velocity = np.round(speed / self._velocity_unit) * self._velocity_unit
-        effort = np.round(self._record["actuator_force"][rows, at] / self._unit) * self._unit
+        effort = (
+            np.round(self._record["actuator_force"][column, at, np.arange(len(self._unit))] / self._unit) * self._unit
+        )
         span = last - self._imu_age[:, None] - np.arange(self._imu_span)
         imu = self._record["sensordata"][rows[:, None], span, :6].mean(1)
         gyro, force = with_errors(imu, noise, self.robot.imu, self._tilt, self._gyro_bias, self._acc_bias)
@@ -246,8 +255,8 @@ class Worlds:
             velocity=velocity,
             effort=effort,
             temperature=np.full(shape, np.nan),  # windings are not simulated here
-            voltage=np.broadcast_to(voltage[:, None], shape),
-            age=np.broadcast_to((self._joint_age * TIMESTEP)[:, None], shape),
+            voltage=voltage,
+            age=self._joint_age * TIMESTEP,
             fault=np.zeros(shape, int),
             orientation=np.full((self.n, 4), np.nan),  # no fusion on the board is simulated
             angular_velocity=gyro,

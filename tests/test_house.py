@@ -25,8 +25,18 @@ BELOW: dict[str, set[str]] = {
 }
 # Where a heavy library may be imported as soon as its module is; elsewhere it waits inside a function.
 HEAVY = {
-    "torch": ("policy/diffusion/", "policy/latent/network.py", "policy/latent/dataset.py"),
-    "mujoco": ("sim/",),  # hw/robot/ reads the robot's body by it, when a robot is loaded
+    "torch": (
+        "policy/diffusion/",
+        "policy/priors/score_matching/",
+        "policy/priors/adversarial/",
+        "policy/latent/network.py",
+        "policy/latent/dataset.py",
+    ),
+    "mujoco": (
+        "sim/",
+        "tools/robots/compare.py",
+        "tools/robots/draft.py",
+    ),  # hw/robot/ reads the robot's body by it, when a robot is loaded
 }
 LONGEST = 400  # lines of a file
 ROOMIEST = 12  # modules of a folder beside its folders

@@ -20,6 +20,7 @@ from servoid.stack.runtime.backends import BACKENDS
 from servoid.tools.cli import VERBS, Verb, main
 from servoid.tools.commands import rollout
 from servoid.tools.common.parser import Parser, settings
+from servoid.tools.learn.envs.tasks import LEARNED_TASKS
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
@@ -63,7 +64,9 @@ def check(words: list[str], verbs: dict[str, Verb] = VERBS) -> None:
 def look_up(args: Namespace, verb: Verb) -> None:
     """Names that are not placeholders must exist."""
     task = getattr(args, "task", None)
-    if task and task != "TASK" and not is_file_reference(task):  # which its page writes, and its test runs
+    if verb.module == "servoid.tools.learn.trainers.policy":
+        assert task in LEARNED_TASKS
+    elif task and task != "TASK" and not is_file_reference(task):  # which its page writes, and its test runs
         given = settings(args) if hasattr(args, "set") else {}
         tasks.load_settings(task, given)
     if verb.module in ("servoid.tools.commands.run", "servoid.tools.commands.rollout"):

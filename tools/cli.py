@@ -32,6 +32,7 @@ VERBS: dict[str, Verb] = {
     "tasks": Verb("list tasks and their settings", "servoid.tools.commands.tasks"),
     "doctor": Verb("check that this machine is ready", "servoid.tools.commands.doctor"),
     "run": Verb("run a task on a robot", "servoid.tools.commands.run"),
+    "operate": Verb("control a robot from a page in the browser", "servoid.tools.web.operate"),
     "rollout": Verb("run a task many times in simulation and measure it", "servoid.tools.commands.rollout"),
     "virtual": Verb("serve a virtual rig on a serial port", "servoid.tools.commands.virtual"),
     "bringup": Verb(
@@ -60,6 +61,17 @@ VERBS: dict[str, Verb] = {
         },
     ),
     "skills": Verb("list skills, or explain one", "servoid.tools.commands.skills"),
+    "robot": Verb(
+        "describe a robot of your own",
+        verbs={
+            "import": Verb("draft a robot's file from an MJCF or URDF", "servoid.tools.robots.import_robot"),
+            "check": Verb("compare a robot's file with its model", "servoid.tools.robots.check"),
+        },
+    ),
+    "tune": Verb(
+        "search for what suits a robot best",
+        verbs={"gait": Verb("search for the steps that a robot walks best by", "servoid.tools.robots.tune_gait")},
+    ),
     "collect": Verb("record demonstrations as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
         "train a network",
@@ -70,6 +82,9 @@ VERBS: dict[str, Verb] = {
                 "train latent actions for a diffusion model to plan in", "servoid.tools.learn.trainers.latent"
             ),
             "diffusion": Verb("train the diffusion model", "servoid.tools.learn.trainers.diffusion"),
+            "prior": Verb("train a motion prior", "servoid.tools.learn.trainers.prior"),
+            "policy": Verb("train a policy for a task under a motion prior", "servoid.tools.learn.trainers.policy"),
+            "planner": Verb("train the planner of whole-body motion", "servoid.tools.learn.trainers.planner"),
         },
     ),
     "evaluate": Verb("measure a policy as papers do, or as you define", "servoid.tools.commands.evaluate"),
@@ -90,6 +105,7 @@ VERBS: dict[str, Verb] = {
             "fuzz": Verb("feed random bytes to everything that reads bytes", "servoid.tools.faults.fuzz"),
         },
     ),
+    "view": Verb("look at a recorded run in the browser", "servoid.tools.web.view"),
     "replay": Verb("repeat a recorded run and compare", "servoid.tools.commands.replay"),
     "export": Verb("write a recorded run as CSV or Parquet", "servoid.tools.commands.export"),
     "plot": Verb("draw a recorded run", "servoid.tools.commands.plot"),

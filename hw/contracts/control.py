@@ -103,6 +103,9 @@ class Instruction:
     distances: DistanceMap | None = None  # to the goal by a free way, where the task works that out
     skill: str | None = None  # name of a skill, for as long as that is asked for; None: stand, or walk
     stand: bool = False  # come to rest, and stand: that is all a planner's cost is about, whatever the task wants
+    # Where parts of the body shall be at the end of a plan, by name: m in the heading frame from below the base, a
+    # point of the ground being (2,), others (3,); "heading": rad.
+    targets: Mapping[str, Array] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -11,7 +11,8 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.hw.contracts.world import Percept, Scene
+from servoid.hw.contracts.operator import CommandSource, Intent
+from servoid.hw.contracts.world import Percept, Scene, Start
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,7 @@ class Episode:
     )  # by tick: change of planar velocity (2,) m/s, world frame
     reach: float | None = None  # m from the goal that count as there, where that is judged
     path: Array | None = None  # (n, 2) m to walk along, in the frame that the robot starts in
+    start: Start | None = None  # how a simulated body begins, one row; None: standing at home
     low: bool = False  # the task has the robot sit, lie or touch the ground: only its tilt tells a fall then
 
 
@@ -134,7 +136,7 @@ class Task(Protocol):
 
     @property
     def steered(self) -> bool:
-        """Whether a person steers, who needs real time."""
+        """Whether a person steers, who needs real time: `steered_behaviour` then takes the place of `behaviour`."""
         ...
 
     @property
@@ -153,6 +155,15 @@ class Task(Protocol):
 
     def behaviour(self, episode: Any) -> Behaviour:
         """What is asked in a run of this episode. It opens the devices that it needs. Raises ConfigError."""
+        ...
+
+    def open_source(self) -> CommandSource:
+        """The device that a person steers with, opened, where the task is `steered`. Raises ConfigError where there is
+        none."""
+        ...
+
+    def steered_behaviour(self, episode: Any, wanted: Callable[[], Intent]) -> Behaviour:
+        """What is asked in a run of this episode by a person, who wants now what `wanted` says."""
         ...
 
     @property

@@ -138,9 +138,10 @@ def apply(robot: Robot, calibration: Calibration, source: str = "the calibration
         joints.append(replace(joint, direction=measured.direction, zero=measured.zero))
     assembled = replace(robot, joints=tuple(joints))
     if seam := across_the_seam(assembled):
+        last = robot.servos[robot.names.index(seam[0])].ticks_per_turn - 1
         raise ConfigError(
             f"{source}: with the zero of {', '.join(seam)} a part of the joint's range lies beyond the servo's "
-            f"0/{robot.servos[0].ticks_per_turn - 1} seam, which it cannot cross in position mode: take the horn off, "
+            f"0/{last} seam, which it cannot cross in position mode: take the horn off, "
             f"turn it by half a turn, and {remedy}"
         )
     return assembled

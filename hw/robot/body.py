@@ -63,7 +63,14 @@ def with_body(robot: Robot, marks: Marks) -> Robot:
     _check_given(robot, legs, marks)
     robot = replace(robot, legs=legs, feet=feet, arms=_arms(model, robot, legs))
     if np.isnan(robot.standing_height):
-        robot = replace(robot, standing_height=float(Legs(robot).stand(robot.home)[0]))
+        height = float(Legs(robot).stand(robot.home)[0])
+        if height <= 0:
+            raise marks.error(
+                "base",
+                f"the frame of body {robot.base!r} is {-height:.3f} m below the soles at home: how high the base is "
+                "tells whether the robot has fallen, so its origin must be in the trunk: give that as `origin`",
+            )
+        robot = replace(robot, standing_height=height)
     return robot
 
 
@@ -75,10 +82,10 @@ def _kinematic_model(robot: Robot) -> mujoco.MjModel:
     wanted = {name for foot in robot.feet.values() for name in foot.geoms}
     for element in [*spec.actuators, *spec.sensors, *spec.keys, *spec.equalities, *spec.tendons, *spec.excludes]:
         spec.delete(element)
+    shapes = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF
     for geom in list(spec.geoms):
-        if geom.type in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF):
-            if geom.name not in wanted:
-                spec.delete(geom)
+        if geom.name not in wanted and geom.type in shapes:
+            spec.delete(geom)
         else:
             geom.material = ""
     kept = {geom.meshname for geom in spec.geoms}

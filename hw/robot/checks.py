@@ -138,6 +138,7 @@ def _check_angles(robot: Robot, marks: Marks) -> None:
             raise marks.error(f"{key}.direction", f"{joint.name}: must be 1 or -1, not {joint.direction}")
         for end, value in enumerate(joint.range):
             _require_radians(value, f"{key}.range[{end}]", marks, joint.name)
+        _require_positive(joint.gear, f"{key}.gear", marks)
         _require_radians(joint.home, f"{key}.home", marks, joint.name)
         _require_radians(joint.zero, f"{key}.zero", marks, joint.name)
         low, high = joint.range

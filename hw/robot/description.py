@@ -61,6 +61,7 @@ class Joint:
     home: float
     mirror: str
     mirror_sign: int
+    gear: float = 1.0  # turns of the servo's horn for one of the joint: a belt, or gears between the two
 
 
 @dataclass(frozen=True)
@@ -219,6 +220,7 @@ class Robot:
     standing_height: float = math.nan  # m of the base above the ground at the home pose
     legs: dict[str, tuple[Link, ...]] = field(default_factory=dict)  # of each foot, from the base on
     walking: Walking = Walking()
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, of the base's frame, in that of its body in the MJCF
     passive: tuple[str, ...] = ()  # joints that no servo drives: not commanded, not read
     weight: float | None = None  # N; None: the file does not say it
     # Settings of its gait: a name in configs/policies/, or a .yaml file beside the robot's; empty: none of its own.
@@ -256,15 +258,46 @@ class Robot:
         return np.array([[self.names.index(link.joint) for link in leg] for leg in self.legs.values()])
 
     @cached_property
-    def servos(self) -> tuple[Servo, ...]:
-        """The servo of each joint."""
+    def bare_servos(self) -> tuple[Servo, ...]:
+        """The servo of each joint by itself."""
         models = {name: load_servo(name) for name in {joint.servo for joint in self.joints}}
         return tuple(models[joint.servo] for joint in self.joints)
+
+    @cached_property
+    def servos(self) -> tuple[Servo, ...]:
+        """The servo of each joint as it acts there, behind the joint's gear; ticks alone are the servo's own."""
+        pairs = zip(self.joints, self.bare_servos, strict=True)
+        return tuple(servo if joint.gear == 1.0 else _geared(servo, joint.gear) for joint, servo in pairs)
+
+    @cached_property
+    def tick_angles(self) -> Array:
+        """How far each joint turns for a tick of its servo [rad]."""
+        return 2.0 * np.pi / np.array([servo.ticks_per_turn for servo in self.servos]) / self.gears
+
+    @cached_property
+    def gears(self) -> Array:
+        return np.array([joint.gear for joint in self.joints])
 
     @property
     def dt(self) -> float:
         """Length of a tick [s]."""
         return 1.0 / self.rate
+
+
+def _geared(servo: Servo, gear: float) -> Servo:
+    """A servo seen through a gear: `gear` turns of its own for one of the joint."""
+    return replace(
+        servo,
+        velocity_unit=servo.velocity_unit / gear,
+        torque_per_ampere=servo.torque_per_ampere * gear,
+        stiffness=servo.stiffness * gear**2,
+        stall_torque=servo.stall_torque * gear,
+        no_load_speed=servo.no_load_speed / gear,
+        braking_torque=servo.braking_torque * gear,
+        damping=servo.damping * gear**2,
+        friction=servo.friction * gear,
+        armature=servo.armature * gear**2,
+    )
 
 
 def load_servo(name: str) -> Servo:

@@ -28,7 +28,18 @@ def read_body(robot: Robot) -> mujoco.MjSpec:
     path = Path(robot.mjcf)
     spec = read_spec(path)
     _check(spec, robot, path)
+    if any(robot.origin):
+        _move_origin(spec.body(robot.base), robot.origin)
     return spec
+
+
+def _move_origin(body: mujoco.MjsBody, origin: tuple[float, float, float]) -> None:
+    """Put the origin of a body's frame to a point of it, and leave all that it holds where it is."""
+    for part in [*body.bodies, *body.geoms, *body.sites, *body.cameras, *body.lights, *body.frames]:
+        if part.frame is None:
+            part.pos = part.pos - origin
+    if body.explicitinertial:
+        body.ipos = body.ipos - origin
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:

@@ -101,7 +101,7 @@ def _check_angles(robot: Robot, marks: Marks) -> None:
             "limits.tilt", f"{limits.tilt:g} rad is more than lying down: the robot has fallen long before"
         )
     for i, (joint, servo) in enumerate(zip(robot.joints, robot.servos, strict=True)):
-        turn = math.tau * (servo.ticks_per_turn - 1) / servo.ticks_per_turn
+        turn = math.tau * (servo.ticks_per_turn - 1) / servo.ticks_per_turn / joint.gear
         if joint.range[1] - joint.range[0] > turn:
             raise marks.error(f"joints[{i}].range", f"{joint.name}: wider than the one turn that its servo has")
 

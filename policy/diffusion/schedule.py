@@ -55,7 +55,7 @@ class DenoisingMatrix:
                 f"not {len(self.states)} and {len(self.actions)}"
             )
         for name, rows in (("states", self.states), ("actions", self.actions)):
-            if rows.min() < 0 or (np.diff(rows, axis=0) > 0).any():
+            if rows.min(initial=0) < 0 or (np.diff(rows, axis=0) > 0).any():
                 raise ValueError(f"noise levels of {name} must be >= 0 and never rise from one call to the next")
 
     @property
@@ -177,7 +177,7 @@ def _staggered(
     state_levels: Array | int, action_levels: Array | int, state_delays: Array, action_delays: Array, steps: int
 ) -> DenoisingMatrix:
     """Each token begins at its level and goes down evenly in `steps` calls, after a delay of so many calls."""
-    calls = steps + int(max(state_delays.max(), action_delays.max()))
+    calls = steps + int(max(state_delays.max(initial=0), action_delays.max(initial=0)))
 
     def rows(levels: Array | int, delays: Array) -> Array:
         ladder = np.linspace(np.broadcast_to(levels, delays.shape), 0.0, steps + 1)

@@ -14,13 +14,15 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import Clip, smooth, velocities
 
 BLEND_SHARE = 0.5  # of the speed that the guard allows, that blending in may take
+WAIT_SHARE = 0.8  # the same where the clip waits meanwhile: nothing is added to its own speed
 
 
 class ClipReference(Reference):
     """One or more clips; arrays have any leading dimensions `shape`, and each world a clip, a time in it and a rate.
 
     A loop goes on from its end, its place and heading carried along. Another clip holds its last frame. `enter` begins
-    a clip in the pose that the robot is in: what it differs by fades out, no faster than the guard allows.
+    a clip in the pose that the robot is in: what it differs by fades out, no faster than the guard allows. One that
+    does not begin upright waits in its first frame for that long: limbs must be where they are to push.
     """
 
     def __init__(self, robot: Robot, clips: Sequence[Clip], shape: tuple[int, ...] = ()) -> None:
@@ -42,6 +44,7 @@ class ClipReference(Reference):
         longest = max(clip.ticks for clip in clips)
         self._ticks = np.array([clip.ticks for clip in clips])
         self._loop = np.array([clip.about.loop for clip in clips])
+        self._waits = np.array([clip.about.begins != "upright" for clip in clips])
 
         def table(arrays: list[Array]) -> Array:  # what is beyond a clip's end repeats its last frame
             return np.stack([np.concatenate([a, np.repeat(a[-1:], longest - len(a), 0)]) for a in arrays])
@@ -60,11 +63,11 @@ class ClipReference(Reference):
         self.time = np.zeros(shape)  # ticks into the clip, fractions too
         self.rate = np.ones(shape)  # of playing: 2 is twice as fast
         self._offset = np.zeros((*shape, len(robot.joints)))  # of the pose that was entered from
-        self._since, self._blend = np.zeros(shape), np.ones(shape)  # ticks
+        self._since, self._blend = np.ones(shape), np.ones(shape)  # ticks since it was entered; that it takes
 
     def reset(self, where: Array | slice = slice(None)) -> None:
         """Begin the same clips anew, without a blend."""
-        for array, value in ((self.time, 0.0), (self._offset, 0.0), (self._since, 0.0), (self._blend, 1.0)):
+        for array, value in ((self.time, 0.0), (self._offset, 0.0), (self._since, 1.0), (self._blend, 1.0)):
             array[() if array.ndim == 0 or not self.clip.ndim else where] = value
 
     def play(
@@ -73,14 +76,15 @@ class ClipReference(Reference):
         """Play clips by their index, from `time` [ticks] on, in the worlds `where` (default: all), without a blend."""
         chosen = ... if where is None or not self.clip.ndim else where
         self.clip[chosen], self.time[chosen], self.rate[chosen] = clip, time, rate
-        self._offset[chosen], self._since[chosen], self._blend[chosen] = 0.0, 0.0, 1.0
+        self._offset[chosen], self._since[chosen], self._blend[chosen] = 0.0, 1.0, 1.0
 
     def enter(self, joints: Array, where: Array | None = None) -> None:
         """Begin in the pose `joints` `(..., n_joints)` rad: what it differs from the clip by fades out."""
         chosen = ... if where is None or not self.clip.ndim else where
         offset = joints - self._joints[self.clip, self._index(self.time)[0]]
         # A minimum-jerk blend is at its quickest 1.875 times as fast as its mean.
-        speed = BLEND_SHARE * self.robot.limits.joint_speed * self.robot.dt
+        share = np.where(self._waits[self.clip], WAIT_SHARE, BLEND_SHARE)
+        speed = share * self.robot.limits.joint_speed * self.robot.dt
         ticks = np.maximum(np.ceil(1.875 * np.abs(offset).max(-1) / speed), 1.0)
         self._offset[chosen], self._blend[chosen] = offset[chosen], ticks[chosen]
         self._since[chosen] = 0.0
@@ -95,8 +99,14 @@ class ClipReference(Reference):
         last = self._ticks[self.clip] - 1.0
         return np.where(self._loop[self.clip], self.time % last, np.minimum(self.time, last)) / last
 
+    @property
+    def _wait(self) -> Array:
+        """Ticks that each world still waits for `(...)`."""
+        return np.where(self._waits[self.clip], np.maximum(self._blend - self._since, 0.0), 0.0)
+
     def advance(self) -> None:
-        self.time = np.asarray(self.time + self.rate)  # of one robot a sum is a number, and could not be set again
+        # Of one robot a sum is a number, and could not be set again.
+        self.time = np.asarray(self.time + self.rate * (self._wait < 1.0))
         self._since = np.asarray(self._since + 1.0)
 
     def _index(self, time: Array) -> tuple[Array, Array]:
@@ -108,11 +118,13 @@ class ClipReference(Reference):
         return low, within - low
 
     def frames(self, ahead: Array) -> ReferenceFrames:
-        time = self.time[..., None] + np.asarray(ahead) * self.rate[..., None]
+        wait = np.floor(self._wait)[..., None]
+        passed = np.where(wait > 0.0, np.maximum(ahead - wait, 0.0), ahead)
+        time = self.time[..., None] + passed * self.rate[..., None]
         clip = np.broadcast_to(self.clip[..., None], time.shape)
         at = self._reader(time)
         still = ~self._loop[clip] & (time >= self._ticks[clip] - 1)
-        moving = np.where(still, 0.0, self.rate[..., None])
+        moving = np.where(still | (ahead < wait), 0.0, self.rate[..., None])
         fading = np.clip((self._since[..., None] + np.asarray(ahead)) / self._blend[..., None], 0.0, 1.0)
         offset = (1.0 - smooth(fading))[..., None] * self._offset[..., None, :]
         slope = 30.0 * fading**2 * (1.0 - fading) ** 2 / (self._blend[..., None] * self.robot.dt)

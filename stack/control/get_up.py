@@ -1,12 +1,13 @@
-"""Gets up by a clip, open loop: first the clip's first pose, from however the robot lies, then the clip, then home.
+"""Gets up by a clip, from however the robot lies, and goes home: open loop, or followed by a tracker.
 
 It proposes targets as a policy does. Which way the robot lies, gravity says; on its side the nearer of both. Going to
-the first pose often rolls it over, so that is looked at again before the clip is played.
+the clip's first pose often rolls it over, so that is looked at again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -14,9 +15,12 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import Robot
+from servoid.policy.checkpoint import CHECKPOINTS, read_header
 from servoid.policy.motion.clip import Clip
 from servoid.policy.motion.library import Library
 from servoid.policy.references.clip import BLEND_SHARE, ClipReference
+from servoid.policy.references.either import GaitOrClip
+from servoid.stack.control.tracker import Tracker
 from servoid.stack.log.provenance import sha256
 from servoid.stack.safety.min_jerk import MIN_JERK_PEAK, MinJerk
 from servoid.stack.safety.recovery import Recovery
@@ -25,6 +29,8 @@ CLIPS = ("get-up-front", "get-up-back")
 SETTLE_SECONDS = 0.5  # in a clip's first pose: clips were recorded from there, at rest
 STAND_SECONDS = 1.5  # that the robot has to come to a stand in when the clip is over
 HOME_SECONDS = 2.0  # the same, when it is home
+RATE = 1.3  # at which a tracker gets up, of the clip's own speed
+ROLLED_SHARE = 0.15  # of a clip, in which the robot may still roll over to its other side
 
 
 class GetUp:
@@ -93,14 +99,57 @@ class GetUp:
             yield self._applied
 
 
+class TrackedGetUp(GetUp):
+    """Gets up with a tracker: it needs no rest in the clip's first pose, keeps its balance, and stands by the gait."""
+
+    def __init__(self, robot: Robot, clips: tuple[Clip, Clip], tracker: Tracker) -> None:
+        """Raises ConfigError where the clips do not fit."""
+        super().__init__(robot, clips)
+        self._tracker, self._either = tracker, GaitOrClip(robot, clips)
+
+    def _rise(self, recovery: Recovery) -> Iterator[Array]:
+        reference, everywhere = self._either, np.ones((), bool)
+        self._tracker.reset()
+        side = self._side()
+        reference.play(side, self._applied, everywhere, rate=RATE)
+        rolled = False
+        while not reference.ended:
+            # While it comes to the first pose it may roll over: once that is answered, twice it has no end.
+            if not rolled and reference.clip.time < ROLLED_SHARE * self._clips[side].ticks and self._side() != side:
+                rolled, side = True, self._side()
+                reference.play(side, self._applied, everywhere, rate=RATE)
+            yield self._follow()
+        for _ in range(round(SETTLE_SECONDS * self._robot.rate)):
+            yield self._follow()
+        reference.stand(self._applied, everywhere)
+        for _ in range(round((STAND_SECONDS + HOME_SECONDS) * self._robot.rate)):
+            yield self._follow()
+        self.failed = (
+            "it stood up, and did not come to a stand at home"
+            if recovery.stands
+            else f"'{CLIPS[side]}' did not end on its feet and still"
+        )
+
+    def _follow(self) -> Array:
+        target = self._tracker(self._state, self._applied, self._either)
+        self._either.advance()
+        return target
+
+
 def get_up(robot: Robot) -> GetUp:
-    """By the clips of the shipped library. Raises ConfigError for a robot that has none, or cannot know how it lies."""
+    """By the clips of the shipped library, and the shipped tracker where it knows clips of this robot.
+
+    Raises ConfigError for a robot that has no clips, or cannot know how it lies.
+    """
     if robot.imu.kind == "none":
         raise ConfigError(f"--recover: {robot.name} has no IMU, so it cannot know that it has fallen: drop --recover")
     try:
         library = Library(robot)
         front, back = (library[name] for name in CLIPS)
-        return GetUp(robot, (front, back))
+        path = _tracker_of(robot)
+        if path is None:
+            return GetUp(robot, (front, back))
+        return TrackedGetUp(robot, (front, back), Tracker(robot, str(path), clips=True))
     except ConfigError as error:
         names = " and ".join(f"'{name}'" for name in CLIPS)
         raise ConfigError(
@@ -108,7 +157,14 @@ def get_up(robot: Robot) -> GetUp:
         ) from error
 
 
+def _tracker_of(robot: Robot) -> Path | None:
+    """The shipped tracker, where there is one of this robot."""
+    path = CHECKPOINTS / "tracker.safetensors"
+    return path if path.is_file() and read_header(path)["robot"] == robot.name else None
+
+
 def fingerprints(robot: Robot) -> dict[str, str | None]:
-    """Hashes of the clips' files, by their names, of a robot that has them."""
-    library = Library(robot)
-    return {name: sha256(library.path(name)) for name in CLIPS}
+    """Hashes of the clips' files, by their names, of a robot that has them, and of the tracker that follows them."""
+    library, tracker = Library(robot), _tracker_of(robot)
+    clips = {name: sha256(library.path(name)) for name in CLIPS}
+    return clips if tracker is None else {**clips, "tracker": sha256(tracker)}

@@ -1,4 +1,4 @@
-"""What a person steers with: a gamepad, or the keys of a terminal. Neither needs a display."""
+"""What a person steers with at this machine: a gamepad, or the keys of a terminal. Neither needs a display."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import sys
 import termios
 import tty
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from servoid.hw.config import ConfigError
-from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.operator import CommandSource, Intent
 
 DEAD_ZONE = 0.1  # of a stick's way: worn ones do not come back to the middle
 FULL = 32767  # of a stick's way; up and left are negative
@@ -25,24 +25,6 @@ _KEYS = {
     "w": (0, _STEP), "s": (0, -_STEP), "q": (1, _STEP), "e": (1, -_STEP), "a": (2, _STEP), "d": (2, -_STEP),
     "\x1b[A": (0, _STEP), "\x1b[B": (0, -_STEP), "\x1b[D": (2, _STEP), "\x1b[C": (2, -_STEP),
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class SteeringInput:
-    """What the person wants now. `way` is `(3,)` in -1..1: forward, to the left, turning left."""
-
-    way: Array
-    ends: bool = False
-
-
-class Steering(Protocol):
-    """A device to steer with."""
-
-    def read(self) -> SteeringInput:
-        """Never waits."""
-        ...
-
-    def close(self) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -95,21 +77,21 @@ class Gamepad:
         if self._pad is None:
             raise ConfigError("no gamepad is connected: plug one in, or steer by keys with --set device=keyboard")
 
-    def read(self) -> SteeringInput:
+    def read(self) -> Intent:
         self._pygame.event.get()  # lets SDL look at its devices
         if self._pad is not None and not self._pad.attached():
             self._pad = None
         if self._pad is None:
             self._find()
         if self._pad is None:
-            return SteeringInput(np.zeros(3))
+            return Intent()
         way = np.array([self._stick(axis) for axis in self._axes])
         self._centred = self._centred or not way.any()
         if not self._centred:
             if not self._told:
                 print("let go of the gamepad's sticks: they count once they are in the middle", file=sys.stderr)
             self._told, way = True, np.zeros(3)
-        return SteeringInput(way, bool(self._pad.get_button(self._end)))
+        return Intent(way=way, ends=bool(self._pad.get_button(self._end)))
 
     def close(self) -> None:
         self._pad = None
@@ -144,7 +126,7 @@ class Keyboard:
         self._way, self._ends = np.zeros(3), False
         print(KEYS_HELP, file=sys.stderr, flush=True)
 
-    def read(self) -> SteeringInput:
+    def read(self) -> Intent:
         while select.select([self._fd], [], [], 0.0)[0]:
             try:
                 pressed = os.read(self._fd, 64).decode("ascii", "ignore")
@@ -154,7 +136,7 @@ class Keyboard:
                 self._way, self._ends = np.zeros(3), True
                 break
             self._press(pressed)
-        return SteeringInput(self._way.copy(), self._ends)
+        return Intent(way=self._way.copy(), ends=self._ends)
 
     def close(self) -> None:
         """Leave the terminal as it was. May be called twice."""
@@ -176,7 +158,7 @@ class Keyboard:
                 self._way[part] = np.clip(self._way[part] + change, -1.0, 1.0)
 
 
-def open_steering(device: str, controls: Controls | None = None) -> Steering:
+def open_steering(device: str, controls: Controls | None = None) -> CommandSource:
     """The device of that kind: gamepad, with its `controls`, keyboard, or auto for the first that is there. Raises
     ConfigError."""
     if device == "keyboard":

@@ -10,7 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import yaml
+
 from servoid.hw.config import ConfigError, available, nearest
+from servoid.hw.config import resolve as find
 from servoid.hw.contracts.control import Policy
 from servoid.hw.contracts.task import Task
 from servoid.hw.plugins import Plugin, Portable, installed, load_plugin
@@ -19,6 +22,7 @@ from servoid.stack.control.base import BasePolicy
 
 if TYPE_CHECKING:
     from servoid.policy.diffusion.settings import DiffusionSettings
+    from servoid.stack.control.closed_loop import ClosedLoopSettings
     from servoid.stack.control.diffusion import DiffusionPolicy
 
 Maker = Callable[[str, Robot, Task, bool, tuple[int, ...]], Policy]
@@ -71,9 +75,37 @@ def _clip(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[in
     return policy
 
 
+def _task_policy(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
+    from servoid.policy.priors.task_policy import TaskPolicy
+
+    policy: Policy = TaskPolicy(robot, Path(source), shape)
+    return policy
+
+
+def _closed_loop(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
+    from servoid.stack.control.closed_loop import closed_loop_policy
+
+    policy: Policy = closed_loop_policy(robot, _loop_settings(source), process=realtime, shape=shape)
+    return policy
+
+
+def _loop_settings(source: str) -> ClosedLoopSettings:
+    """Settings of planning in a closed loop. Raises ConfigError."""
+    from servoid.stack.control.closed_loop import load_settings
+
+    trained = source.endswith(".safetensors")
+    return replace(load_settings(), checkpoint=source) if trained else load_settings(source)
+
+
 # Policies of Servoid's own; besides there are the planner's other settings in configs/policies/.
 POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "gait": _gait}
-_KINDS: dict[str, Maker] = {"diffusion": _diffusion, "tracker": _expert, "clip": _clip}  # of .safetensors files
+_KINDS: dict[str, Maker] = {  # of .safetensors files
+    "diffusion": _diffusion,
+    "tracker": _expert,
+    "clip": _clip,
+    "planner": _closed_loop,
+    "task_policy": _task_policy,
+}
 
 
 def _own(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
@@ -112,9 +144,9 @@ def make_policy(
     """A policy for a robot and a task, or for worlds of any leading `shape`.
 
     Raises ConfigError for an unknown name, or for a checkpoint that does not fit. `name` is one of `names`, the
-    .safetensors file of a diffusion model, a tracker or a clip, a .yaml file of diffusion settings, or
-    `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it answers at the tick that its plan is
-    for. `planner` holds the settings of a recorded diffusion policy: no file is read for them then.
+    .safetensors file of a diffusion model, a tracker, a clip, a planner or a task policy, a .yaml file of settings of
+    one that plans, or `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it answers at the tick
+    that its plan is for. `planner` holds the settings of a recorded diffusion policy: no file is read for them then.
     """
     if planner is not None:
         return _planned(planner, robot, task, realtime, shape)
@@ -123,7 +155,8 @@ def make_policy(
 
 def policy_fingerprint(name: str, robot: Robot | None = None) -> dict[str, Any]:
     """Name of a policy and what it is made of, for the flight log: its checkpoint and that of odometry by their hashes,
-    settings of the planner or of the robot's gait, and the file of a user's own. None for what it has not.
+    settings of the planner, of a closed loop with its tracker or of the robot's gait, and the file of a user's own.
+    None for what it has not.
 
     `robot` is by default the shipped one. Raises ConfigError.
     """
@@ -135,23 +168,37 @@ def policy_fingerprint(name: str, robot: Robot | None = None) -> dict[str, Any]:
     maker = _maker(name)
     planner = _planner(name) if maker is _diffusion else None
     own = _plugin(name) if maker is _own else None
-    named = name if maker in (_expert, _clip) else None if planner is None else planner.checkpoint
+    loop = _loop_settings(name) if maker is _closed_loop else None
+    named = name if maker in (_expert, _clip, _task_policy) else None
+    if (planned := planner or loop) is not None:
+        named = planned.checkpoint
     checkpoint = None if named is None else resolve(named, robot)
     return {
         "name": name,
         "checkpoint_sha256": None if checkpoint is None else sha256(checkpoint),
         "odometry_sha256": sha256(resolve("odometry", robot)),
         "planner": None if planner is None else described(planner),
+        "closed_loop": None if loop is None else described(loop),
+        "tracker_sha256": sha256(resolve(loop.tracker, robot)) if loop is not None and loop.tracker else None,
         "gait": described(gait_of(robot)) if maker in (_gait, _expert) else None,
         "source": None if own is None else own.source(),
     }
+
+
+def _is_loop(name: str) -> bool:
+    """Whether a file of settings is of planning in a closed loop: it names a tracker, be it none."""
+    path = find("policies", name)
+    try:
+        return path.is_file() and "tracker" in (yaml.safe_load(path.read_text(encoding="utf-8")) or {})
+    except (OSError, UnicodeDecodeError, TypeError, yaml.YAMLError):
+        return False  # whoever loads it says what is wrong
 
 
 def _maker(name: str) -> Maker:
     if name in POLICIES:
         return POLICIES[name]
     if name.endswith((".yaml", ".yml")) or name in available("policies"):
-        return _diffusion
+        return _closed_loop if _is_loop(name) else _diffusion
     if name.endswith(".safetensors"):
         from servoid.policy.checkpoint import read_header
 

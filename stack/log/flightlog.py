@@ -7,7 +7,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -58,22 +58,18 @@ def read_log(path: Path | str) -> FlightLog:
     """Read a flight log up to its last complete chunk. Raises ConfigError for what is none."""
     path = Path(path)
     found: dict[str, list[Message]] = {channel: [] for channel in SCHEMAS}
-    try:
-        file = path.open("rb")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-    with file:
+    with open_log(path) as file:
         complete = False
         topics: dict[int, str] = {}
         try:
-            for kind, record in _records(file):
+            for kind, record in records(file):
                 if kind == "Channel":
                     topics[record.id] = record.topic
                 elif kind == "Message" and topics.get(record.channel_id) in found:
                     found[topics[record.channel_id]].append(json.loads(record.data))
                 elif kind == "Footer":
                     complete = True
-        except _BROKEN:
+        except BROKEN:
             complete = False
     if not complete and found["/timing"]:
         last = found["/timing"][-1]["tick"]  # a tick's last message: what comes after belongs to a tick cut in two
@@ -81,6 +77,20 @@ def read_log(path: Path | str) -> FlightLog:
     if not found["/run"]:
         raise ConfigError(f"{path}: not a flight log, or cut short before its header was written")
     header = found["/run"][0]
+    check_header(path, header)
+    return FlightLog(path, as_now(header), found, complete)
+
+
+def open_log(path: Path) -> BinaryIO:
+    """Raises ConfigError for a file that cannot be read."""
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def check_header(path: Path, header: dict[str, Any]) -> None:
+    """Raise ConfigError for the header of a log that this version does not read."""
     if header.get("format") != FORMAT:
         raise ConfigError(f"{path}: log format {header.get('format')}, but this version reads {FORMAT}")
     missing = [name for name in _NEEDED if not _has(header, name.split("."))]
@@ -89,7 +99,6 @@ def read_log(path: Path | str) -> FlightLog:
             f"{path}: a log whose header lacks {', '.join(missing)}: another program wrote it; record the run with "
             "`servoid run`"
         )
-    return FlightLog(path, as_now(header), found, complete)
 
 
 def as_now(header: dict[str, Any]) -> dict[str, Any]:
@@ -113,9 +122,10 @@ def _has(values: Any, keys: list[str]) -> bool:
 
 
 # What the library raises at the point where a file was cut, depending on the record that it cuts.
-_BROKEN = (McapError, ZstdError, struct.error, ValueError, OSError)
+BROKEN = (McapError, ZstdError, struct.error, ValueError, OSError)
 
 
-def _records(file: Any) -> Iterator[tuple[str, Any]]:
+def records(file: BinaryIO) -> Iterator[tuple[str, Any]]:
+    """Kind and content of each record of a log. Raises one of BROKEN where it was cut."""
     for record in StreamReader(file, validate_crcs=True).records:
         yield type(record).__name__, record

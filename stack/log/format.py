@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.operator import Halt, Intent
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.event import Event
 
@@ -87,6 +88,11 @@ SCHEMAS: dict[str, dict[str, Any]] = {
                 "objects": "x, y, z m of the middle and quaternion w x y z, odometry frame",
             }
         )
+    ),
+    "/intent": _schema(
+        {"tick": _INTEGER, "sequence": _INTEGER, "age": _NUMBER, "text": _TEXT, "ends": {"type": "boolean"}}
+        | {"halt": _INTEGER}
+        | _arrays({"way": "forward, left, turning left, -1..1", "goal": "m, odometry frame"})
     ),
     "/plan": _schema(
         {"tick": _INTEGER, "requested": _INTEGER, "adopted": _INTEGER, "first": _INTEGER, "seconds": _NUMBER}
@@ -163,6 +169,8 @@ def messages(record: TickRecord) -> list[tuple[str, dict[str, Any]]]:
             arrays |= {"objects": percept.objects}
         instruction |= {name: pack(array, COMPACT) for name, array in arrays.items() if array is not None}
         out.append(("/instruction", instruction))
+    if record.intent is not None:
+        out.append(("/intent", tick | intent_message(record.intent)))
     if proposal.plan is not None:
         plan = proposal.plan.plan
         out.append((
@@ -181,3 +189,30 @@ def messages(record: TickRecord) -> list[tuple[str, dict[str, Any]]]:
 
 def event_message(event: Event) -> dict[str, Any]:
     return {name: getattr(event, name) for name in event.__slots__}
+
+
+def intent_message(intent: Intent) -> dict[str, Any]:
+    """An intent as JSON. One from nobody, whose age is infinite, has no age."""
+    message = {
+        "sequence": intent.sequence,
+        "age": intent.age if math.isfinite(intent.age) else None,
+        "way": pack(intent.way, EXACT),
+        "ends": intent.ends,
+        "halt": int(intent.halt),
+    }
+    if intent.goal is not None:
+        message["goal"] = pack(intent.goal, EXACT)
+    return message if intent.text is None else message | {"text": intent.text}
+
+
+def read_intent(message: dict[str, Any]) -> Intent:
+    """The intent that `intent_message` wrote."""
+    return Intent(
+        sequence=message["sequence"],
+        age=math.inf if message["age"] is None else message["age"],
+        way=unpack(message["way"]),
+        goal=unpack(message["goal"]) if "goal" in message else None,
+        text=message.get("text"),
+        ends=message["ends"],
+        halt=Halt(message["halt"]),
+    )

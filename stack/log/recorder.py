@@ -6,6 +6,7 @@ import json
 import queue
 import threading
 import time
+from datetime import datetime
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -140,6 +141,13 @@ class Recorder:
                 add(at, topic, message)
         writer.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
+
+
+def free_name(task: str, folder: Path) -> Path:
+    """A name for a log that is free: DATE-TASK.mcap, numbered when two runs start in one second."""
+    stem = f"{datetime.now():%Y%m%d-%H%M%S}-{task}"
+    names = (folder / f"{stem}{end}.mcap" for end in ("", *(f"-{i}" for i in range(2, 1000))))
+    return next(name for name in names if not name.exists())
 
 
 def check_new(path: Path) -> None:

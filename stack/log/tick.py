@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from servoid.hw.contracts.body import Array, Command, Observation
 from servoid.hw.contracts.control import Adopted, Instruction, State
+from servoid.hw.contracts.operator import Intent
 from servoid.hw.contracts.world import Percept
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Phase
@@ -48,6 +49,7 @@ class TickRecord:
     proposal: Proposal
     events: tuple[Event, ...]
     timing: Timing
+    intent: Intent | None = None  # what the person in control wants; None where there is nobody
 
 
 Listener = Callable[[TickRecord], None]

@@ -9,7 +9,7 @@ from typing import Any
 
 from servoid.hw.config import ConfigError, nearest
 from servoid.hw.contracts.backend import Backend
-from servoid.hw.contracts.world import Scene
+from servoid.hw.contracts.task import Episode
 from servoid.hw.robot.checks import check_bus_port
 from servoid.hw.robot.description import Robot
 
@@ -41,13 +41,15 @@ def backend_kind(name: str) -> Kind:
 
 
 def make_backend(
-    name: str, robot: Robot, *, seed: int, randomise: bool, port: str | None, scene: Scene | None = None
+    name: str, robot: Robot, *, seed: int, randomise: bool, port: str | None, episode: Episode | None = None
 ) -> Backend:
-    """A body, not yet connected, with a scene around a simulated one: who runs a real robot puts up what it asks for.
+    """A body, not yet connected. A simulated one begins, and has a scene around it, as `episode` says: who runs a real
+    robot puts up what that asks for.
 
     Raises ConfigError for an unknown name or a setting that it does not take.
     """
-    kind = backend_kind(name)
+    kind, episode = backend_kind(name), episode or Episode()
+    scene = episode.scene
     if scene is not None and scene.robots is not None and not kind.several:
         able = ", ".join(f"--backend {other}" for other, its in BACKENDS.items() if its.several)
         raise ConfigError(f"backend '{name}' has one robot, but the task needs {len(scene.robots) + 1}: use {able}")
@@ -62,6 +64,7 @@ def make_backend(
     if not kind.simulated and randomise:
         raise ConfigError(f"backend '{name}': real hardware cannot be randomised: drop --randomise")
     make = getattr(import_module(kind.module), kind.attribute)
-    chosen = {"seed": seed, "randomise": randomise, "scene": scene} if kind.simulated else {"port": port}
+    simulated = {"seed": seed, "randomise": randomise, "scene": scene, "start": episode.start}
+    chosen = simulated if kind.simulated else {"port": port}
     backend: Backend = make(robot, **chosen, **kind.options)
     return backend

@@ -24,6 +24,7 @@ IGNORED = (signal.SIGTTIN, signal.SIGTTOU)
 
 ONCE = "interrupted: stopping; once more for torque off at once"
 TWICE = "interrupted twice: torque off at once"
+OFF = "a person asked for torque off at once"
 
 
 class Interrupt:
@@ -101,21 +102,30 @@ class Stop:
 
 
 class Stops:
-    """All such reasons in one place: the operator's Ctrl-C, a log that cannot be written, and, when a recorded run is
-    repeated, the ones that its log tells of."""
+    """All such reasons in one place: Ctrl-C, what a person `asked` elsewhere, a log that cannot be written, and, when a
+    recorded run is repeated, the ones that its log tells of."""
 
     def __init__(
-        self, interrupt: Interrupt, failure: Callable[[], str | None] = lambda: None, script: Sequence[Event] = ()
+        self,
+        interrupt: Interrupt,
+        failure: Callable[[], str | None] = lambda: None,
+        script: Sequence[Event] = (),
+        asked: Callable[[], Stop | None] = lambda: None,
     ) -> None:
-        self._interrupt, self._failure, self._script = interrupt, failure, script
+        self._interrupt, self._failure, self._script, self._asked = interrupt, failure, script, asked
 
     def at(self, tick: int) -> Stop | None:
         """The reason to stop at a tick, the strongest first."""
         due = [event for event in self._script if event.tick <= tick]
+        asked = self._asked()
+        if asked is not None and asked.at_once:
+            return asked
         if self._interrupt.count > 1 or any(event.text == TWICE for event in due):
             return Stop("interrupt", TWICE, at_once=True)
         if self._interrupt.count == 1:
             return Stop("interrupt", ONCE)
+        if asked is not None:
+            return asked
         if due:
             return Stop(due[0].kind, due[0].text)
         failure = self._failure()

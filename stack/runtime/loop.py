@@ -13,6 +13,7 @@ from servoid.stack.estimation.sample_hold import SampleHold, complete
 from servoid.stack.log.tick import Listener, Proposal, TickRecord, Timing
 from servoid.stack.runtime.clock import Schedule
 from servoid.stack.runtime.interrupt import TWICE, Interrupt, Stops
+from servoid.stack.runtime.operator import Operator
 from servoid.stack.safety.guard import Guard
 
 
@@ -58,7 +59,10 @@ class Loop:
         interrupt: Interrupt,
         stops: Stops,
         listeners: tuple[Listener, ...] = (),
+        operator: Operator | None = None,
     ) -> None:
+        """The reasons of `stops` may include the operator's."""
+        self._operator = operator
         self._sensors, self._estimator, self._guard = controlled.sensors, controlled.estimator, controlled.guard
         self._supervisor = supervisor
         self._schedule, self._interrupt, self._stops, self._listeners = schedule, interrupt, stops, listeners
@@ -86,6 +90,7 @@ class Loop:
         observation = self._hold.update(raw)
         state = self._estimate(wake.tick, observation) if complete(observation) else None
         estimated = time.perf_counter_ns()
+        intent = None if self._operator is None else self._operator.read()
         self._heed(wake.tick)  # first: a signal that asks to stop may have ended a planner, too
         proposal = self._act(wake.tick, observation, state)
         acted = time.perf_counter_ns()
@@ -103,7 +108,8 @@ class Loop:
             write=written - guarded,
             record=self._record_ns,
         )
-        record = TickRecord(wake.tick, self._guard.phase, raw, state, command, proposal, self._guard.events(), timing)
+        events = self._guard.events()
+        record = TickRecord(wake.tick, self._guard.phase, raw, state, command, proposal, events, timing, intent)
         for listener in self._listeners:
             listener(record)
         self._record_ns = time.perf_counter_ns() - written

@@ -150,7 +150,9 @@ class Phases:
         recovering, recovery, tick = self._recovering, self._guard.recovery, self.task_ticks
         assert recovering is not None
         assert recovery is not None
-        if before is Phase.RUNNING:
+        if before is Phase.READY:  # it lies as it begins
+            self._estimator.reset_odometry()
+        if before in {Phase.READY, Phase.RUNNING}:
             self._estimator.fall()
         if (asked := self._ask(state)) is None:
             return Proposal()

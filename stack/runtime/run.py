@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from types import TracebackType
 
 import numpy as np
@@ -12,8 +13,7 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.control import Policy
-from servoid.hw.contracts.task import Assignment, Behaviour, Task
-from servoid.hw.contracts.world import Scene
+from servoid.hw.contracts.task import Assignment, Behaviour, Episode, Task
 from servoid.hw.dynamixel.calibration import calibrated
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.hw.seeds import Stream, generator
@@ -29,6 +29,7 @@ from servoid.stack.runtime.clock import RealTime, Schedule, WallClock
 from servoid.stack.runtime.interrupt import Interrupt, Stops
 from servoid.stack.runtime.loop import ControlledRobot, Loop
 from servoid.stack.runtime.multi_robot import Teammates
+from servoid.stack.runtime.operator import Held, Operator, Recorded
 from servoid.stack.runtime.phases import Phases, Recovering
 from servoid.stack.runtime.realtime import undisturbed
 from servoid.stack.runtime.result import Result, Tally
@@ -53,15 +54,19 @@ def run(
     policy: Policy | None = None,
     confirm: Confirm | None = None,
     script: Script | None = None,
+    operator: Operator | None = None,
 ) -> Result:
     """Do one run and return how it went, the robot with torque off.
 
     `backend` and `policy` replace those that the settings name; a backend that offers a `simulation` starts itself and
     need not keep to real time. `on_tick` is called after each tick and must be quick. `confirm` asks the person at a
-    real robot, and returns when it may move. `script` repeats a recorded run. Raises ConfigError before anything is
-    connected, BackendError when the body cannot be reached.
+    real robot, and returns when it may move. `script` repeats a recorded run. `operator` reads what a person wants: its
+    stop ends any task, and a task that is steered goes by it instead of opening a device of its own. Raises ConfigError
+    before anything is connected, BackendError when the body cannot be reached.
     """
-    with Run(settings, backend=backend, on_tick=on_tick, policy=policy, confirm=confirm, script=script) as one:
+    with Run(
+        settings, backend=backend, on_tick=on_tick, policy=policy, confirm=confirm, script=script, operator=operator
+    ) as one:
         one.prepare()
         one.connect()
         one.loop()
@@ -75,7 +80,7 @@ def prepare(settings: RunSettings) -> tuple[Assignment, Backend]:
     """
     robot = load_robot(settings.robot)
     assignment = draw(_task(settings, robot), settings.seed)
-    return assignment, _body(settings, robot, assignment.episode.scene)
+    return assignment, _body(settings, robot, assignment.episode)
 
 
 def draw(task: Task, seed: int) -> Assignment:
@@ -104,9 +109,11 @@ class Run:
         policy: Policy | None = None,
         confirm: Confirm | None = None,
         script: Script | None = None,
+        operator: Operator | None = None,
     ) -> None:
         self.settings, self._backend, self._on_tick, self._policy = settings, backend, on_tick, policy
         self._confirm, self._script = confirm, script or Script()
+        self._operator = operator
         self._get_up: GetUp | None = None
         self._begun = 0  # times that the policy has begun
         self._interrupt = Interrupt(eager=True)
@@ -143,7 +150,7 @@ class Run:
         assembled = self.robot
         if not simulated and backend is None:
             assembled, self._assembly = calibrated(self.robot)
-        self.body = backend or _body(settings, assembled, self.assignment.episode.scene)
+        self.body = backend or _body(settings, assembled, self.assignment.episode)
         self._check()
 
     def _check(self) -> None:
@@ -192,7 +199,9 @@ class Run:
         if body.simulation is None and not settings.start and self._confirm is not None:
             known = f"{self._assembly}. " if self._assembly is not None else ""
             again = (
-                "" if self._get_up is None else f"; if it falls, it gets up by itself, {TRIES} tries: keep away from it"
+                ""
+                if self._get_up is None
+                else f"; if it lies or falls, it gets up by itself, {TRIES} tries: keep away from it"
             )
             self._confirm(f"{known}{robot.name} will go to its home pose and then: {task.name}{again}")
         self._interrupt.settle()  # from here on a Ctrl-C is a request, until the motors are off
@@ -229,9 +238,10 @@ class Run:
         if self.realtime:
             self._open.enter_context(undisturbed(self.body.simulation is None, self._note))
             clock = clock if isinstance(clock, WallClock) else RealTime(clock)
-        stops = Stops(self._interrupt, self._failure, self._script.stops)
-        schedule = Schedule(clock, self.robot.rate)
-        loop = Loop(self._controlled, self.phases, schedule, self._interrupt, stops, tuple(listeners))
+        operator, schedule = self._operator, Schedule(clock, self.robot.rate)
+        asked = (lambda: None) if operator is None else operator.stop
+        stops = Stops(self._interrupt, self._failure, self._script.stops, asked)
+        loop = Loop(self._controlled, self.phases, schedule, self._interrupt, stops, tuple(listeners), operator)
         try:
             loop.run()
             if self._teammates is not None:
@@ -246,7 +256,7 @@ class Run:
         """How the run went, and the end of its log."""
         last = self.guard.events()
         self._tally.events += last
-        told = self._interrupt.count > 0
+        told = self._interrupt.count > 0 or (self._operator is not None and self._operator.intent.halt > 0)
         result = self._tally.result(self.phases, self.guard, self.assignment, self.settings.record, told)
         if self._recorder is not None:
             self._recorder.events(last)
@@ -263,16 +273,27 @@ class Run:
         self.policy.reset(None, np.array(self.settings.seed))
 
     def _behaviour(self) -> Behaviour:
-        assignment, steered = self.assignment, self._script.velocities
-        if assignment.task.steered and steered is not None:
-            return SteeredAgain(steered, self._script.ended)
-        return assignment.task.behaviour(assignment.episode)
+        """What is asked of the robot; where a person asks, through the operator, whose device is opened here."""
+        task, episode, script = self.assignment.task, self.assignment.episode, self._script
+        if script.intents is not None:
+            self._operator = Operator(Recorded(script.intents), held=script.held)
+        elif task.steered and script.velocities is not None:
+            return SteeredAgain(script.velocities, script.ended)
+        elif task.steered and self._operator is None:
+            self._operator = Operator(task.open_source(), held=False)
+            self._open.callback(self._operator.close)
+        operator = self._operator
+        if operator is None:
+            return task.behaviour(episode)
+        behaviour = task.steered_behaviour(episode, operator.wanted) if task.steered else task.behaviour(episode)
+        return Held(behaviour, operator, partial(self._note, kind="operator")) if operator.held else behaviour
 
     def _record(self) -> Recorder:
         settings, own = self.settings, self._policy
         assert settings.record is not None
         policy = policy_fingerprint(settings.policy, self.robot) if own is None else {"name": type(own).__qualname__}
         facts = header(settings, self.robot, self.assignment, source(settings.task), self.body.name, policy)
+        facts["operator"] = None if self._operator is None else {"held": self._operator.held}
         if self.assignment.task.performs:
             facts["skills"] = skill_fingerprints(self.robot)
         facts["recovery"] = None if self._get_up is None else fingerprints(self.robot)
@@ -283,8 +304,8 @@ class Run:
     def _failure(self) -> str | None:
         return None if self._recorder is None else self._recorder.error
 
-    def _note(self, text: str) -> None:
-        self.guard.note("system", text)
+    def _note(self, text: str, kind: str = "system") -> None:
+        self.guard.note(kind, text)
 
 
 def _task(settings: RunSettings, robot: Robot) -> Task:
@@ -294,14 +315,14 @@ def _task(settings: RunSettings, robot: Robot) -> Task:
     return load_task(settings.task, values, robot.dt, robot)
 
 
-def _body(settings: RunSettings, robot: Robot, scene: Scene | None) -> Backend:
+def _body(settings: RunSettings, robot: Robot, episode: Episode) -> Backend:
     return make_backend(
         settings.backend,
         robot,
         seed=settings.seed,
         randomise=settings.randomise,
         port=settings.port,
-        scene=scene,
+        episode=episode,
     )
 
 

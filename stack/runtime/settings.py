@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.operator import Intent
 from servoid.stack.safety.event import Event
 
 if TYPE_CHECKING:
@@ -53,6 +54,8 @@ class Script:
     # Ticks of plan requests, and when their plans were adopted, of each time that the policy began: it does so again
     # when the robot has got up. None: whatever comes in time.
     plans: Sequence[Mapping[int, int]] | None = None
-    velocities: Array | None = None  # (ticks, 3) that a person steered by,
+    velocities: Array | None = None  # (ticks, 3) that a person steered by, in logs which do not say what was wanted,
     ended: bool = False  # and whether the person ended the run
+    intents: Sequence[Intent] | None = None  # what a person wanted, tick by tick,
+    held: bool = False  # and whether that person had to be heard
     planner: DiffusionSettings | None = None  # what it planned with: the policy's file may have moved or changed

@@ -20,7 +20,8 @@ tests/stack/test_safety*.py:
    was found in, is not lowered: it hangs or lies.
 8. Gains only go down within a run: below what was asked for where servos get hot, the supply low or a joint blocked.
    While a robot that is to recover falls and lies, they are zero, but for its arms as they come in.
-9. A fall is survived only where `recover` was asked for, and only from RUNNING. The robot is moved again when it has
+9. A fall is survived only where `recover` was asked for, and only from RUNNING, or READY: it may lie as it begins,
+   and is brought home lying. The robot is moved again when it has
    lain still, with the limits of 1 and 2, in at most so many tries and so much time (recovery.py); what ends a run ends
    it then too, damped at once. It runs on when it has stood still, on flat soles, at the home pose.
 
@@ -41,7 +42,7 @@ from servoid.hw.faults import STOP_BUTTON
 from servoid.hw.robot.description import Robot
 from servoid.stack.estimation.sample_hold import missing
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.health import BLOCKED, WALKING, Health
+from servoid.stack.safety.health import BLOCKED, WALKING, Health, tilt_of
 from servoid.stack.safety.limits import limit
 from servoid.stack.safety.lowering import lowered_pose
 from servoid.stack.safety.min_jerk import MIN_JERK_PEAK, MinJerk
@@ -230,7 +231,7 @@ class Guard:
         elif self.phase in {Phase.READY, Phase.RECOVERING, *FOLLOWING}:
             self._accepted = self._tick  # a goal that is held is accepted anew: time spent holding earns no leap
         elif self.phase is Phase.HOMING:
-            self._home_on(observation)
+            self._home_on(observation, state)
         elif self.phase is Phase.LOWERING:
             self._lower_on()
         if self.phase in POWERED:
@@ -292,13 +293,14 @@ class Guard:
         self.applied = limit(proposal, self.applied, self.robot, self._elapsed())
         self._accepted = self._tick
 
-    def _home_on(self, observation: Observation) -> None:
+    def _home_on(self, observation: Observation, state: State | None) -> None:
         assert self._motion is not None
         self._accepted = self._tick
         if self._motion.done:
             error = np.abs(observation.position - self.robot.home)
             worst = int(error.argmax())
-            if error[worst] > HOME_TOLERANCE:
+            lies = self.recovery is not None and tilt_of(observation, state) > self.robot.limits.tilt
+            if error[worst] > HOME_TOLERANCE and not lies:  # one that lies may lie on an arm
                 name = self.robot.names[worst]
                 self.fault("homing", f"{name} is {error[worst]:.2f} rad from home: is it blocked or unpowered?", name)
             else:
@@ -359,7 +361,7 @@ class Guard:
         load = None if self.phase is Phase.FALLEN else LOAD if self.phase is Phase.RECOVERING else WALKING
         found = self._health.examine(observation, state, self.applied, upright=upright, load=load)
         for ends, kind, text, joint in found:
-            if kind == "fall" and self.recovery is not None and self.phase is Phase.RUNNING:
+            if kind == "fall" and self.recovery is not None and self.phase in {Phase.READY, Phase.RUNNING}:
                 self._fall(text)
             elif ends == "now" and self.phase not in ENDED:
                 self.fault(kind, text, joint)

@@ -35,7 +35,8 @@ class After:
 
 @dataclass(frozen=True)
 class Skill:
-    """What a skill is; where it begins and ends is one of the poses of `policy.motion.clip.POSES`.
+    """What a skill is; where it begins and ends is one of the poses of `policy.motion.clip.POSES`, or one of those more
+    closely described: "sitting on a seat".
 
     `policy` performs it: `clip` plays the clip open loop, `tracker` follows it with feedback, by a network that knows
     clips.
@@ -59,7 +60,7 @@ class Skill:
         if not self.phrases or not all(text.strip() for text in (*self.phrases, *self.held_out)):
             raise ValueError("phrases: at least one is needed, and none may be empty")
         for key, pose in (("entry", self.entry), ("end", self.end)):
-            if pose not in POSES:
+            if not any(pose == known or pose.startswith(f"{known} ") for known in POSES):
                 raise ValueError(f"{key}: '{pose}' is none of {', '.join(POSES)}")
         if self.interrupted_by == "anything" and self.low:
             raise ValueError("interrupted_by: a skill that does not stay on its feet is not left half done")
@@ -80,7 +81,7 @@ def load_skills(robot: Robot, folder: Path = CONFIGS / "skills") -> dict[str, Sk
         skill, marks = load_marked(path, Skill)
         clip = find(skill.clip, robot)
         for key, said, is_so in (("entry", skill.entry, clip.about.begins), ("end", skill.end, clip.about.ends)):
-            if said != is_so:
+            if said != is_so and not said.startswith(f"{is_so} "):
                 raise marks.error(key, f"'{said}', but its clip '{clip.name}' has '{is_so}'")
         found[path.stem] = replace(skill, name=path.stem, seconds=(clip.ticks - 1) * robot.dt)
     return found

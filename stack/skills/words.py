@@ -14,7 +14,28 @@ from servoid.policy.text.lexicon import words
 from servoid.policy.text.nearest_phrase import FAMILIAR, Phrasebook, refuse_untold, side_of, similarity
 from servoid.stack.skills.skill import Skill
 
-_NO_NAME = {"left", "right", "up", "down", "front", "back"}  # parts of skills' names that other sentences have too
+# Cosine similarity to a phrase below which a text that names no skill asks for none: more than for walking, since there
+# are many skills, and what is performed by mistake may throw the robot over. And by how much more it must be like a
+# skill than like a walk.
+SURE, MARGIN = 0.55, 0.02
+# Parts of skills' names that other sentences have too.
+_NO_NAME = {
+    "left",
+    "right",
+    "up",
+    "down",
+    "front",
+    "back",
+    "forward",
+    "around",
+    "side",
+    "high",
+    "low",
+    "both",
+    "one",
+    "two",
+}
+_NO_NAME |= {"ready", "on", "from", "seat", "foot", "stand", "look"}
 
 
 class SkillWords:
@@ -38,11 +59,11 @@ class SkillWords:
         named = self._named(text)
         if named.any():
             near = np.where(named, near, -np.inf)
-        elif walking.max() > near.max() and walking.max() >= FAMILIAR:
+        elif _walks(near.max(), walking.max()):
             return self._walking.understand(text)
         refuse_untold(text)
         name, side = str(self._names[near.argmax()]), side_of(text)
-        if near.max() < FAMILIAR and not named.any():
+        if near.max() < SURE and not named.any():
             motion = MOTIONS[int(self._walking.motions[walking.argmax()])]
             raise ConfigError(
                 f"the instruction '{text}' asks for nothing that is known; the nearest skill is "
@@ -62,9 +83,14 @@ class SkillWords:
         without a word."""
         code = self._encoder.encode([text])
         near, walking = similarity(code, self._codes).max(), similarity(code, self._walking.codes).max()
-        return bool(self._named(text).any() or (near > walking and near >= FAMILIAR))
+        return bool(self._named(text).any() or (near >= SURE and not _walks(near, walking)))
 
     def _named(self, text: str) -> Array:
         """Which phrases `(n,)` are of skills whose name has a word of the text: what kicks is no way to walk."""
         found = set(words(text)) - _NO_NAME
         return np.array([bool(found & set(name.split("-"))) for name in self._names])
+
+
+def _walks(near: float, walking: float) -> bool:
+    """Whether a text that names no skill is about walking, by its similarity to phrases of skills and of walks."""
+    return walking >= FAMILIAR and near < walking + MARGIN

@@ -20,6 +20,7 @@ from servoid.stack.tasks.goal import Goal
 from servoid.stack.tasks.inbetween import Inbetween
 from servoid.stack.tasks.obstacle import Obstacle
 from servoid.stack.tasks.path import Path
+from servoid.stack.tasks.skills.get_up import LieAndStand
 from servoid.stack.tasks.skills.kick import Kick
 from servoid.stack.tasks.skills.skill import PerformSkills
 from servoid.stack.tasks.stand import Stand
@@ -43,7 +44,7 @@ class TaskEntry:
 
 _CLASSES: tuple[type[BaseTask], ...] = (
     Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Cross, Inbetween, Survive, Text, Steer,
-    PerformSkills, Kick,
+    PerformSkills, Kick, LieAndStand,
 )  # fmt: skip
 _OWN: dict[str, TaskEntry] = {
     **{cls.name: TaskEntry(cls.name, cls, cls.description) for cls in _CLASSES},

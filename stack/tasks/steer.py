@@ -1,20 +1,27 @@
-"""Walk as a person steers, with a gamepad or by keys."""
+"""Do as a person steers: with a gamepad, by keys, or on the operator's page, which takes goals and sentences too."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
 
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.operator import CommandSource, Intent
 from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
+from servoid.hw.geometry import to_heading
 from servoid.hw.setting import Setting
-from servoid.stack.control.operator import Controls, Steering, open_steering
+from servoid.policy.text.captions import twist_of
+from servoid.stack.control.operator import Controls, open_steering
+from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 from servoid.stack.tasks.terms import metrics as measures
+from servoid.stack.tasks.text import understood
 
 Stick = Literal["leftx", "lefty", "rightx", "righty"]
 
@@ -31,20 +38,26 @@ class SteerSettings(Settings):
     forward_stick: Annotated[Stick, Setting("part of the gamepad that walks forward and back")] = "lefty"
     sideways_stick: Annotated[Stick, Setting("part of it that walks sideways")] = "leftx"
     turning_stick: Annotated[Stick, Setting("part of it that turns")] = "rightx"
+    arrive: Annotated[float, Setting("distance from a goal at which to stop", "m", above=0)] = 0.05
+    leave: Annotated[float, Setting("distance from a goal at which to start again", "m", above=0)] = 0.1
+    approach: SpeedProfile = field(default_factory=SpeedProfile)
     end_button: Annotated[Literal["a", "b", "x", "y"], Setting("button of it that ends the run")] = "b"
 
 
 class Steer(BaseTask):
     name = "steer"
-    description = "walk as a person steers, with a gamepad or by keys"
+    description = "walk as a person steers: with a gamepad, by keys or on the page"
     settings_type = SteerSettings
     steered = True
 
-    def behaviour(self, episode: Episode) -> BaseBehaviour:
+    def open_source(self) -> CommandSource:
         """Find the device. Raises ConfigError where there is none."""
         s = self.settings
         controls = Controls(s.forward_stick, s.sideways_stick, s.turning_stick, s.end_button)
-        return Steered(episode, open_steering(s.device, controls), s)
+        return open_steering(s.device, controls)
+
+    def steered_behaviour(self, episode: Episode, wanted: Callable[[], Intent]) -> BaseBehaviour:
+        return Steered(episode, wanted, self.settings, self.top)
 
     def criteria(self, trace: Trace, episode: Episode) -> list[Criterion]:
         return [
@@ -60,25 +73,52 @@ class Steer(BaseTask):
 
 
 class Steered(BaseBehaviour):
-    """Velocities are rounded to float32, as the flight log holds them: a replay steers by the log."""
+    """Goes by what is wanted now. Velocities are rounded to float32, as the flight log holds them.
 
-    def __init__(self, episode: Episode, device: Steering, settings: SteerSettings) -> None:
+    A sentence that names no motion asks the robot to stand.
+    """
+
+    def __init__(self, episode: Episode, wanted: Callable[[], Intent], settings: SteerSettings, top: Array) -> None:
+        """`top` `(3,)` are the speeds that sentences speak of."""
         super().__init__(episode)
-        self._device, self._settings, self._ends = device, settings, False
+        self._wanted, self._settings, self._top = wanted, settings, top
+        self._ends = self._arrived = False
+        self._understood: dict[str, Array] = {}  # velocities of sentences
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
-        wish, s = self._device.read(), self._settings
-        forward, left, turn = wish.way
+        wish = self._wanted()
         self._ends = wish.ends
-        velocity = [forward * (s.forward if forward > 0.0 else s.backward), left * s.sideways, turn * s.turning]
-        return Instruction(velocity=np.array(velocity, dtype=np.float32).astype(float))
+        if wish.goal is not None:
+            return self._go(to_heading(wish.goal, state))
+        self._arrived = False
+        if wish.text is not None:
+            velocity = self._meant(wish.text)
+            return Instruction(velocity, text=wish.text if velocity.any() else None)
+        s = self._settings
+        forward, left, turn = wish.way
+        velocity = np.array(
+            [forward * (s.forward if forward > 0.0 else s.backward), left * s.sideways, turn * s.turning]
+        )
+        return Instruction(velocity.astype(np.float32).astype(float))
 
     def done(self, state: State) -> bool:
         """The person has had enough."""
         return self._ends
 
-    def close(self) -> None:
-        self._device.close()
+    def _go(self, ahead: Array) -> Instruction:
+        """To a point `(2,)` m, and stand there."""
+        s, distance = self._settings, float(np.linalg.norm(ahead))
+        self._arrived = distance <= (s.leave if self._arrived else s.arrive)
+        return Instruction(np.zeros(3) if self._arrived else go_to_point(ahead, s.approach), goal=ahead)
+
+    def _meant(self, text: str) -> Array:
+        """The velocity `(3,)` that a sentence means, looked up once."""
+        if text not in self._understood:
+            try:
+                self._understood[text] = twist_of(understood("sentence", text), self._top)
+            except ConfigError:
+                self._understood[text] = np.zeros(3)
+        return self._understood[text]
 
 
 class SteeredAgain(BaseBehaviour):

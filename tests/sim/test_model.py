@@ -1,6 +1,5 @@
 """The simulated robot is the one in the manufacturer's table, and the servo the one in its file."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -214,19 +213,6 @@ def test_own_mjcf_lacking_something_is_refused(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=named) as error:
             build(load_robot(tmp_path / "own.yaml"))
         assert "own.xml" in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("key", "old", "new"), [("command_delay", "0.020", "0.030"), ("position_latency", "0.004", "0.0")]
-)
-def test_servos_of_different_delays_are_refused(tmp_path: Path, key: str, old: str, new: str) -> None:
-    """One delay is drawn for a robot: the joints of the other servo would silently have the first one's."""
-    robot = load_robot()
-    servo = Path("configs/servos/xm430-w350.yaml").read_text()
-    (tmp_path / "slow.yaml").write_text(servo.replace(f"{key}: {old}", f"{key}: {new}"))
-    joints = (*robot.joints[:4], replace(robot.joints[4], servo=str(tmp_path / "slow.yaml")), *robot.joints[5:])
-    with pytest.raises(ConfigError, match=f"l_el: {key}.*head_pan"):
-        build(replace(robot, joints=joints))
 
 
 def test_own_actuators_are_replaced(tmp_path: Path) -> None:

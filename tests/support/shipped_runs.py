@@ -13,7 +13,7 @@ from servoid.hw.contracts.control import Adopted, Plan, PlanRequest
 from servoid.hw.contracts.task import Trace
 from servoid.hw.robot.description import load_robot
 from servoid.policy.diffusion.runtime import Runtime
-from servoid.stack.control.planner import Answer, InlinePlanner
+from servoid.stack.control.planning.planner import Answer, InlinePlanner
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import Result, RunSettings, prepare, run
 from servoid.tools.common.ground_truth import GroundTruth

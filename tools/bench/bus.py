@@ -61,11 +61,18 @@ COLUMNS = ("client", "mode", "baud", "median_ms", "p99_ms", "cpu_us", "failed", 
 
 def measure(report: Report, bauds: tuple[int, ...], cycles: int) -> list[dict[str, Any]]:
     """A row for each client, mode and baud, the wire's own among them."""
+    from tqdm import tqdm
+
     from servoid.stack.runtime.realtime import undisturbed
     from servoid.tools.bench.bus_clients import CLIENTS
 
     rows = []
-    with responder() as port, undisturbed(False, report.line):
+    total = 2 * len(CLIENTS) * len(bauds) * cycles
+    with (
+        responder() as port,
+        undisturbed(False, report.line),
+        tqdm(total=total, unit="cycle", leave=False, disable=None) as bar,  # on a terminal, between what is timed
+    ):
         for baud in bauds:
             runs = {(name, mode): ClientTimes() for mode in ("sync", "fast") for name in CLIENTS}
             done = 0
@@ -73,6 +80,7 @@ def measure(report: Report, bauds: tuple[int, ...], cycles: int) -> list[dict[st
                 batch = min(BATCH, cycles - done)
                 for (name, mode), run in runs.items():
                     run.batch(CLIENTS[name](port, baud, range(1, SERVOS + 1), BOARD_ID, mode == "fast"), batch)
+                    bar.update(batch)
                 done += batch
             for mode in ("sync", "fast"):
                 limit = wire_ms(mode, baud)

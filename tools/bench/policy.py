@@ -89,6 +89,8 @@ class Network:
 
 
 def _run(args: argparse.Namespace, report: Report) -> None:
+    from tqdm import tqdm
+
     from servoid.hw.config import ConfigError
     from servoid.hw.robot.description import load_robot
     from servoid.policy.diffusion.engines import ENGINES, check_engine, load_engine
@@ -103,16 +105,16 @@ def _run(args: argparse.Namespace, report: Report) -> None:
     networks = _networks(args, robot)
     skipped: dict[str, str] = {}
     rows = []
-    for network in networks:
-        for engine in args.engine or ENGINES:
-            try:
-                loaded = load_engine(engine, network.model.denoiser)
-            except ConfigError as error:
-                skipped[f"{network.name}: {engine}"] = str(error)
-                continue
-            timed = _Timed(engine, loaded, _call_times(loaded, network.model, args.plans))
-            for runtime, settings in runtimes.items():
-                rows += _time(network, timed, runtime, settings, robot, args.plans)
+    pairs = [(network, engine) for network in networks for engine in args.engine or ENGINES]
+    for network, engine in tqdm(pairs, unit="engine", leave=False, disable=None):
+        try:
+            loaded = load_engine(engine, network.model.denoiser)
+        except ConfigError as error:
+            skipped[f"{network.name}: {engine}"] = str(error)
+            continue
+        timed = _Timed(engine, loaded, _call_times(loaded, network.model, args.plans))
+        for runtime, settings in runtimes.items():
+            rows += _time(network, timed, runtime, settings, robot, args.plans)
     peak = peak_gflops()
     for row in rows:
         row["peak_gflops"] = peak

@@ -66,6 +66,11 @@ def main(args: argparse.Namespace) -> int:
         from servoid.hw.dynamixel.calibration import apply, calibration_path, check_writable
 
         robot = load_robot(args.robot)
+        if geared := [joint.name for joint in robot.joints if joint.gear != 1.0]:
+            raise ConfigError(
+                f"{', '.join(geared)}: behind a gear, a servo's angle does not say which turn the joint is in: measure "
+                "their zeros yourself, and write them into the robot's file"
+            )
         virtual = is_virtual(args)
         path = args.out or (None if virtual else calibration_path(robot))
         chosen = _chosen(args.joint, robot)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError, from_values
 from servoid.stack.log.flightlog import FlightLog, read_log
-from servoid.stack.log.format import MACHINE_DEPENDENT, event_message, messages, plain
+from servoid.stack.log.format import MACHINE_DEPENDENT, event_message, messages, plain, read_intent
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.backends import BACKENDS
 from servoid.stack.runtime.phases import DONE
@@ -100,7 +100,9 @@ def replay(log: FlightLog, done: Callable[[], object] = lambda: None) -> tuple[i
 
     velocities = log.column("/instruction", "velocity").reshape(-1, 3)
     ended = any(event["kind"] == "task" and event["text"] == DONE for event in log.messages["/event"])
-    script = Script(tuple(stops), plans, velocities, ended, _planner(log))
+    intents = [read_intent(message) for message in log.messages["/intent"]] or None
+    held = bool((log.header.get("operator") or {}).get("held"))
+    script = Script(tuple(stops), plans, velocities, ended, intents, held, _planner(log))
     result = run(settings, on_tick=compare, script=script)
     for event in result.events:  # of their own ticks, as in the log: what befalls other robots comes between two
         repeated[event.tick]["/event"].append(plain(event_message(event)))
@@ -155,6 +157,8 @@ def changes(log: FlightLog) -> list[str]:
         "policy.checkpoint_sha256": "the policy's checkpoint",
         "policy.odometry_sha256": "the odometry's checkpoint",
         "policy.planner": "the file of the planner's settings (those of the log are used)",
+        "policy.closed_loop": "the settings of the closed loop",
+        "policy.tracker_sha256": "the checkpoint of its tracker",
         "policy.gait": "the gait's settings",
         "task": "the task's settings",
         "task_files": "a file that the task's settings name",

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
@@ -27,6 +26,12 @@ from servoid.tools.common.parser import (
 )
 from servoid.tools.common.pictures.drawing import prepare
 from servoid.tools.common.prompt import confirm
+from servoid.tools.web.launch import STOPS, add_view_arguments, open_page, view_of
+
+if TYPE_CHECKING:
+    from servoid.stack.runtime.result import Result
+    from servoid.stack.runtime.run import Confirm, RunSettings
+    from servoid.tools.common.live import LiveLine
 
 EXIT_CODES = {
     "succeeded": exit_codes.DONE,
@@ -64,6 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--video-size", default="1280x720", metavar="WxH", help="size of the film (default: %(default)s)"
     )
     parser.add_argument("--fast", action="store_true", help="simulate as fast as possible, also on a terminal")
+    add_view_arguments(parser)
     add_json_argument(parser)
 
 
@@ -72,13 +78,14 @@ def main(args: argparse.Namespace) -> int:
         check_seed(args.seed)
         if args.video is not None:
             size = prepare(args.video, args.video_size)
+        from servoid.stack.log.recorder import free_name
         from servoid.stack.runtime.backends import backend_kind
         from servoid.stack.runtime.run import RunSettings, run
         from servoid.stack.tasks import find
         from servoid.tools.common.live import LiveLine
         from servoid.tools.common.summary import summary
 
-        watched = (sys.stdout.isatty() and not args.json) or find(args.task).cls.steered
+        watched = (sys.stdout.isatty() and not args.json) or args.view or find(args.task).cls.steered
         plan = RunSettings(
             task=args.task,
             backend=args.backend,
@@ -90,7 +97,7 @@ def main(args: argparse.Namespace) -> int:
             gain=args.gain,
             set=settings(args),
             start=args.start,
-            record=args.record or _default_log(find(args.task).name),
+            record=args.record or free_name(find(args.task).name, Path("runs")),
             realtime=(watched and not args.fast) if backend_kind(args.backend).simulated else None,
             port=args.port,
             recover=args.recover,
@@ -98,8 +105,9 @@ def main(args: argparse.Namespace) -> int:
         for text in out_of_reach(args):
             report.line(text)
         live = LiveLine(sys.stderr if args.json else sys.stdout)
+        asks = partial(confirm, remedy="give --start to let the robot move")
         try:
-            result = run(plan, on_tick=live, confirm=partial(confirm, remedy="give --start to let the robot move"))
+            result = _shown(report, args, plan, live, asks) if args.view else run(plan, on_tick=live, confirm=asks)
         finally:
             live.close()
             tell_lateness(report, args.port)
@@ -116,6 +124,16 @@ def main(args: argparse.Namespace) -> int:
     return EXIT_CODES[result.outcome]
 
 
+def _shown(report: Report, args: argparse.Namespace, plan: RunSettings, live: LiveLine, asks: Confirm) -> Result:
+    """The run, on the page."""
+    from servoid.tools.web.watched import check_steered, watched_run
+
+    check_steered(plan)
+    with open_page(view_of(args), plan.robot) as page:
+        report.line(f"page: {page.url}  ({STOPS})")
+        return watched_run(page.link, plan, on_tick=live, confirm=asks)
+
+
 def tell_lateness(report: Report, port: str | None) -> None:
     """Of a virtual rig in real time: what it kept waiting is not the cable's fault."""
     if port is not None and Path(port + ".control").is_socket():  # where `servoid virtual --link` puts it
@@ -130,13 +148,6 @@ def tell_lateness(report: Report, port: str | None) -> None:
             text = str(error)
         if text is not None:
             report.line(text)
-
-
-def _default_log(task: str) -> Path:
-    """A name that is free: runs/DATE-TASK.mcap, numbered when two runs start in one second."""
-    stem = f"{datetime.now():%Y%m%d-%H%M%S}-{task}"
-    names = (Path("runs") / f"{stem}{end}.mcap" for end in ("", *(f"-{i}" for i in range(2, 1000))))
-    return next(name for name in names if not name.exists())
 
 
 def _film(report: Report, log: Path, path: Path, size: tuple[int, int]) -> dict[str, Path]:

@@ -8,8 +8,13 @@ programs can record ranges and calibrate.
 from __future__ import annotations
 
 import argparse
+import json
 import signal
+import subprocess
+import sys
+import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from types import FrameType
 
@@ -18,6 +23,7 @@ from servoid.sim.rig.servo.factory_state import add_factory_state_arguments
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, add_json_argument, reporting
 from servoid.tools.common.parser import check_seed
+from servoid.tools.web.launch import add_view_arguments, check_installed, view_of
 
 HAND_SECONDS = 0.02  # between two places of a joint that is moved by hand
 BOARD_POWER = 24  # register of the board
@@ -44,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="serve nothing; move limp joints of the rig running at --link or --control",
     )
     parser.add_argument("--over", type=float, default=1.0, metavar="S", help="duration of --move (default: 1)")
+    add_view_arguments(parser)
     add_json_argument(parser)
 
 
@@ -59,7 +66,14 @@ def main(args: argparse.Namespace) -> int:
             return exit_codes.DONE
         if args.clock == "locked" and args.control is None:
             raise ConfigError("--clock locked needs a control socket: use --link or --control")
-        serve(report, args)
+        with ExitStack() as open_:
+            if args.view:
+                check_installed()
+                view_of(args)
+                if args.control is None:  # the page asks there where the robot is
+                    folder = open_.enter_context(tempfile.TemporaryDirectory(prefix="servoid-"))
+                    args.control = Path(folder) / "control"
+            serve(report, args)
     return exit_codes.DONE
 
 
@@ -83,11 +97,22 @@ def serve(report: Report, args: argparse.Namespace) -> None:
     values = {"robot": rig.robot.name, "port": server.port, "baud": baud, "control": args.control, "board_id": board}
     report.result(values | {"powered": args.powered or not args.board})
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    page = _show(args) if args.view else None
     try:
         server.serve()
     finally:
+        if page is not None:
+            page.terminate()
+            page.wait()
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _show(args: argparse.Namespace) -> subprocess.Popen[bytes]:
+    """The page of the rig, beside it."""
+    values = {"robot": args.robot, "control": str(args.control), "board": args.board}
+    values |= {"host": args.view_host, "port": args.view_port}
+    return subprocess.Popen([sys.executable, "-m", "servoid.tools.web.rig_view", json.dumps(values)])
 
 
 def told(robot: str, servos: int, board_id: int, baud: int, port: str, args: argparse.Namespace) -> list[str]:

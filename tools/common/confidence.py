@@ -18,8 +18,9 @@ def wilson(successes: int, n: int) -> list[float]:
     return [max((centre - spread) / (1 + z * z / n), 0.0), min((centre + spread) / (1 + z * z / n), 1.0)]
 
 
-def bootstrap(values: Sequence[float]) -> list[float] | None:
-    """95 % confidence interval of a mean: percentiles of the means of resampled values, the same at every call.
+def bootstrap(values: Sequence[float], median: bool = False) -> list[float] | None:
+    """95 % confidence interval of a mean, or of a `median`: percentiles of those of resampled values, the same at every
+    call.
 
     Resampling asks for no bell curve: episode lengths pile up at their limit. Percentiles lie further out than 2.5 %
     where values are few: "expanded" so that for normal values the interval is Student's (T. Hesterberg, "What teachers
@@ -31,7 +32,8 @@ def bootstrap(values: Sequence[float]) -> list[float] | None:
     n, sample = len(values), np.asarray(values, dtype=float)
     if n < LEAST or np.ptp(sample) == 0.0:
         return None
-    means = sample[np.random.default_rng(0).integers(n, size=(_RESAMPLES, n))].mean(axis=1)
+    resampled = sample[np.random.default_rng(0).integers(n, size=(_RESAMPLES, n))]
+    means = np.median(resampled, axis=1) if median else resampled.mean(axis=1)
     tail = NormalDist().cdf(-math.sqrt(n / (n - 1)) * _student(n - 1))
     low, high = np.percentile(means, [100.0 * tail, 100.0 * (1.0 - tail)])
     return [float(low), float(high)]

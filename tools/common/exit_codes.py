@@ -23,6 +23,9 @@ _EXTRAS = {
     "tensordict": "train",
     "tensorboard": "train",
     "pyarrow": "train",
+    "viser": "page",
+    "trimesh": "page",
+    "websockets": "page",
 }
 
 

@@ -33,7 +33,7 @@ class Falls:
     def watch(self, record: TickRecord, standing: bool) -> None:
         """`standing`: whether the robot stands at this tick."""
         before, phase, self._before = self._before, record.phase, record.phase
-        if phase is Phase.FALLEN and before is Phase.RUNNING:
+        if phase is Phase.FALLEN and before in {Phase.READY, Phase.RUNNING}:
             self.falls, self._rose = self.falls + 1, None
         if phase is Phase.RECOVERING and self._rose is None:
             self._rose = record.tick

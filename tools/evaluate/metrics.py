@@ -10,6 +10,7 @@ from typing import Any, Literal
 from servoid.tools.evaluate.judge import ENDED
 
 Record = Mapping[str, Any]
+IN_TIME = 5.0  # s to get up in
 
 
 def fell_or_broken_off(record: Record) -> bool:
@@ -17,10 +18,26 @@ def fell_or_broken_off(record: Record) -> bool:
     return bool(record.get("fell")) or record.get("outcome") not in ENDED
 
 
+def rose(record: Record) -> float | None:
+    """How long it took from its first motion to standing [s], after the first fall of an episode that it got up from;
+    where it began lying, that is the first."""
+    seconds = record.get("stand_seconds") or []
+    return float(seconds[0]) if seconds else None
+
+
+def rose_in_time(record: Record) -> bool:
+    """Whether it stood within `IN_TIME` of its first motion, and at the end."""
+    seconds = rose(record)
+    return seconds is not None and seconds <= IN_TIME and not record.get("fell")
+
+
 # None where an episode has no such figure.
 MEASURES: dict[str, Callable[[Record], float | None]] = {
     "success": lambda record: record.get("success"),
     "fell_or_broken_off": fell_or_broken_off,
+    "on_its_feet": lambda record: not fell_or_broken_off(record),
+    "rose_in_time": rose_in_time,
+    "seconds_to_rise": rose,
     "ticks": lambda record: record.get("ticks"),
     "floating_mm": lambda record: record.get("motion", {}).get("floating_mm"),
     "jerk_mps3": lambda record: record.get("motion", {}).get("jerk_mps3"),
@@ -30,12 +47,14 @@ MEASURES: dict[str, Callable[[Record], float | None]] = {
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of each episode, whose mean is the row's value: one of MEASURES, or a metric of the task by its name."""
+    """A figure of each episode, whose mean (or `median`) is the row's value: one of MEASURES, or the task's metric of
+    that name."""
 
     of: str
     unit: str = ""
     share: bool = False  # true or false, instead of a number
     lower: bool = False  # whether less is better
+    median: bool = False
     # How an episode counts that fell or was stopped: until then, with what it left undone, or (like all that did not
     # succeed) not at all.
     unfinished: Literal["until then", "whole", "left out"] = "until then"
@@ -59,6 +78,12 @@ class Metric:
 METRICS: dict[str, Metric] = {
     "success": Metric("success", share=True),
     "falls": Metric("fell_or_broken_off", share=True, lower=True),  # a robot that cannot go on has not stayed up
+    "on_its_feet": Metric("on_its_feet", share=True),
+    "rose_in_time": Metric("rose_in_time", share=True),
+    "seconds_to_rise": Metric("seconds_to_rise", "s", lower=True, median=True, unfinished="left out"),
+    "ball_speed": Metric("ball_speed_mps", "m/s"),
+    "joint_error": Metric("joint_rms_rad", "rad", lower=True),
+    "understood": Metric("understood", share=True),
     "ticks": Metric("ticks", "ticks", unfinished="whole"),
     "velocity_error": Metric("velocity_error_mps", "m/s", lower=True, unfinished="whole"),
     "seconds_to_goal": Metric("seconds_to_goal", "s", lower=True, unfinished="left out"),

@@ -195,6 +195,7 @@ def dependencies(
         backend=experiment.backend,
         robot=robot,
         randomise=experiment.randomise,
+        recover=experiment.recover,
         seconds=seconds,
         seed=seed,
         set=dict(experiment.set),

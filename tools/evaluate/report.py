@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -41,14 +42,17 @@ def table(rows: Sequence[Row], measured: Mapping[str, Measured]) -> list[dict[st
 
 def _value(row: Row, measured: Measured) -> float | None:
     values = row.metric.values(measured.records)
-    return math.fsum(values) / len(values) if values else None
+    if not values:
+        return None
+    return statistics.median(values) if row.metric.median else math.fsum(values) / len(values)
 
 
 def _line(row: Row, measured: Measured, values: Mapping[str, float | None]) -> dict[str, Any]:
     sample, value, figure = row.metric.values(measured.records), values[row.name], _figure(row, values)
     interval = None
     if sample:
-        interval = wilson(round(math.fsum(sample)), len(sample)) if row.metric.share else bootstrap(sample)
+        share = row.metric.share
+        interval = wilson(round(math.fsum(sample)), len(sample)) if share else bootstrap(sample, row.metric.median)
     return {
         "paper": row.paper,
         "row": row.title,

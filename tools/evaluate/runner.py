@@ -178,6 +178,7 @@ def _prepare(experiment: Experiment, policies: Policies, options: Options, say: 
         robot=options.robot,
         policy=policies.name(experiment),
         randomise=experiment.randomise,
+        recover=experiment.recover,
         seconds=seconds,
         set=chosen,
     )

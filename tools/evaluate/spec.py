@@ -42,6 +42,7 @@ class Experiment:
     policy: str | None = None  # as in `servoid run`, instead of the evaluated one
     backend: str = "sim"
     randomise: bool = False
+    recover: bool = False  # it gets up after a fall, and goes on
     episodes: int = 100
     quick_seconds: float | None = None  # at most so long an episode with --quick
     clips: int = 0  # recorded motions of the expert that the task takes its keyframes from
@@ -101,6 +102,7 @@ class _Experiment:
     policy: str | None = None
     backend: str | None = None
     randomise: bool | None = None
+    recover: bool | None = None
     episodes: int | None = None
     quick_seconds: float | None = None
     clips: int | None = None

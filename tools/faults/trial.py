@@ -6,7 +6,6 @@ the events of the run and by what it raised.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -244,7 +243,7 @@ def unsafe_goals(robot: Robot, accepted: list[dict[str, Any]]) -> list[str]:
     wrong = []
     for entry in accepted:
         joint, register, time_ns, position = (entry[k] for k in ("joint", "register", "time_ns", "position"))
-        name, tick = robot.names[joint], 2 * math.pi / robot.servos[joint].ticks_per_turn
+        name, tick = robot.names[joint], float(robot.tick_angles[joint])
         if register == "torque_enable":
             (powered.add if entry["value"] else powered.discard)(joint)
         if register != "goal_position":

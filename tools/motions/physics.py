@@ -14,9 +14,10 @@ from servoid.sim.worlds import Worlds
 from servoid.stack.safety.limits import limit
 
 SETTLE_SECONDS = 1.0  # in the pose that a motion begins in, before it does
-_CARRIES = 1.0  # N on a sole that carries
+HOLD_SECONDS = 1.0  # of the last goal: a robot that is about to fall has fallen by then
+CARRIES = 1.0  # N on a sole that carries
 # Base in the world frame, w x y z: pitched forward by a right angle, it lies on its front.
-_TURNS = {
+TURNS = {
     "lying on the front": (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0),
     "lying on the back": (np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0),
 }
@@ -61,7 +62,7 @@ def play(
     """
     many = Worlds(robot, worlds, threads=1, randomise=randomise)
     first = np.tile(goals[0], (worlds, 1))
-    orientation = np.tile(_TURNS[begins], (worlds, 1)) if begins in _TURNS else None
+    orientation = np.tile(TURNS[begins], (worlds, 1)) if begins in TURNS else None
     streams = [np.random.default_rng([seed, i]) for i in range(worlds)]
     many.reset(np.arange(worlds), streams, Start(joints=first, orientation=orientation))
     gain = np.ones((worlds, len(robot.joints)))
@@ -77,7 +78,7 @@ def play(
             ("joints", truth.joints),
             ("place", truth.position),
             ("turn", truth.orientation),
-            ("contact", truth.foot_force > _CARRIES),
+            ("contact", truth.foot_force > CARRIES),
             ("effort", many.effort),
             ("fell", truth.fallen),
         ):

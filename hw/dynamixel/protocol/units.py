@@ -1,8 +1,8 @@
 """Servo units to joint units and back, for all joints of a robot at once.
 
-joint = direction * (ticks - center) * 2 pi / ticks_per_turn + zero. A position is known within a turn only, so it is
-taken to be the one nearest the middle of the joint's range: safe across the 0/4095 seam, and after turns that the servo
-counted while it was limp.
+joint = direction * (ticks - center) * 2 pi / (ticks_per_turn * gear) + zero. A position is known within a turn of the
+servo only, so it is taken to be the one nearest the middle of the joint's range: safe across the 0/4095 seam, and after
+turns that the servo counted while it was limp.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ class Units:
         self._zero = np.array([joint.zero for joint in robot.joints])
         self._turn = np.array([servo.ticks_per_turn for servo in servos])
         self._center = np.array([servo.center_tick for servo in servos])
-        self._tick = _TURN / self._turn  # rad
+        self._tick = robot.tick_angles  # rad of the joint
+        self._wrap = _TURN / robot.gears  # rad of the joint for a turn of its servo
         self._middle = (self._lower + self._upper) / 2.0
         self._velocity = self._direction * [servo.velocity_unit for servo in servos]
         self._voltage = np.array([servo.voltage_unit for servo in servos])
@@ -44,7 +45,7 @@ class Units:
     def position(self, ticks: Array) -> Array:
         """Joint angles [rad]; NaN stays NaN."""
         angle = self._direction * (ticks - self._center) * self._tick + self._zero
-        return angle - _TURN * np.round((angle - self._middle) / _TURN)
+        return angle - self._wrap * np.round((angle - self._middle) / self._wrap)
 
     def within_turn(self, ticks: Array) -> Array:
         """Ticks as the servo counts them once torque is on: whole turns forgotten."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -122,14 +121,17 @@ def compare(robot: Robot, found: Sequence[Found]) -> list[Difference]:
     """Every register that matters and differs from what the robot's file asks for, grave ones first."""
     units = Units(robot, [servo.table for servo in found])
     if seam := units.across_the_seam():
+        last = robot.servos[robot.names.index(seam[0])].ticks_per_turn - 1
         raise BackendError(
-            f"{', '.join(seam)}: the range crosses the servo's 0/{robot.servos[0].ticks_per_turn - 1} seam, beyond "
+            f"{', '.join(seam)}: the range crosses the servo's 0/{last} seam, beyond "
             "which it cannot go in position mode: mount the horn half a turn round and set 'zero' in the robot's file"
         )
     lows, highs = units.limits()
-    margin = int(robot.limits.margin * robot.servos[0].ticks_per_turn / math.tau)  # ticks that the guard keeps off
+    margins = (robot.limits.margin / robot.tick_angles).astype(int)  # ticks that the guard keeps off
     differences: list[Difference] = []
-    for servo, model, low, high in zip(found, robot.servos, lows.tolist(), highs.tolist(), strict=True):
+    for servo, model, low, high, margin in zip(
+        found, robot.servos, lows.tolist(), highs.tolist(), margins.tolist(), strict=True
+    ):
         wanted = _factory(servo.table) | {
             "operating_mode": POSITION_MODE,
             "min_position_limit": low,

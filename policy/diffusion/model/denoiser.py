@@ -41,14 +41,24 @@ class Block(nn.Module):
         self.norm_feed = nn.LayerNorm(width)
         self.feed = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
 
-    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Tokens `(batch, tokens, width)` to the same; `mask` is `(tokens, tokens)` bool."""
+    def forward(self, x: Tensor, mask: Tensor, modulation: Tensor | None = None) -> Tensor:
+        """Tokens `(batch, tokens, width)` to the same; `mask` is `(tokens, tokens)` bool.
+
+        `modulation` `(batch, 1 or tokens, 6, width)` makes the norms adaptive: shift, scale and gate of the attention,
+        then of the feed-forward (Peebles and Xie, arXiv:2212.09748).
+        """
+        if modulation is None:
+            x = x + self._attention(self.norm_attention(x), mask)
+            return x + self.feed(self.norm_feed(x))
+        shift, scale, gate, feed_shift, feed_scale, feed_gate = modulation.unbind(2)
+        x = x + gate * self._attention(self.norm_attention(x) * (1.0 + scale) + shift, mask)
+        return x + feed_gate * self.feed(self.norm_feed(x) * (1.0 + feed_scale) + feed_shift)
+
+    def _attention(self, x: Tensor, mask: Tensor) -> Tensor:
         batch, tokens, width = x.shape
-        qkv = self.qkv(self.norm_attention(x)).view(batch, tokens, 3, self.heads, width // self.heads)
+        qkv = self.qkv(x).view(batch, tokens, 3, self.heads, width // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)
-        attended = _attend(q, k, v, mask)
-        x = x + self.out(attended.transpose(1, 2).reshape(batch, tokens, width))
-        return x + self.feed(self.norm_feed(x))
+        return self.out(_attend(q, k, v, mask).transpose(1, 2).reshape(batch, tokens, width))
 
 
 def tick_encoding(ticks: Array, width: int, slowest: float = 400.0) -> Tensor:

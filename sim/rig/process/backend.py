@@ -13,7 +13,7 @@ import numpy as np
 
 from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array, BackendError, Clock
-from servoid.hw.contracts.world import Scene, Truth
+from servoid.hw.contracts.world import Scene, Start, Truth
 from servoid.hw.dynamixel.backend import DynamixelBackend
 from servoid.hw.dynamixel.motors import DynamixelMotors
 from servoid.hw.dynamixel.sensors import DynamixelSensors
@@ -33,10 +33,19 @@ class VirtualBackend:
     name = "virtual"
     clock: Clock
 
-    def __init__(self, robot: Robot, *, seed: int = 0, randomise: bool = False, scene: Scene | None = None) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        seed: int = 0,
+        randomise: bool = False,
+        scene: Scene | None = None,
+        start: Start | None = None,
+    ) -> None:
+        """`start` says how the robot is let go, in one row."""
         self.clock = self._clock = VirtualClock()
         self.truth: Truth = VirtualTruth(self)
-        self._robot, self._seed, self._randomise = robot, seed, randomise
+        self._robot, self._seed, self._randomise, self._start = robot, seed, randomise, start
         self.stage = None if scene is None else Stage(scene, self.truth, robot.dt, self._roll)
         self.simulation = Simulation(self.truth, self.push, self.stage)
         self._rig: RigProcess | None = None
@@ -61,6 +70,8 @@ class VirtualBackend:
             rig = self._rig = RigProcess(on_the_board(self._robot), seed=self._seed, randomise=self._randomise)
             if self.stage is not None:
                 rig.control.furnish(self.stage.scene, self._seed, randomise=self._randomise)
+            if self._start is not None:
+                rig.control.lay(self._start)
             self._rig_truth = rig.truth(None if self.stage is None else self.stage.scene)
             self._clock.attach(rig)
             self._body = DynamixelBackend(on_the_board(self._robot), port=rig.port, clock=self.clock, name=self.name)

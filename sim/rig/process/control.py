@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from servoid.hw.contracts.body import Array, BackendError
-from servoid.hw.contracts.world import Scene
+from servoid.hw.contracts.world import Scene, Start
 from servoid.hw.robot.description import Robot, load_robot, save_robot
 from servoid.sim.model import build
 from servoid.sim.rig.servo.factory_state import FactoryState
@@ -73,6 +73,12 @@ class Control:
         """Put a scene around the robot, and reset the rig."""
         self.call("furnish", scene=plain(scene))
         self.reset(seed, randomise=randomise)
+
+    def lay(self, start: Start) -> None:
+        """Hold the robot so, and let it go so when all servos have torque, until a reset: joints, height, orientation
+        and angular velocity in one row."""
+        values = {name: getattr(start, name) for name in ("joints", "position", "orientation", "angular_velocity")}
+        self.call("lay", **{name: None if value is None else value[0].tolist() for name, value in values.items()})
 
     def roll(self, places: Array) -> None:
         """Put the centres of the scene's spheres to `(m, 3)` m."""
@@ -149,10 +155,12 @@ class RigTruth:
         self._recent, self._scene = np.zeros((1, 1, model.nsensordata)), scene_sensors(model)
         qpos, qvel, sensors = self._arrays.values()
         self._truth = SimulatedTruth(model, robot, qpos, qvel, sensors, self._recent)
+        self.held = True  # whether somebody held the robot when the truth was fetched last
 
     def fetch(self) -> SimulatedTruth:
         """The truth of now; a later call changes what this one returned."""
         answer = self._control.call("truth")
+        self.held = bool(answer["held"])
         for name, array in self._arrays.items():
             array[0] = answer[name]
         self._recent[..., self._scene] = answer["touches"]

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from servoid.hw.config import nearest
+from servoid.hw.contracts.world import Start
 from servoid.sim.rig.rig import Rig
 from servoid.sim.rig.wire.faults import Fault
 from servoid.sim.scene import from_plain
@@ -67,6 +68,14 @@ def _furnish(rig: Rig, scene: dict[str, Any]) -> dict[str, Any]:
     return {}
 
 
+def _lay(rig: Rig, **values: list[float] | None) -> dict[str, Any]:
+    """The robot is held and let go as a start says, until a reset."""
+    rows = {name: None if value is None else np.array([value], dtype=float) for name, value in values.items()}
+    rig.plant.laid = Start(**rows)
+    rig.place(rig.robot.home if rows["joints"] is None else rows["joints"][0])
+    return {}
+
+
 def _roll(rig: Rig, places: list[list[float]]) -> dict[str, Any]:
     """Move the scene's spheres."""
     rig.plant.move(np.asarray(places, float))
@@ -120,6 +129,7 @@ _REQUESTS: dict[str, Callable[..., dict[str, Any]]] = {
     "hold": _hold,
     "push": _push,
     "furnish": _furnish,
+    "lay": _lay,
     "roll": _roll,
     "move": _move,
     "joints": _joints,

@@ -94,7 +94,7 @@ class FactoryState:
                 "return_delay_time": 0,
             }
             if self.assembly == "file":
-                tick = 2 * math.pi / servo.ticks_per_turn
+                tick = 2 * math.pi / servo.ticks_per_turn / joint.gear
                 ends = [servo.center_tick + joint.direction * (end - joint.zero) / tick for end in joint.range]
                 set_up["min_position_limit"] = max(math.floor(min(ends)), 0)
                 set_up["max_position_limit"] = min(math.ceil(max(ends)), servo.ticks_per_turn - 1)

@@ -44,10 +44,10 @@ class Firmware:
     acceleration, the register `feedforward_2nd_gain`, has no effect.
     """
 
-    def __init__(self, servos: tuple[Servo, ...], constant: Array, resistance: Array, delay: float) -> None:
-        """`constant` [V s/rad] and `resistance` [Ohm] are the motors' at the joint; `delay` [s] from goal to torque."""
+    def __init__(self, servos: tuple[Servo, ...], constant: Array, resistance: Array, delay: Array) -> None:
+        """`constant` [V s/rad] and `resistance` [Ohm] are the motors'; `delay` [s] from each one's goal to torque."""
         n = self.n = len(servos)
-        self._k, self._r, self._delay_ns = constant, resistance, round(delay * 1e9)
+        self._k, self._r, self._delay_ns = constant, resistance, np.round(delay * 1e9).astype(int).tolist()
         self.torque_per_ampere = np.array([servo.torque_per_ampere for servo in servos])
         self._no_load = np.array([servo.no_load_speed for servo in servos])
         self._stall = np.array([servo.stall_torque for servo in servos])
@@ -87,7 +87,7 @@ class Firmware:
 
     def submit(self, servo: int, name: str, value: float, now_ns: int) -> None:
         """A goal that was written at `now_ns`: it drives the motor after the servo's own delay."""
-        self._pending.append(_Pending(now_ns + self._delay_ns, servo, name, value))
+        self._pending.append(_Pending(now_ns + self._delay_ns[servo], servo, name, value))
 
     def flush(self, servo: int, angle: float) -> None:
         """Forget what was underway: for torque-on and mode changes, from rest at `angle`."""
@@ -123,8 +123,9 @@ class Firmware:
 
     def step(self, now_ns: int, angle: Array, speed: Array, supply: float) -> Array:
         """Voltages `(n,)` for the physics step that begins at `now_ns`, at the true `angle` and `speed`."""
-        while self._pending and self._pending[0].time_ns <= now_ns + TIMESTEP * 5e8:  # to the nearest step
-            item = self._pending.popleft()
+        due = [item for item in self._pending if item.time_ns <= now_ns + TIMESTEP * 5e8]  # to the nearest step
+        for item in due:
+            self._pending.remove(item)
             if not self.halted[item.servo]:
                 getattr(self, item.name)[item.servo] = item.value
                 self._plan(item.servo)

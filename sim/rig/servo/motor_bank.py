@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.dynamixel.protocol.codec import FRAME_BITS
 from servoid.hw.robot.description import Robot
@@ -36,15 +37,22 @@ class MotorBank:
     def __init__(self, robot: Robot, plant: Plant) -> None:
         self.robot, self.plant = robot, plant
         self._direction = np.array([joint.direction for joint in robot.joints], float)
+        self._ratio = self._direction * robot.gears  # turns of the servo for one of the joint
         self._zero = np.array([joint.zero for joint in robot.joints])
+        if len(set(volts := [servo.voltage for servo in robot.servos])) > 1:
+            raise ConfigError(
+                f"{robot.name}: its servos are for {min(volts):g} to {max(volts):g} V, and a virtual rig has one supply"
+            )
         self.reset()
 
     def reset(self) -> None:
         """New motors, cold, for a plant that was just reset."""
         plant = self.plant
-        steps = np.ceil(plant.body.command_delay / TIMESTEP - 1e-6)  # as in simulation, goals act from whole steps on
-        delay = max(float(steps) * TIMESTEP - _cycle(self.robot), 0.0)
-        self.firmware = Firmware(self.robot.servos, plant.constant, plant.resistance, delay)
+        first, servos = self.robot.servos[0], self.robot.servos
+        wanted = plant.body.command_delay + np.array([servo.command_delay - first.command_delay for servo in servos])
+        steps = np.ceil(wanted / TIMESTEP - 1e-6)  # as in simulation, goals act from whole steps on
+        delay = np.maximum(steps * TIMESTEP - _cycle(self.robot), 0.0)
+        self.firmware = Firmware(self.robot.bare_servos, plant.constant / self.robot.gears, plant.resistance, delay)
         self.firmware.set_stiffness(plant.stiffness)
         self.open_circuit = plant.body.voltage  # V of the battery at rest with the servos idle
         self.sag = 0.0  # V below that: a fault
@@ -54,19 +62,19 @@ class MotorBank:
 
     def angle_of(self, joint: Array) -> Array:
         """Servo angles of joint angles, both rad."""
-        return self._direction * (joint - self._zero)
+        return self._ratio * (joint - self._zero)
 
     def joint_of(self, angle: Array) -> Array:
         """Joint angles of servo angles, both rad."""
-        return self._direction * angle + self._zero
+        return angle / self._ratio + self._zero
 
     def step(self, now_ns: int) -> None:
         """Advance by one physics step, which begins at `now_ns`."""
         plant, firmware = self.plant, self.firmware
-        angle, speed = self.angle_of(plant.joints), self._direction * plant.joint_speed
+        angle, speed = self.angle_of(plant.joints), self._ratio * plant.joint_speed
         volts = firmware.step(now_ns, angle, speed, self.supply)
         plant.step(self._direction * volts, firmware.powered, self.supply)
-        draw = firmware.settle(self._direction * plant.torque, self._direction * plant.joint_speed, self.supply)
+        draw = firmware.settle(plant.torque / self._ratio, self._ratio * plant.joint_speed, self.supply)
         self.supply = max(self.open_circuit - self.sag - BATTERY_RESISTANCE * float(draw.sum()), 0.0)
         self.sense()
 
@@ -78,8 +86,8 @@ class MotorBank:
         self.angle = self.angle_of(angle)
         columns = (
             self.angle,
-            self._direction * speed,
-            self._direction * torque / f.torque_per_ampere,
+            self._ratio * speed,
+            torque / self._ratio / f.torque_per_ampere,
             f.duty,
             f.reference,
             f.reference_speed,

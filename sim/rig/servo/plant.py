@@ -12,10 +12,11 @@ import mujoco
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.contracts.world import Scene
+from servoid.hw.contracts.world import Scene, Start
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
 from servoid.hw.seeds import Stream, generator
+from servoid.sim.ground import Ground
 from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.randomise import Body, draw
 from servoid.sim.scene import robot_bodies, scene_sensors
@@ -43,6 +44,7 @@ class Plant:
         robot = self.robot
         self.model = build(robot, scene)
         self.data = mujoco.MjData(self.model)
+        self._ground = Ground(self.model)
         self._bodies, self._scene = robot_bodies(self.model), scene_sensors(self.model)
         joints = [self.model.joint(name) for name in robot.names]
         self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
@@ -79,9 +81,14 @@ class Plant:
         mujoco.mj_setConst(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
         self.held, self._noise_block, self._ticks = True, -1, 0
+        self.laid: Start | None = None  # how it is held and let go; None: on its feet
         self._idle_rng = generator(seed, Stream.BODY, 1)  # while held: the episode's stream waits
         self._idle = self._idle_rng.standard_normal(6 + len(self.robot.joints))
-        self._joint_age = round(self.body.joint_latency / TIMESTEP)
+        first = self.robot.servos[0]
+        later = np.array([servo.position_latency - first.position_latency for servo in self.robot.servos])
+        ages = np.round(np.maximum(self.body.joint_latency + later, 0.0) / TIMESTEP).astype(int)
+        self._joint_age = int(ages.max())
+        self._sample = self._joint_age - ages, np.arange(len(ages))  # of each joint in its history
         self._imu_age = max(round(self.body.imu_latency / TIMESTEP) - 1, 0)  # sensor data is a substep old already
         self._imu_span = max(round(self.robot.imu.average / TIMESTEP), 1)
         self.place(self.robot.home)
@@ -92,8 +99,8 @@ class Plant:
         data.qvel[:] = 0.0
         data.qpos[self._qpos] = pose - self.body.zero
         data.qpos[0:2] = 0.0
-        height, data.qpos[3:7] = self._legs.stand(pose - self.body.zero)
-        data.qpos[2] = height + CLEARANCE
+        data.qpos[2], data.qpos[3:7] = self._stance()
+        data.qpos[2] += CLEARANCE
         self.held = True
         self._play = data.qpos[self._qpos].copy()
         self._force = np.zeros((self._joint_age + 1, self.model.nu))
@@ -106,11 +113,25 @@ class Plant:
     def release(self) -> None:
         """Put the held robot on its feet where it is, and let go."""
         if self.held:
-            height, self.data.qpos[3:7] = self._legs.stand(self.data.qpos[self._qpos])
-            self.data.qpos[2] = height
+            self.data.qpos[2], self.data.qpos[3:7] = self._stance()
             self.data.qvel[0:6] = 0.0
+            if self.laid is not None:
+                if self.laid.position is not None:
+                    self.data.qpos[2] = self.laid.position[0, 2]
+                if self.laid.angular_velocity is not None:
+                    self.data.qvel[3:6] = self.laid.angular_velocity[0]
             self.held, self._ticks = False, 0
             self._forward()
+
+    def _stance(self) -> tuple[float, Array]:
+        """Height [m] and orientation `(4,)` in which the held robot touches the ground: on its feet, or as it is laid
+        down."""
+        if self.laid is None or self.laid.orientation is None:
+            height, orientation = self._legs.stand(self.data.qpos[self._qpos])
+            return float(height), orientation
+        qpos = self.data.qpos.copy()
+        qpos[3:7] = self.laid.orientation[0]
+        return self._ground.height(qpos), qpos[3:7]
 
     def _forward(self) -> None:
         """Sense the body where it was put."""
@@ -176,10 +197,10 @@ class Plant:
     def encoder(self) -> tuple[Array, Array, Array]:
         """What the servos have measured by now: angle [rad], speed [rad/s] with noise, torque [N m]. A servo that rests
         measures no speed at all: its encoder shows the same tick again and again."""
-        speed = self._speed[0]
+        speed = self._speed[self._sample]
         moving = np.abs(speed) > self._slowest
         measured = np.where(moving, speed + VELOCITY_NOISE * self._row()[6:], 0.0)
-        return self._angle[0] + self.body.zero, measured, self._force[0]
+        return self._angle[self._sample] + self.body.zero, measured, self._force[self._sample]
 
     @property
     def imu(self) -> Array:

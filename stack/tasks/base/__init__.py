@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
@@ -12,6 +12,7 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.operator import CommandSource, Intent
 from servoid.hw.contracts.task import Behaviour, Criterion, Episode, Objective, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot, shipped_robot
@@ -147,6 +148,12 @@ class BaseTask:
 
     def behaviour(self, episode: Any) -> Behaviour:
         raise NotImplementedError(f"task {self.name} asks for nothing")
+
+    def open_source(self) -> CommandSource:
+        raise NotImplementedError(f"nobody steers task {self.name}")
+
+    def steered_behaviour(self, episode: Any, wanted: Callable[[], Intent]) -> Behaviour:
+        raise NotImplementedError(f"nobody steers task {self.name}")
 
     @property
     def objective(self) -> Objective | None:

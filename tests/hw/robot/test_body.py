@@ -8,7 +8,7 @@ from shutil import copy
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from servoid.hw.config import CONFIGS, ConfigError, available
@@ -71,7 +71,7 @@ vector = st.tuples(number, number, number)
 part = st.tuples(vector, vector, vector.filter(lambda v: np.linalg.norm(v) > 0.1), vector, st.integers(0, 2))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25, deadline=None, phases=(Phase.explicit, Phase.generate))
 @given(waist=st.lists(part, max_size=2), legs=st.lists(st.tuples(part, part), min_size=1, max_size=5))
 def test_legs_of_any_build_are_those_of_mujoco(
     tmp_path_factory: pytest.TempPathFactory, waist: list[tuple], legs: list[tuple]

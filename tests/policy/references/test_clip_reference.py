@@ -132,3 +132,24 @@ def test_a_clip_beyond_the_joint_ranges_is_refused() -> None:
         ClipReference(ROBOT, [replace(CLIP, joints=joints)])
     with pytest.raises(ConfigError, match="at least one clip"):
         ClipReference(ROBOT, [])
+
+
+def test_a_clip_that_does_not_begin_upright_waits_for_the_robot_in_its_first_frame() -> None:
+    lying = replace(CLIP, about=replace(CLIP.about, begins="lying on the back"))
+    waits, runs = ClipReference(ROBOT, [lying]), ClipReference(ROBOT, [CLIP])
+    pose = CLIP.joints[0] + 0.5
+    for reference in (waits, runs):
+        reference.play(0)
+        reference.enter(pose)
+    ahead = waits.frames(np.arange(100))
+    ticks = int(np.flatnonzero(ahead.root_position[:, 0] > 1e-9)[0]) - 1  # the last one of waiting
+    assert 10 < ticks < 40
+    np.testing.assert_allclose(ahead.position[ticks], CLIP.joints[0], atol=1e-3)
+    assert (ahead.velocity[:ticks] == 0.0).all()
+    for tick in range(60):
+        now = waits.frames(np.zeros(1, int))
+        np.testing.assert_allclose(now.position[0], ahead.position[tick], atol=1e-9)
+        assert (waits.time == 0.0) == (tick <= ticks)
+        waits.advance()
+        runs.advance()
+    assert runs.time == 60.0, "one that begins upright plays meanwhile"

@@ -10,7 +10,7 @@ from test_diffusion_policy import INSTRUCTION, ROBOT, Spy, state
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Plan, PlanRequest, State
 from servoid.stack.control.diffusion import DiffusionPolicy
-from servoid.stack.control.plan_buffer import Pace
+from servoid.stack.control.planning.plan_buffer import Pace
 from servoid.stack.control.trim import Trim
 
 

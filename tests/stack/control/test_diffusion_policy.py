@@ -24,8 +24,8 @@ from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings
 from servoid.policy.features import Normaliser, raw_layout
 from servoid.stack.control.diffusion import DiffusionPolicy, diffusion_policy
-from servoid.stack.control.plan_buffer import Pace
-from servoid.stack.control.planner import InlinePlanner, ProcessPlanner
+from servoid.stack.control.planning.plan_buffer import Pace
+from servoid.stack.control.planning.planner import InlinePlanner, ProcessPlanner
 from servoid.stack.control.trim import Trim
 from servoid.stack.safety.min_jerk import MinJerk
 

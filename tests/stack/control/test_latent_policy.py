@@ -22,7 +22,7 @@ from servoid.policy.features import Normaliser, raw_layout, raw_row
 from servoid.policy.latent.actions import LatentActions, LatentConfig, proprioception_layout
 from servoid.policy.latent.network import LatentNetwork
 from servoid.stack.control.diffusion import DiffusionPolicy, diffusion_policy
-from servoid.stack.control.plan_buffer import Pace
+from servoid.stack.control.planning.plan_buffer import Pace
 
 SIZE = 3
 HEIGHT = raw_layout(20).slice("displacement").stop - 1

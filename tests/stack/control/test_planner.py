@@ -15,7 +15,7 @@ import pytest
 from waiting import until
 
 from servoid.hw.contracts.control import Instruction, Plan, PlanRequest
-from servoid.stack.control.planner import InlinePlanner, PlannerError, ProcessPlanner
+from servoid.stack.control.planning.planner import InlinePlanner, PlannerError, ProcessPlanner
 
 
 def request(tick: int, seed: int = 0) -> PlanRequest:
@@ -155,7 +155,7 @@ def test_the_process_dies_with_its_parent() -> None:
         from functools import partial
         sys.path[:0] = sys.argv[1].split(os.pathsep)
         from test_planner import build
-        from servoid.stack.control.planner import ProcessPlanner
+        from servoid.stack.control.planning.planner import ProcessPlanner
         if __name__ == "__main__":
             planner = ProcessPlanner(partial(build, seconds=0.0))
             print(planner._process.pid, flush=True)
@@ -181,7 +181,7 @@ def test_a_program_that_forgets_to_close_ends_all_the_same(seconds: float) -> No
         from functools import partial
         sys.path[:0] = sys.argv[1].split(os.pathsep)
         from test_planner import build, request
-        from servoid.stack.control.planner import ProcessPlanner
+        from servoid.stack.control.planning.planner import ProcessPlanner
         if __name__ == "__main__":
             planner = ProcessPlanner(partial(build, seconds=float(sys.argv[2])))
             planner.submit(request(0))

@@ -14,7 +14,7 @@ from servoid.hw.contracts.control import Plan, PlanRequest
 from servoid.hw.contracts.task import Trace
 from servoid.policy.diffusion.settings import load_settings
 from servoid.stack.control.diffusion import STAND_SECONDS, DiffusionPolicy, diffusion_policy
-from servoid.stack.control.planner import Planner
+from servoid.stack.control.planning.planner import Planner
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import Result, RunSettings, prepare, run
 from servoid.tools.common.ground_truth import GroundTruth

@@ -21,7 +21,7 @@ from servoid.stack.control.operator import Controls, Gamepad, Keyboard, open_ste
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.tasks import load_task
-from servoid.stack.tasks.steer import Steered, SteeredAgain
+from servoid.stack.tasks.steer import SteeredAgain
 from servoid.tools.commands import replay
 
 NOTHING = Percept("task", 0.0)
@@ -240,7 +240,7 @@ def test_recorded_steering_ends_as_the_person_did() -> None:
 def test_steering_is_held_as_the_log_holds_it(terminal: tuple[Keyboard, Callable[[str], None], int]) -> None:
     keyboard, press, _ = terminal
     task = load_task("steer", {"forward": "0.3"})
-    steered = Steered(Episode(), keyboard, task.settings)
+    steered = task.steered_behaviour(Episode(), keyboard.read)
     press("www")
     velocity = steered.instruct(0, None, NOTHING).velocity  # type: ignore[arg-type]
     assert velocity[0] == float(np.float32(0.18))

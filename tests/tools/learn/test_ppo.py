@@ -36,6 +36,7 @@ class Beads:
 
     action_size = 1
     mirrors: Mapping[str, Mirror] = {"action": Mirror.FLIPPED, "actor": Mirror.FLIPPED, "critic": Mirror.FLIPPED}
+    measures: Mapping[str, float] = {}
 
     def __init__(self, n: int) -> None:
         self.n, self.ticks, self.terms = n, np.zeros(n, int), dict[str, float]()

@@ -18,16 +18,18 @@ from servoid.tools.learn.settings import (
     DiffusionTraining,
     LatentTraining,
     OdometryTraining,
+    PlannerTraining,
     TrackerTraining,
     TrainingRun,
 )
-from servoid.tools.learn.trainers import diffusion, latent, odometry, tracker
+from servoid.tools.learn.trainers import diffusion, latent, odometry, planner, tracker
 
 METHODS: list[tuple[ModuleType, TrainingRun]] = [
     (tracker, TrackerTraining()),
     (odometry, OdometryTraining()),
     (latent, LatentTraining()),
     (diffusion, DiffusionTraining()),
+    (planner, PlannerTraining()),
 ]
 
 

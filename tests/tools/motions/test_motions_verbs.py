@@ -103,6 +103,9 @@ def test_a_run_becomes_a_clip(tmp_path: Path, motions: Motions, monkeypatch: pyt
         (("import", "{}/motion.bin", "--name", "look-left", "--page", 7), "look-left.safetensors: already exists"),
         (("play", "look-lfet", "--library", "{}/clips"), "did you mean 'look-left'?"),
         (("play", "look-left", "--library", "{}/clips", "--rate", 0), "--rate 0: must be between 0.1 and 10"),
+        (("play", "look-left", "--library", "{}/clips", "--push", 0.3), "open loop nothing answers a push"),
+        (("play", "look-left", "--library", "{}/clips", "--tracker", "expert"), "a tracker of the gait alone"),
+        (("play", "look-left", "--library", "{}/clips", "--tracker", "trakcer"), "no such checkpoint"),
         (
             ("play", "look-left", "--library", "{}/clips", "--worlds", 5),
             "--worlds 5: must be at least 1, and needs --randomise",

@@ -51,11 +51,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _choose_drawing() -> None:
-    """Find a way to draw, for MuJoCo to take when it is loaded. Raises ConfigError naming what is missing.
-
-    It is tried in a process of its own: some ways that do not work end the process, and none is to be left open while
-    a robot runs.
-    """
+    """Find packages and a way to draw a film. Raises ConfigError naming what is missing."""
     if any(find_spec(name) is None for name in ("av", "matplotlib", "PIL")):
         raise ConfigError("--video: this needs the 'video' extra: pip install 'servoid[video]'")
     import av
@@ -64,6 +60,15 @@ def _choose_drawing() -> None:
         av.Codec("libx264", "w")
     except av.error.FFmpegError:
         raise ConfigError("--video: the installed 'av' cannot write H.264: pip install --force-reinstall av") from None
+    choose_drawing("--video")
+
+
+def choose_drawing(what: str) -> None:
+    """Find a way to draw, for MuJoCo to take when it is loaded. Raises ConfigError where there is none for `what`.
+
+    It is tried in a process of its own: some ways that do not work end the process, and none is to be left open while
+    a robot runs.
+    """
     asked = os.environ.get("MUJOCO_GL")
     ways = (asked,) if asked else ("glfw", "egl", "osmesa") if os.environ.get("DISPLAY") else ("egl", "osmesa")
     for way in ways:
@@ -77,4 +82,4 @@ def _choose_drawing() -> None:
             return
     others = " or ".join(f"MUJOCO_GL={way}" for way in ("egl", "osmesa") if way != asked)
     hint = f"try {others}" if asked else "install libegl1 (or libosmesa6)"
-    raise ConfigError(f"--video: cannot draw on this machine with {', '.join(ways)}: {hint}")
+    raise ConfigError(f"{what}: cannot draw on this machine with {', '.join(ways)}: {hint}")

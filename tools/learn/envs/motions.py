@@ -27,7 +27,9 @@ _HOLD_SECONDS = (0.1, 0.6)  # of a clip's last frame
 _ASTRAY_SECONDS = 0.5  # for which a world that follows a clip may be far from it
 _ASTRAY_GRAVITY = 1.0  # squared error of gravity, seen from the base: 60 degrees
 _ASTRAY_HEIGHT = 0.3  # of the standing height
+_AFTER_SECONDS = 1.5
 _GRACE_SECONDS = 1.0  # in which one that lies need not yet lie as the clip
+_NEAR = 0.3  # rad, root mean square, between the end of a clip and the beginning of one that goes on from it
 _LEARNED = 0.03  # of a clip's success, from one try
 _ALWAYS = 0.2  # weight of a clip that never fails, beside 1 of one that always does
 
@@ -49,10 +51,13 @@ class Motions:
         self._along = along(robot, clips, _ALONG, seed) if wanted else None
         self._lying = lying(robot, _LYING, seed) if wanted and self._lies.any() else None
         self._ends = np.array([clip.about.ends for clip in clips])
+        ends, begins = (np.array([clip.joints[at] for clip in clips]) for at in (-1, 0))
+        self._near = np.sqrt(((ends[:, None] - begins) ** 2).mean(-1)) < _NEAR
         self._chances = np.full(len(clips), 0.5)  # of failure
         self._astray, self._since = np.zeros(n, int), np.zeros(n, int)  # ticks: far off; since the last change
         self._next_command, self._next_change = np.zeros(n, int), np.zeros(n, int)
         self._done_at = np.full(n, -1)  # tick of the episode at which a clip that is over gives way
+        self._after = np.zeros(n, bool)  # stands, and did a clip before
         self._level = 1.0
         height, orientation = Legs(robot).stand(robot.home)
         self._stance = float(height), orientation  # of a base that stands at home
@@ -125,7 +130,7 @@ class Motions:
         self.reference.reset(where)
         self._astray[where] = self._next_command[where] = 0
         self._since[where] = round(_GRACE_SECONDS * self.robot.rate)  # whoever begins standing has fallen once it falls
-        self._done_at[where], self.closing[where] = -1, False
+        self._done_at[where], self.closing[where], self._after[where] = -1, False, False
         for i in np.flatnonzero(where).tolist():
             self._next_change[i] = self._walk_ticks(rngs[i], first=True)
         entered = where & (self._first >= 0)
@@ -153,7 +158,7 @@ class Motions:
         chosen = np.broadcast_to(time, self.n)[where] if np.ndim(time) else time
         self.reference.play(clip[where], applied, where, time=chosen, rate=rates[where])
         self._since[where] = self._astray[where] = 0
-        self._done_at[where] = -1
+        self._done_at[where], self._after[where] = -1, False
 
     # -- a tick --------------------------------------------------------------------------------------------------------
 
@@ -169,7 +174,9 @@ class Motions:
         # A robot that has just got up, or kneels beside its clip, may find its feet again; one that walks has fallen.
         patience = _ASTRAY_SECONDS * self.robot.rate
         failed = (self._astray > patience) | (fallen & ~grace)
-        self._learn(failed & self.on_clip, 1.0)
+        # Who falls just after a clip has not come to a stand from it.
+        soon = self._after & (self._since < _AFTER_SECONDS * self.robot.rate)
+        self._learn(failed & (self.on_clip | soon), 1.0)
         return failed
 
     def _learn(self, where: Array, failure: float) -> None:
@@ -206,6 +213,8 @@ class Motions:
         play = np.zeros(self.n, bool)
         for i in np.flatnonzero(due & ~stand).tolist():
             fits = self._begins == pose[i]
+            if ended[i]:  # it sits, or lies, and who lies may come to any pose of lying
+                fits = fits & (self._lies | self._near[self.reference.clip.clip[i]])
             if not fits.any():
                 self.closing[i] = True
                 continue
@@ -215,6 +224,7 @@ class Motions:
             self._play(play, next_clip, applied, rates)
         if stand.any():
             self.reference.stand(applied, stand)
+            self._after |= stand
             self._since[stand], self._done_at[stand], self._astray[stand] = 0, -1, 0
             for i in np.flatnonzero(stand).tolist():
                 self._next_command[i] = ticks[i] + round(rngs[i].uniform(*_STOP_SECONDS) * self.robot.rate)

@@ -21,7 +21,6 @@ from servoid.tools.learn.settings import Ppo
 from servoid.tools.learn.trainers.trainer import Trainer
 
 _BEGUN_AT = 0.5  # of the schedules: as much noise and as large steps as a network stands that is trained already
-_CRITIC_ALONE = 600_000  # samples
 _ADOPTED_COUNT = 5_000_000  # samples that adopted input statistics weigh as much as
 _SETTLING = 60  # ticks
 
@@ -80,6 +79,7 @@ class PpoTrainer(Trainer):
     """Trains an actor and its critic in an environment; a subclass says what its checkpoint is."""
 
     settings: Ppo
+    critic_alone: float = 600_000  # samples, where the actor was adopted
 
     def __init__(self, env: Environment, settings: Ppo, out: Path, source: str) -> None:
         super().__init__(out, settings, source)
@@ -131,7 +131,7 @@ class PpoTrainer(Trainer):
         if self.begun_with:
             progress = _BEGUN_AT + (1.0 - _BEGUN_AT) * progress
             # An adopted actor must not learn from a critic that knows nothing yet.
-            self.ppo.actor.mlp.requires_grad_(self.step >= _CRITIC_ALONE)
+            self.ppo.actor.mlp.requires_grad_(self.step >= self.critic_alone)
         self.env.schedule(progress)
         self.ppo.actor.distribution.log_std_param.fill_(np.log(np.interp(progress, [0.0, 1.0], s.noise)))
         self.ppo.learning_rate = s.learning_rate * (1.0 - 0.85 * progress)
@@ -187,6 +187,15 @@ class PpoTrainer(Trainer):
             raise ConfigError(
                 f"{path}: a network with other inputs or layers: use --no-resume or another --out"
             ) from None
+
+    def begin_small(self, share: float) -> None:
+        """Let the actor's actions begin at a `share` of what its initial weights give."""
+        import torch
+
+        last = _dense(self.ppo.actor)[-1]
+        with torch.no_grad():
+            last.weight.mul_(share)
+            last.bias.mul_(share)
 
     def begin_with(self, network: Mlp) -> None:
         """Give the actor the weights and the input statistics of a network with the same layers."""

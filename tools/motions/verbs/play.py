@@ -1,4 +1,4 @@
-"""Play a clip open loop in physics: only its goals, without a controller.
+"""Play a clip in physics: open loop, only its goals without a controller; or followed by a tracker.
 
 The nominal robot does the same every time, so it plays once; --randomise plays it on --worlds robots drawn at random.
 """
@@ -16,8 +16,6 @@ from servoid.tools.common.output import reporting
 from servoid.tools.common.parser import check_seed
 from servoid.tools.motions.verbs.options import add_library_arguments, clip_of
 
-HOLD_SECONDS = 1.0  # of the last goal: a robot that is about to fall has fallen by then
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("clip", metavar="CLIP", help="name in the library, or file")
@@ -25,6 +23,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worlds", type=int, metavar="N", help="robots to draw (default: 40)")
     parser.add_argument("--rate", type=float, default=1.0, metavar="X", help="factor on the clip's speed (default: 1)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument(
+        "--tracker", metavar="NAME|FILE", help="tracker that follows the clip (default: none, open loop)"
+    )
+    parser.add_argument(
+        "--push", type=float, default=0.0, metavar="M/S", help="hardest push of the base, once a second (default: 0)"
+    )
     add_library_arguments(parser)
 
 
@@ -36,14 +40,22 @@ def main(args: argparse.Namespace) -> int:
         worlds = (args.worlds or 40) if args.randomise else 1
         if not 0.1 <= args.rate <= 10.0:
             raise ConfigError(f"--rate {args.rate:g}: must be between 0.1 and 10")
-        from servoid.tools.motions.physics import play
+        if not 0.0 <= args.push <= 2.0:
+            raise ConfigError(f"--push {args.push:g}: must be between 0 and 2 m/s")
+        if args.push and not args.tracker:
+            raise ConfigError("--push: open loop nothing answers a push: give a --tracker, or drop --push")
+        from servoid.tools.motions.physics import HOLD_SECONDS, play
+        from servoid.tools.motions.tracked import follow
 
         clip, robot = clip_of(args.clip, args)
-        goals = clip.at_rate(args.rate).joints
-        held = np.concatenate([goals, np.repeat(goals[-1:], round(HOLD_SECONDS * robot.rate), 0)])
-        played = play(
-            held, robot, begins=clip.about.begins, worlds=worlds, randomise=float(args.randomise), seed=args.seed
-        )
+        clip = clip.at_rate(args.rate)
+        goals = clip.joints
+        drawn = {"worlds": worlds, "randomise": float(args.randomise), "seed": args.seed}
+        if args.tracker:
+            played = follow(clip, robot, args.tracker, push=args.push, **drawn)
+        else:
+            held = np.concatenate([goals, np.repeat(goals[-1:], round(HOLD_SECONDS * robot.rate), 0)])
+            played = play(held, robot, begins=clip.about.begins, **drawn)
         upright = clip.about.ends == "upright"
         stood = int(played.stands.sum())
         error = float(np.sqrt(np.mean((played.joints - played.goals) ** 2)))

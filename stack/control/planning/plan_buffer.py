@@ -17,7 +17,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Adopted, Instruction, Plan, PlanRequest
 from servoid.policy.diffusion.model.action_space import ActionSpace
-from servoid.stack.control.planner import Planner
+from servoid.stack.control.planning.planner import Planner
 
 _MANY = 25  # late plans in a row after which it is said that the machine is too slow
 
@@ -126,9 +126,13 @@ class PlanBuffer:
     @property
     def due(self) -> bool:
         """Whether a plan is to be asked for at this tick. A recorded run says so of a plan that it did adopt."""
-        tick, pace = self.tick, self.pace
-        idle = self._requested is None or (self._only is not None and tick in self._only)
-        return tick % pace.execution_horizon == 0 and tick >= pace.history - 1 and idle
+        return self.tick % self.pace.execution_horizon == 0 and self.free
+
+    @property
+    def free(self) -> bool:
+        """Whether the planner may be asked at this tick, due or not: it waits for the history, and for one answer."""
+        idle = self._requested is None or (self._only is not None and self.tick in self._only)
+        return self.tick >= self.pace.history - 1 and idle
 
     def ask(self, history: History, meanwhile: list[Array], instruction: Instruction) -> None:
         """Ask for a plan; `meanwhile` are the actions of the next `delay` ticks. Without delay it is adopted now."""

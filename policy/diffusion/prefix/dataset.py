@@ -1,0 +1,139 @@
+"""Windows to learn planning from: a prefix and the frames that follow it, what they are told, and where they end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from servoid.hw.contracts.body import Array
+from servoid.policy.diffusion.prefix.config import PlannerShape
+from servoid.policy.diffusion.prefix.frames import BodyMotion, Frames
+from servoid.policy.diffusion.prefix.target import BodyTarget, drawn
+from servoid.policy.features import Normaliser
+from servoid.policy.motion.clip import other_side
+from servoid.policy.recording import DatasetError
+from servoid.policy.text.encoder import TextEncoder
+
+HELD_OUT = 20  # one take in so many is kept for validation
+UNTOLD = -1  # a window over which what is asked changes
+
+
+@dataclass
+class Sequences:
+    """Takes as frames: each `(frames, size)`, with the number of what each frame is called `(frames,)`."""
+
+    frames: list[Array] = field(default_factory=list)
+    label: list[Array] = field(default_factory=list)
+
+    def add(self, frames: Frames, motion: BodyMotion, label: Array) -> None:
+        """Take in a motion at the robot's rate, called `label` `(ticks,)`: once for each tick that frames may begin
+        at."""
+        for first in range(frames.stride):
+            every = slice(first, None, frames.stride)
+            parts = (getattr(motion, part.name)[every] for part in fields(BodyMotion))
+            self.frames.append(frames.to_relative(BodyMotion(*parts)).astype(np.float32))
+            self.label.append(label[every][1:])
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Windows of a batch; frames are normalised."""
+
+    frames: Tensor  # (batch, prefix + frames, size)
+    text: Tensor  # (batch, words, text size), NaN where there is none
+    target: BodyTarget
+
+
+class ToldSentences:
+    """Encoded phrasings of each label, and of its mirror image."""
+
+    def __init__(self, told: Mapping[str, Sequence[str]], encoder: TextEncoder, words: int) -> None:
+        sides = [[list(texts) for texts in told.values()], [[other_side(t) for t in texts] for texts in told.values()]]
+        flat = [text for side in sides for texts in side for text in texts]
+        self.tokens = torch.from_numpy(encoder.tokens(flat, words))
+        counts = np.array([len(texts) for texts in told.values()])
+        first = np.cumsum([0, *counts[:-1]])
+        self._count = torch.from_numpy(counts)
+        self._first = torch.from_numpy(np.stack([first, first + counts.sum()]))  # (2, labels)
+
+    def of(self, label: Tensor, mirrored: Tensor, generator: torch.Generator) -> Tensor:
+        """A phrasing of each label `(batch,)`, `(batch, words, size)`; all NaN for `UNTOLD`."""
+        known = label.clamp_min(0)
+        share = torch.rand(len(label), generator=generator)
+        pick = self._first[mirrored.long(), known] + (share * self._count[known]).long()
+        return torch.where((label == UNTOLD)[:, None, None], torch.nan, self.tokens[pick])
+
+
+class PlanWindows:
+    """Windows over takes, drawn as normalised batches: each label equally often, mirrored half of the time."""
+
+    def __init__(
+        self,
+        sequences: Sequences,
+        frames: Frames,
+        shape: PlannerShape,
+        sentences: ToldSentences,
+        untold: float,
+        rest: int,
+    ) -> None:
+        """`untold` is the share of windows that are told nothing since what is asked changes on the way.
+
+        What is asked is that of the first frame to come. A motion may come to its end within the window, with `rest`,
+        the label of standing, after it. Raises DatasetError without a window.
+        """
+        self.kinematics, self.shape, self._sentences, self._untold = frames, shape, sentences, untold
+        length = shape.prefix + shape.frames
+        rows, labels, held, offset = [], [], [], 0
+        for number, label in enumerate(sequences.label):
+            if (count := len(label) - length + 1) > 0:
+                ahead = np.lib.stride_tricks.sliding_window_view(label[shape.prefix :], shape.frames)[:count]
+                rows.append(offset + np.arange(count))
+                labels.append(asked(ahead, rest))
+                held.append(np.full(count, number % HELD_OUT == HELD_OUT - 1))
+            offset += len(label)
+        if not rows or not np.concatenate(held).any():
+            raise DatasetError(f"fewer than {HELD_OUT} takes are longer than the {length} frames of a window")
+        row, label, kept = np.concatenate(rows), np.concatenate(labels), np.concatenate(held)
+        self._frames = torch.from_numpy(np.concatenate(sequences.frames).astype(np.float32))
+        self.normaliser = Normaliser.fit(
+            np.concatenate([self._frames.numpy(), frames.mirror(self._frames.numpy())])
+        ).to_torch()
+        self.count = int((~kept).sum())
+        self._training, self._validation = (
+            {int(k): torch.from_numpy(row[mine & (label == k)]) for k in np.unique(label[mine])}
+            for mine in (~kept, kept)
+        )
+        self._span = torch.arange(length)
+
+    def draw(self, batch: int, generator: torch.Generator) -> Batch:
+        """A training batch."""
+        return self._draw(self._training, batch, generator)
+
+    def held_out(self, batch: int) -> Batch:
+        """Windows of takes that are not trained on, the same ones each time."""
+        return self._draw(self._validation, batch, torch.Generator().manual_seed(0))
+
+    def _draw(self, windows: Mapping[int, Tensor], batch: int, generator: torch.Generator) -> Batch:
+        told = [k for k in windows if k != UNTOLD]
+        label = torch.tensor(told)[torch.randint(len(told), (batch,), generator=generator)]
+        if UNTOLD in windows:
+            label = torch.where(torch.rand(batch, generator=generator) < self._untold, UNTOLD, label)
+        share = torch.rand(batch, generator=generator)
+        rows = torch.stack([windows[int(k)][int(s * len(windows[int(k)]))] for k, s in zip(label, share, strict=True)])
+        mirrored = torch.rand(batch, generator=generator) < 0.5
+        raw = self._frames[rows[:, None] + self._span]
+        raw = torch.where(mirrored[:, None, None], self.kinematics.mirror(raw), raw)
+        target = drawn(self.kinematics, raw[:, self.shape.prefix :], generator)
+        return Batch(self.normaliser.encode(raw), self._sentences.of(label, mirrored, generator), target)
+
+
+def asked(ahead: Array, rest: int) -> Array:
+    """What windows are told `(windows,)`, of the labels of their frames to come `(windows, frames)`."""
+    first = ahead[:, :1]
+    same = ahead == first
+    over = np.logical_and.accumulate(ahead[:, ::-1] == rest, axis=1)[:, ::-1]  # rests from here on
+    return np.where((same | over).all(1), first[:, 0], UNTOLD)

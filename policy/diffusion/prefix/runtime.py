@@ -1,0 +1,185 @@
+"""From a request to a plan, with the planner (DiP): what was executed so far is the prefix of what comes next.
+
+A plan requested at tick k is followed from tick k + delay on. So its prefix ends there: with the frames of the plan
+that runs meanwhile behind those that were executed. All of it are frames relative to the one before, so that they go
+on from wherever the robot is.
+
+A pure function of the request, its seed and the network. In a `Plan` the actions are rows of poses (`row_layout` of
+`servoid.policy.references.plan`) for whoever tracks them, and the states are frames.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, Plan, PlanRequest
+from servoid.hw.robot.description import Robot
+from servoid.policy.diffusion.prefix import target
+from servoid.policy.diffusion.prefix.frames import Anchor, BodyMotion, Frames, turned
+from servoid.policy.diffusion.prefix.model import PlannerModel
+from servoid.policy.diffusion.prefix.planner import PrefixPlanner
+from servoid.policy.diffusion.prefix.planning import Planning
+from servoid.policy.diffusion.rolling import seeded
+from servoid.policy.diffusion.runtime import one_thread
+from servoid.policy.text.captions import MOTIONS, caption
+from servoid.policy.text.encoder import load_encoder
+
+_STAND = MOTIONS[0].phrasings[0]
+_STILL = ("yaw_rate", "velocity", "point_velocity")  # of a frame that holds
+
+
+class PlannerRuntime:
+    """Answers requests on one torch thread."""
+
+    def __init__(self, model: PlannerModel, robot: Robot, frames: Frames, planning: Planning) -> None:
+        """Raises ValueError for steps that the network has not."""
+        self._planner = PrefixPlanner(model, frames, steps=planning.steps, text_weight=planning.text_weight)
+        self._model, self._robot, self._frames, self._planning = model, robot, frames, planning
+        self._encoder = load_encoder(model.config.text)
+        self._read: dict[str, Tensor] = {}  # sentences that were encoded
+
+    def warm_up(self) -> None:
+        """Plan once for nothing: the first call of a process takes many times longer than those that follow."""
+        size, words = self._model.config.size, self._sentence(_STAND)
+        with one_thread():
+            prefix = torch.zeros(1, self._model.config.prefix, size)
+            self._planner.plan(prefix, words, target.none(self._frames, 1), [seeded(0)], 1)
+
+    def plan(self, request: PlanRequest) -> Plan:
+        """The plan of one robot's request, or of many at once. Raises ValueError where states are not finite, and
+        ConfigError for a sentence without an English word."""
+        start, lead = time.perf_counter(), request.states.shape[:-2]
+        raw = request.states.reshape(-1, *request.states.shape[-2:])
+        if not np.isfinite(raw).all():
+            raise ValueError("plan request: states are not finite; was every sensor read?")
+        executed = self._frames.of_states(raw[:, :: self._frames.stride])
+        prefix, begin = self._prefix(request, executed)
+        ages = request.tick if request.ages is None else request.ages
+        seeds, ages = (np.broadcast_to(x, lead).ravel() for x in (request.seeds, ages))
+        generators = [seeded(int(seed), int(age)) for seed, age in zip(seeds, ages, strict=True)]
+        now = Anchor.before(executed, -1)
+        with one_thread():
+            text, wanted = self._asked(request.instruction, len(raw), now, begin)
+            planned = self._planner.plan(
+                torch.from_numpy(prefix.astype(np.float32)), text, wanted, generators, self._planning.frames
+            ).numpy()
+        frames = planned.astype(float)
+        motion = self._frames.to_global(frames, Anchor.before(begin, -1))
+        rows = self._rows(begin, motion)
+        path = turned(motion.place[..., :2] - now.place[:, None], -now.heading[:, None])
+        delay, count = self._planning.delay, frames.shape[1]
+        waiting = np.repeat(rows[:, :1], delay, 1)  # for the ticks until it is adopted
+        actions = np.concatenate([waiting, rows], 1)
+        return Plan(
+            tick=request.tick,
+            actions=actions.reshape(*lead, *actions.shape[1:]),
+            states=frames.reshape(*lead, *frames.shape[1:]),
+            path=path.reshape(*lead, count, 2),
+            seconds=time.perf_counter() - start,
+            ticks=delay + self._frames.stride * np.arange(1, count + 1),
+        )
+
+    def _prefix(self, request: PlanRequest, executed: BodyMotion) -> tuple[Array, BodyMotion]:
+        """Frames `(batch, prefix, size)` up to where the plan begins, and that frame in the odometry frame."""
+        config, planning, stride = self._model.config, self._planning, self._frames.stride
+        seen = self._frames.to_relative(executed)
+        last, waiting = request.previous, planning.delay // stride
+        if last is None:
+            coming, before = np.repeat(self._held(seen[:, -1:]), waiting, 1), seen
+        else:
+            states = last.states.reshape(len(seen), *last.states.shape[-2:])
+            first = (request.tick - last.tick - planning.delay) // stride  # of its frames, those that have passed
+            ahead = first + np.arange(waiting)
+            held = ahead >= states.shape[1]
+            coming = states[:, np.clip(ahead, 0, states.shape[1] - 1)]
+            coming = np.where(held[:, None], self._held(coming), coming)
+            before = seen if planning.feedback else np.concatenate([seen, states[:, : max(first, 0)]], 1)
+        begin = self._frames.to_global(np.concatenate([seen[:, -1:], coming], 1), Anchor.before(executed, -2))
+        return np.concatenate([before, coming], 1)[:, -config.prefix :], begin
+
+    def _held(self, frames: Array) -> Array:
+        """The same poses at rest."""
+        still = frames.copy()
+        for name in _STILL:
+            still[..., self._frames.layout.slice(name)] = 0.0
+        return still
+
+    def _rows(self, begin: BodyMotion, motion: BodyMotion) -> Array:
+        """Poses at the robot's rate `(batch, ticks, row size)`, from the tick after the plan begins."""
+        stride = self._frames.stride
+
+        def whole(name: str) -> Array:
+            return np.concatenate([getattr(begin, name)[:, -1:], getattr(motion, name)], 1)
+
+        def between(values: Array) -> Array:
+            share = (np.arange(stride) + 1.0)[:, None] / stride
+            steps = values[:, :-1, None] + share * (values[:, 1:, None] - values[:, :-1, None])
+            return steps.reshape(len(values), -1, values.shape[-1])
+
+        orientation = whole("orientation")
+        flips = np.where((orientation[:, 1:] * orientation[:, :-1]).sum(-1) < 0.0, -1.0, 1.0)
+        orientation[:, 1:] *= np.cumprod(flips, 1)[..., None]
+        turn = between(orientation)
+        joints = np.clip(between(whole("joints")), self._robot.lower, self._robot.upper)
+        contact = np.clip(between(whole("contact")), 0.0, 1.0)
+        unit = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
+        return np.concatenate([between(whole("place")), unit, joints, contact], -1)
+
+    # -- what is asked -------------------------------------------------------------------------------------------------
+
+    def _asked(
+        self, instruction: Instruction, batch: int, now: Anchor, begin: BodyMotion
+    ) -> tuple[Tensor | None, target.BodyTarget]:
+        """Sentence and target, seen from where the plan begins."""
+        top = self._robot.walking.scale
+        velocity = np.broadcast_to(instruction.velocity, (batch, 3))
+        wanted: list[list[tuple[str, Array]]] = [[] for _ in range(batch)]
+        if instruction.stand:
+            sentences = [_STAND] * batch
+        elif instruction.text is not None:
+            sentences = [instruction.text] * batch
+        else:
+            sentences = [caption(twist, top) for twist in velocity]
+        if not instruction.stand:
+            self._add_places(wanted, instruction, velocity, batch)
+        told = [self._sentence(text) for text in sentences if text.strip()]
+        text = torch.cat(told) if len(told) == batch else None
+        targets = [target.of_points(self._frames, asked) for asked in wanted]
+        whole = target.BodyTarget(
+            *(torch.cat([getattr(one, name) for one in targets]) for name in ("places", "heading", "asked"))
+        )
+        away = turned(begin.place[:, -1, :2] - now.place, -now.heading)
+        turn = begin.heading[:, -1] - now.heading
+        return text, whole.moved(torch.from_numpy(away).float(), torch.from_numpy(turn).float())
+
+    def _add_places(
+        self, wanted: list[list[tuple[str, Array]]], instruction: Instruction, velocity: Array, batch: int
+    ) -> None:
+        if instruction.targets is not None:
+            for name, values in instruction.targets.items():
+                each = np.broadcast_to(values, (batch, *np.shape(values)[-1:]) if np.ndim(values) else (batch,))
+                for asked, value in zip(wanted, each, strict=True):
+                    asked.append((name, np.atleast_1d(value)))
+        elif instruction.goal is not None:
+            goal = np.broadcast_to(instruction.goal, (batch, 2))
+            distance = np.linalg.norm(goal, axis=-1, keepdims=True)
+            near = goal * np.minimum(self._planning.reach / np.maximum(distance, 1e-9), 1.0)
+            for asked, place in zip(wanted, near, strict=True):
+                asked.append(("ground", place))
+        elif instruction.text is None:  # where the velocity leads to, along an arc
+            seconds = (self._model.config.frames + self._planning.delay / self._frames.stride) * self._frames.dt
+            angle = velocity[:, 2] * seconds
+            chord = velocity[:, :2] * (seconds * np.sinc(angle / (2 * np.pi)))[:, None]
+            for asked, place, heading in zip(wanted, turned(chord, angle / 2), angle, strict=True):
+                asked += [("ground", place), (target.HEADING, np.atleast_1d(heading))]
+
+    def _sentence(self, text: str) -> Tensor:
+        if text not in self._read:
+            tokens = self._encoder.tokens([text], self._model.config.words)
+            self._read[text] = torch.from_numpy(tokens)
+        return self._read[text]

@@ -1,0 +1,76 @@
+"""What a task policy sees of what it is asked: pure functions of an instruction, the same in training and in a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction
+from servoid.hw.robot.description import Walking
+from servoid.hw.robot.mirror import Mirror
+
+AHEAD = 1.0  # s of turning that an instruction which gives a yaw rate asks to face
+FARTHEST = 1.0  # m: a place farther away is seen at this distance
+
+
+@dataclass(frozen=True)
+class SeenGoal:
+    """A kind of goal: how it is seen `(..., size)`, and in a mirror."""
+
+    name: str
+    size: int
+    mirror: Mirror
+    observe: Callable[[Instruction, Walking], Array]
+
+
+def _velocity(instruction: Instruction, walking: Walking) -> Array:
+    """Planar velocity in the heading frame `(..., 2)`, in shares of the top speed."""
+    asked = instruction.velocity[..., :2] if instruction.ground is None else instruction.ground
+    return np.asarray(asked, float) / walking.forward
+
+
+def _steering(instruction: Instruction, walking: Walking) -> Array:
+    """The velocity, and the direction to face, in the heading frame `(..., 4)`: where the ground velocity points, or
+    where the yaw rate leads."""
+    if instruction.ground is None:
+        angle = AHEAD * np.asarray(instruction.velocity[..., 2], float)
+    else:
+        x, y = instruction.ground[..., 0], instruction.ground[..., 1]
+        angle = np.where(np.hypot(x, y) > 1e-6, np.arctan2(y, x), 0.0)
+    facing = np.stack([np.cos(angle), np.sin(angle)], -1)
+    return np.concatenate([_velocity(instruction, walking), facing], -1)
+
+
+def _location(instruction: Instruction, walking: Walking) -> Array:
+    """The place in the heading frame `(..., 2)` m. Raises ConfigError where the task has none."""
+    if instruction.goal is None:
+        raise ConfigError("this policy walks to a place, and the task gives none: run goal, goal-near or goal-far")
+    goal = np.asarray(instruction.goal, float)
+    distance = np.maximum(np.linalg.norm(goal, axis=-1, keepdims=True), 1e-9)
+    return goal * np.minimum(1.0, FARTHEST / distance)
+
+
+def _ball(instruction: Instruction, walking: Walking) -> Array:
+    """Where the nearest thing to keep clear of is [m], and where it goes in shares of the top speed, in the heading
+    frame `(..., 4)`. Raises ConfigError where the task has none."""
+    if instruction.obstacles is None or not np.size(instruction.obstacles):
+        raise ConfigError("this policy gets out of a ball's way, and the task has none: run obstacle")
+    things = np.asarray(instruction.obstacles, float)
+    distance = np.linalg.norm(things[..., :2], axis=-1)
+    nearest = np.take_along_axis(things, np.argmin(distance, -1)[..., None, None], -2)[..., 0, :]
+    return np.concatenate([nearest[..., :2], nearest[..., 3:5] / walking.forward], -1)
+
+
+GOALS: Mapping[str, SeenGoal] = {
+    goal.name: goal
+    for goal in (
+        SeenGoal("velocity", 2, Mirror.PLANAR, _velocity),
+        SeenGoal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering),
+        SeenGoal("location", 2, Mirror.PLANAR, _location),
+        SeenGoal("ball", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _ball),
+    )
+}

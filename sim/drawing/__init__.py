@@ -1,0 +1,1 @@
+"""What draws robots: their shapes."""

@@ -1,0 +1,177 @@
+"""A motion prior: what it knows, what it refuses, and what it generates."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from made_prior import SMALL, trainer, write_prior
+from synthetic_recording import write_dataset
+
+from servoid.hw.config import ConfigError
+from servoid.hw.geometry import up_vector, yaw_of
+from servoid.hw.robot.description import load_robot
+from servoid.hw.robot.limbs import Limb, Limbs
+from servoid.policy import checkpoint
+from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.priors.score_matching.generate import generate, starts, upright
+from servoid.policy.priors.score_matching.model import Prior, Style, load_prior
+from servoid.policy.priors.score_matching.score import RunningMean, Score, likeness
+from servoid.policy.recording import DatasetError
+from servoid.sim.kinematics import limbs_of
+from servoid.tools.learn.trainers.prior import read_by_style
+
+ROBOT = load_robot()
+
+
+@pytest.fixture(scope="module")
+def styled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A prior of two styles."""
+    data = tmp_path_factory.mktemp("styles")
+    for seed, style in enumerate(("high", "low")):
+        write_dataset(data / style, ROBOT, episodes=4, ticks=60, seed=seed)
+    return write_prior(data, tmp_path_factory.mktemp("prior"))
+
+
+@pytest.fixture(scope="module")
+def prior(styled: Path) -> Prior:
+    return load_prior(styled, ROBOT, limbs_of(ROBOT))
+
+
+def windows(prior: Prior, count: int = 64) -> torch.Tensor:
+    torch.manual_seed(0)
+    return prior.decode(torch.randn(count, prior.config.frames, prior.config.size))
+
+
+def changed(path: Path, out: Path, **more: Any) -> Path:
+    """The checkpoint with another header."""
+    head, tensors = checkpoint.read(path)
+    checkpoint.write(out, tensors, {**head, **more})
+    return out
+
+
+def test_training_makes_it_tell_data_from_noise(synthetic_dataset: Path, tmp_path: Path) -> None:
+    made = trainer(synthetic_dataset, tmp_path, replace(SMALL, steps=120, width=64, learning_rate=3e-3, average=0.9))
+    made.start(resume=False)
+    first = made.learn()["loss"]
+    made.run()
+    found = load_prior(made.best_path, ROBOT)
+    known = found.decode(made.windows.held_out(64)[0])
+    score = Score(found, Style(), 0)
+    assert score(known).shape == (64, 3)
+    assert score(known).mean() < 0.8 * score(windows(found)).mean()
+    assert made.held_out()["error"] < 0.9 * first
+    assert found.header["results"]["step"] == 120
+
+
+def test_styles_are_composed_by_the_body(prior: Prior) -> None:
+    """Upper features are those of one style and lower ones those of the other."""
+    noisy, levels = windows(prior, 8), torch.full((8,), 4)
+    high, low = (prior.noise(noisy, levels, Style(name, name)) for name in ("high", "low"))
+    both = prior.noise(noisy, levels, Style.parse("high+low"))
+    lower = torch.from_numpy(prior.features.lower)
+    assert torch.equal(both[..., lower], low[..., lower])
+    assert torch.equal(both[..., ~lower], high[..., ~lower])
+    assert not torch.allclose(high, low)
+    free = prior.noise(noisy, levels, Style())
+    guided = prior.noise(noisy, levels, Style.parse("low", 2.0))
+    assert torch.allclose(guided, free + 2.0 * (low - free), atol=1e-5)
+
+
+def test_an_unknown_style_is_named(prior: Prior) -> None:
+    with pytest.raises(ConfigError, match=r"style 'zombie'.*high, low"):
+        Score(prior, Style.parse("zombie"), 0)
+
+
+def test_a_window_with_a_nan_is_refused(prior: Prior) -> None:
+    bad = windows(prior)
+    bad[3, 1, 5] = torch.nan
+    with pytest.raises(ValueError, match="not finite"):
+        Score(prior, Style(), 0)(bad)
+
+
+def test_a_random_level_is_one_error_a_window(prior: Prior) -> None:
+    assert Score(prior, Style(), 0, random_level=True)(windows(prior)).shape == (64, 1)
+
+
+def test_generated_windows_depend_on_the_seed_alone(prior: Prior) -> None:
+    a, b, c = (generate(prior, 3, Style(), seed) for seed in (1, 1, 2))
+    assert torch.equal(a, b)
+    assert not torch.equal(a, c)
+    assert torch.equal(generate(prior, 2, Style(), 1), a[:2])
+    assert a.shape == (3, prior.config.frames, prior.config.size)
+    start = starts(a.numpy(), prior.features, 0.04)
+    assert start.joints is not None
+    assert (start.joints >= ROBOT.lower).all()
+    assert (start.joints <= ROBOT.upper).all()
+    assert start.position is not None
+    assert np.isnan(start.position[:, 2]).all()  # put down on the ground
+
+
+def test_an_upright_quaternion_tilts_as_gravity_says() -> None:
+    gravity = np.random.default_rng(0).normal(size=(20, 3))
+    quaternion = upright(gravity)
+    assert np.allclose(-up_vector(quaternion), gravity / np.linalg.norm(gravity, axis=1, keepdims=True))
+    assert np.allclose(yaw_of(quaternion), 0.0)
+
+
+def test_the_running_mean_is_of_all_errors_until_it_freezes() -> None:
+    mean = RunningMean(2, freeze_after=30)
+    first = mean(np.full((20, 2), [2.0, 4.0]))
+    assert np.allclose(first, [2.0, 4.0])
+    assert np.allclose(mean(np.full((20, 2), [4.0, 0.0])), [3.0, 2.0])
+    assert np.allclose(mean(np.full((20, 2), 100.0)), [3.0, 2.0])
+    assert np.allclose(likeness(np.array([[3.0, 2.0], [0.0, 0.0]]), np.array([3.0, 2.0]), 6.0), [np.exp(-6.0), 1.0])
+
+
+def test_what_does_not_fit_is_refused(styled: Path, tmp_path: Path) -> None:
+    head, _ = checkpoint.read(styled)
+    layout = [["velocity", 3], *head["prior_layout"][2:]]
+    others = [
+        ({"rate": 100}, "100 ticks a second"),
+        ({"joints": list(ROBOT.names[::-1])}, "joints do not fit"),
+        ({"prior_layout": layout}, "layout is not this program's"),
+        ({"results": {"step": 0}}, "0 steps"),
+        ({"results": {"step": 10}}, "interrupted before it was measured"),
+        ({"kind": "diffusion"}, "a prior network is needed"),
+        ({"config": {**head["config"], "frames": 1}}, "frames must be at least 2"),
+    ]
+    for number, (change, message) in enumerate(others):
+        with pytest.raises(CheckpointError, match=message):
+            load_prior(changed(styled, tmp_path / f"{number}.safetensors", **change), ROBOT)
+    limbs = limbs_of(ROBOT)
+    arm = limbs.limbs[0]
+    longer = Limbs((Limb(arm.joints, arm.anchors, arm.axes, arm.tip * 1.1), *limbs.limbs[1:]))
+    with pytest.raises(CheckpointError, match="limbs are not those of op3"):
+        load_prior(styled, ROBOT, longer)
+
+
+def test_data_without_motion_is_refused(tmp_path: Path) -> None:
+    write_dataset(tmp_path / "short", ROBOT, episodes=3, ticks=1)
+    with pytest.raises(DatasetError, match="no episode has the 7 ticks of a window"):
+        trainer(tmp_path / "short", tmp_path / "out")
+    write_dataset(tmp_path / "single", ROBOT, episodes=1, ticks=60)
+    with pytest.raises(DatasetError, match="one episode alone"):
+        trainer(tmp_path / "single", tmp_path / "out")
+
+
+def test_folders_of_datasets_are_styles(tmp_path: Path, synthetic_dataset: Path) -> None:
+    write_dataset(tmp_path / "data" / "wide", ROBOT, episodes=2, ticks=30)
+    assert list(read_by_style(tmp_path / "data", ROBOT)) == ["wide"]
+    assert list(read_by_style(synthetic_dataset, ROBOT)) == [""]
+
+
+def test_the_shipped_prior_knows_motion_of_this_robot() -> None:
+    found = load_prior(checkpoint.resolve("prior"), ROBOT, limbs_of(ROBOT))
+    results = found.header["results"]
+    assert results["reversed_error"] > 5.0 * results["error"]
+    drawn = generate(found, 8, Style(), 0)
+    still = drawn[:, -1:].expand_as(drawn)
+    score = Score(found, Style(), 0)
+    assert score(still).mean() > 2.0 * score(drawn).mean()
+    speeds, cadences = found.manner["speed"], found.manner["cadence"]
+    assert len(speeds) == len(cadences) >= 3

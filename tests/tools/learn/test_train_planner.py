@@ -1,0 +1,80 @@
+"""`servoid train planner`: takes, a training that goes on, and what it measures."""
+
+from __future__ import annotations
+
+import argparse
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from servoid.hw.config import ConfigError
+from servoid.hw.robot.description import load_robot
+from servoid.policy.checkpoint import read_header
+from servoid.policy.diffusion.prefix.frames import Frames, wrapped
+from servoid.policy.motion.library import Library
+from servoid.policy.text.captions import MOTIONS, NAMES
+from servoid.tools.learn.takes import TakeMaker, labels, told
+from servoid.tools.learn.trainers import planner
+
+ROBOT = load_robot("op3")
+LIBRARY = Library(ROBOT)
+CLIPS = [LIBRARY[name] for name in ("wave", "sit-down", "rise")]
+
+
+def test_takes_go_from_clip_to_clip_without_a_jump_and_end_standing() -> None:
+    maker = TakeMaker(ROBOT, CLIPS, np.random.default_rng(0))
+    names = list(labels(CLIPS))
+    seen: set[str] = set()
+    for number, take in enumerate([*maker.clips(4, walking=0.0), *maker.clips(2, walking=1.0)]):
+        order = [names[i] for i in take.label[np.r_[True, np.diff(take.label) != 0]]]
+        seen |= set(order)
+        assert order[-1] == "stand"
+        assert all(after == "rise" for before, after in pairwise(order) if before == "sit-down")
+        if number < 4:  # the gait itself is quicker
+            assert np.abs(np.diff(take.joints, axis=0)).max() < ROBOT.limits.joint_speed * ROBOT.dt
+        motion = Frames(ROBOT).motion(take.place, take.orientation, take.joints)
+        assert np.linalg.norm(np.diff(take.place, axis=0), axis=1).max() < 0.03
+        assert np.abs(wrapped(np.diff(motion.heading))).max() < 0.1
+    assert {"wave", "sit-down", "rise", "stand"} <= seen
+    assert any(motion.name in seen for motion in MOTIONS[1:]), "some clips begin from a walk that stops"
+
+
+def test_walks_are_told_by_their_command_and_go_where_they_say() -> None:
+    maker = TakeMaker(ROBOT, CLIPS, np.random.default_rng(0))
+    forward = NAMES.index("forward")
+    walks = maker.walks(8, 8.0)
+    assert len(walks) == 8
+    assert all(walk.ticks == 400 and (walk.label >= 0).all() for walk in walks)
+    speeds = [np.diff(w.place[:, 0])[w.label[1:] == forward] / ROBOT.dt for w in walks]
+    assert any(len(s) for s in speeds)
+
+
+def test_what_leads_to_a_motion_is_called_like_it() -> None:
+    assert told(np.array([3, -1, -1, 7, -1])).tolist() == [3, 7, 7, 7, NAMES.index("stand")]
+
+
+def test_a_pose_that_nothing_leads_on_from_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no clip begins sitting"):
+        TakeMaker(ROBOT, CLIPS[:2], np.random.default_rng(0))
+
+
+@pytest.mark.slow
+def test_a_training_learns_goes_on_and_says_what_it_measured(tmp_path: Path) -> None:
+    small = ["--layers", "1", "--width", "32", "--batch", "16", "--threads", "1", "--evaluate-every", "0",
+             "--clips", "wave", "sit-down", "rise", "--clip-takes", "40", "--walk-takes", "10",
+             "--walk-seconds", "8", "--out", str(tmp_path)]  # fmt: skip
+    before = torch.get_num_threads()
+    for steps in ("20", "40"):
+        parser = argparse.ArgumentParser()
+        planner.add_arguments(parser)
+        assert planner.main(parser.parse_args([*small, "--steps", steps])) == 0
+    torch.set_num_threads(before)
+    head = read_header(tmp_path / "planner.safetensors")
+    assert head["kind"] == "planner"
+    assert head["results"]["step"] == 40
+    assert 0.0 < head["results"]["validation_loss"] < 3.0
+    assert 0.0 < head["results"]["target_error_m"] < 3.0
+    assert "3 clips" in head["data"]

@@ -1,0 +1,229 @@
+"""Task policies under a motion prior: their world, their reward, what they save, and that it runs as it learned."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from made_prior import write_prior
+
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.control import Instruction
+from servoid.hw.robot.description import load_robot
+from servoid.hw.robot.mirror import Mirror
+from servoid.policy import checkpoint
+from servoid.policy.checkpoint import CheckpointError, read_header
+from servoid.policy.priors.adversarial.discriminator import (
+    Adversary,
+    Discriminator,
+    load_discriminator,
+    save_discriminator,
+)
+from servoid.policy.priors.goals import GOALS
+from servoid.policy.priors.score_matching.model import Style, load_prior
+from servoid.policy.priors.score_matching.windows import PriorWindows
+from servoid.policy.priors.task_policy import TaskPolicy
+from servoid.policy.recording import read_recording
+from servoid.sim.kinematics import limbs_of
+from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
+from servoid.tools.learn.envs.score_term import Rival
+from servoid.tools.learn.envs.task_environment import TaskEnvironment
+from servoid.tools.learn.envs.tasks import LEARNED_TASKS, TaskState, load_learned_task
+from servoid.tools.learn.prior_settings import PolicyTraining
+from servoid.tools.learn.trainers.policy import PolicyTrainer, environment
+
+ROBOT = load_robot()
+SETTINGS = replace(
+    PolicyTraining(),
+    hidden=(16,),
+    horizon=3,
+    mini_batches=2,
+    episode_seconds=0.4,
+    worlds=6,
+    starts=8,
+    samples=36.0,
+    evaluate_every=0.0,
+    critic_alone=0.0,
+)
+
+
+@pytest.fixture(scope="module")
+def prior(synthetic_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_prior(synthetic_dataset, tmp_path_factory.mktemp("prior"))
+
+
+def made(prior: Path, task: str = "speed", settings: PolicyTraining = SETTINGS) -> TaskEnvironment:
+    return environment(task, load_prior(prior, ROBOT, limbs_of(ROBOT)), Style(), settings, settings.worlds, 0)
+
+
+@pytest.mark.slow
+def test_a_policy_is_trained_and_runs_as_it_learned(prior: Path, tmp_path: Path) -> None:
+    """Decisions of the checkpoint, made from the estimate of a run, are those that the training rewarded."""
+    env = made(prior)
+    trainer = PolicyTrainer(env, Style(), SETTINGS, tmp_path, prior)
+    trainer.start(resume=False)
+    trainer.run()
+    head = read_header(trainer.best_path)
+    assert head["config"]["prior"]["name"] == prior.name
+    assert math.isfinite(head["results"]["return"])
+    policy = TaskPolicy(ROBOT, trainer.best_path, (env.n,))
+    policy.reset(None, env.fleet.seeds)
+    env.settings = replace(SETTINGS, episode_seconds=60.0)
+    env.limit = 1000
+    env.reset()
+    for _ in range(3):
+        decided = ROBOT.home + env.reach * trainer.actor()(env.observations["actor"])
+        told = env.task.instruct(env.asked, env.fleet.state)
+        first = policy.act(env.fleet.state, env.fleet.applied, told)
+        assert np.allclose(first, decided, atol=1e-5)
+        assert np.array_equal(policy.act(env.fleet.state, env.fleet.applied, told), first)  # it holds for two ticks
+        env.step(trainer.actor()(env.observations["actor"]))
+
+
+def test_the_papers_sum_and_a_gate_are_weights(prior: Path) -> None:
+    env = made(prior, settings=replace(SETTINGS, rewards={"task": 0.5, "manner": 0.5}))
+    env.reset()
+    reward, _, _ = env.step(np.zeros((env.n, env.action_size)))
+    assert env.term_names == ("task", "manner")
+    assert np.allclose(reward.mean() / env.dt, env.terms["task"] + env.terms["manner"])
+    assert 0.0 < env.terms["manner"] <= 0.5
+    with pytest.raises(ValueError, match=r"rewards\.tsk: no such reward"):
+        replace(SETTINGS, rewards={"tsk": 1.0})
+
+
+def test_an_episode_that_is_unlike_the_data_ends(prior: Path) -> None:
+    env = made(prior, settings=replace(SETTINGS, unlike=1e-3, unlike_after=0.0))
+    env.reset()
+    _, done, late = env.step(np.zeros((env.n, env.action_size)))
+    assert done.all()
+    assert not late.any()
+
+
+def test_generated_starts_move_and_stand_on_the_ground(prior: Path) -> None:
+    env = made(prior, settings=replace(SETTINGS, generated=1.0))
+    env.reset()
+    truth = env.fleet.truth
+    assert not np.allclose(truth.joints, ROBOT.home)
+    assert (np.abs(truth.foot_position[..., 2].min(1)) < 0.05).all()
+    standing = made(prior, settings=replace(SETTINGS, generated=0.0))
+    standing.reset()
+    assert np.allclose(standing.fleet.applied, ROBOT.home, atol=1e-6)
+    assert np.allclose(standing.velocity, 0.0)
+
+
+def test_rewards_are_highest_for_what_is_asked() -> None:
+    def state(position: tuple[float, float], yaw: float, velocity: tuple[float, float]) -> TaskState:
+        return TaskState(np.array([position]), np.array([yaw]), np.array([velocity]))
+
+    speed, steering, location = (LEARNED_TASKS[name](ROBOT) for name in ("speed", "steering", "location"))
+    asked = np.array([[0.3]])
+    assert speed.reward(asked, state((0, 0), 0.0, (0.3, 0.0)))[0] == pytest.approx(1.0)
+    assert speed.reward(asked, state((0, 0), 0.0, (0.0, 0.3)))[0] < 0.2  # another way
+    assert speed.reward(asked, state((0, 0), 0.0, (0.0, 0.0)))[0] < 0.2  # standing
+    sideways = np.array([[0.0, 0.1, 1.0, 0.0]])
+    assert steering.reward(sideways, state((0, 0), 0.0, (0.0, 0.1)))[0] == pytest.approx(1.0)
+    assert steering.reward(sideways, state((0, 0), np.pi / 2, (0.0, 0.1)))[0] == pytest.approx(0.7)
+    assert steering.reward(sideways, state((0, 0), 0.0, (0.0, -0.01)))[0] == pytest.approx(0.3)
+    ball = LEARNED_TASKS["dodgeball"](ROBOT)
+    thrown = ball.draw(np.random.default_rng(0), np.array([1.0, -1.0]))[None]
+    hit = [bool(ball.ended(ball.advance(thrown, t), state((1, -1), 0.0, (0.0, 0.0)))[0]) for t in np.arange(0, 6, 0.1)]
+    assert any(hit)  # it flies at where the robot stands
+    assert not hit[0]
+    assert ball.reward(thrown, state((5, 5), 0.0, (0, 0)))[0] > ball.reward(thrown, state((1, -1), 0.0, (0, 0)))[0] > 0
+    place = np.array([[1.0, 0.0]])
+    assert location.reward(place, state((1.0, 0.0), 0.0, (0.0, 0.0)))[0] == pytest.approx(1.0)
+    assert location.reward(place, state((0.0, 0.0), 0.0, (0.0, 0.0)))[0] < 0.01
+
+
+def test_what_a_policy_sees_of_an_instruction() -> None:
+    walking = ROBOT.walking
+    ground = Instruction(velocity=np.array([0.1, 0.0, 0.5]), ground=np.array([0.0, 0.25]))
+    assert np.allclose(GOALS["velocity"].observe(ground, walking), [0.0, 0.5])
+    assert np.allclose(GOALS["steering"].observe(ground, walking), [0.0, 0.5, 0.0, 1.0])
+    turning = Instruction(velocity=np.array([0.25, 0.0, 0.5]))
+    assert np.allclose(GOALS["steering"].observe(turning, walking), [0.5, 0.0, np.cos(0.5), np.sin(0.5)])
+    far = Instruction(velocity=np.zeros(3), goal=np.array([3.0, 4.0]))
+    assert np.allclose(GOALS["location"].observe(far, walking), [0.6, 0.8])
+    things = np.array([[2.0, 0.0, 0.1, -0.5, 0.0], [0.0, -1.0, 0.1, 0.0, 0.25]])
+    seen = GOALS["ball"].observe(Instruction(np.zeros(3), obstacles=things), walking)
+    assert np.allclose(seen, [0.0, -1.0, 0.0, 0.5])  # the nearest
+    with pytest.raises(ConfigError, match="run obstacle"):
+        GOALS["ball"].observe(turning, walking)
+    with pytest.raises(ConfigError, match="the task gives none"):
+        GOALS["location"].observe(turning, walking)
+
+
+def test_a_task_without_a_reward_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "from servoid.tools.learn.envs.tasks import LearnedTask\n"
+        "class Mine(LearnedTask):\n"
+        "    name, goal, size, every, run = 'mine', 'velocity', 1, (1.0, 2.0), 'walk'\n"
+        "    def draw(self, rng, position): return [0.0]\n"
+        "    def instruct(self, asked, state): return None\n"
+    )
+    with pytest.raises(ConfigError, match=r"mine\.py:2: Mine: .*reward"):
+        load_learned_task(f"{file}:Mine", ROBOT)
+    with pytest.raises(ConfigError, match=r"unknown task 'sped'.*speed"):
+        load_learned_task("sped", ROBOT)
+
+
+def test_a_task_policy_for_another_robot_is_refused(prior: Path) -> None:
+    with pytest.raises(CheckpointError, match="a task_policy network is needed"):
+        TaskPolicy(ROBOT, prior)
+
+
+def test_demonstrations_are_told_what_came_of_them(synthetic_dataset: Path) -> None:
+    recording = read_recording(synthetic_dataset, ROBOT)
+    seen, targets = demonstrated(recording, ROBOT, GOALS["velocity"], 2, np.random.default_rng(0))
+    assert len(seen) == len(targets)
+    assert targets.shape[1] == len(ROBOT.joints)
+    asked = seen[:, -2:] * ROBOT.walking.forward
+    speed = np.linalg.norm(asked, axis=1)
+    assert speed.max() < 0.31  # the made-up bodies glide at 0.3 m/s at most
+    assert (np.abs(asked[:, 0]) > np.abs(asked[:, 1])).mean() > 0.9  # and almost straight ahead
+
+
+@pytest.mark.slow
+def test_a_discriminator_learns_along_and_rewards_frozen(prior: Path, synthetic_dataset: Path, tmp_path: Path) -> None:
+    """AMP in the same environment: it comes to tell the policy's windows, and its file rewards another training."""
+    known = load_prior(prior, ROBOT, limbs_of(ROBOT))
+    recordings = {"": read_recording(synthetic_dataset, ROBOT)}
+    discriminator = Discriminator(known)
+    adversary = Adversary(discriminator, PriorWindows(recordings, known.features, known.config), 0)
+    rival = Rival(discriminator, adversary)
+    env = environment("speed", known, Style(), replace(SETTINGS, generated=0.0), 6, 0, rival)
+    env.reset()
+    for _ in range(6):
+        env.step(np.ones((env.n, env.action_size)))
+    told = [env.score.learn() for _ in range(60)][-1]
+    assert told["tells_data"] > 0.9
+    assert told["tells_policy"] > 0.9
+    file = tmp_path / "discriminator.safetensors"
+    save_discriminator(file, discriminator, known, {"data": "", "licence": "", "results": {}})
+    frozen = load_discriminator(file, known)
+    real = adversary._data.held_out(20)[0] * known.std + known.mean
+    assert np.array_equal(frozen.reward(real), discriminator.reward(real))
+    assert frozen.reward(real).mean() > frozen.reward(torch.cat(adversary._memory)).mean()
+    again = environment("speed", known, Style(), SETTINGS, 6, 0, Rival(frozen, None))
+    again.reset()
+    again.step(np.zeros((6, again.action_size)))
+    assert again.score.learn() == {}
+    head, tensors = checkpoint.read(file)
+    checkpoint.write(file, tensors, {**head, "config": {**head["config"], "stride": 1}})
+    with pytest.raises(CheckpointError, match="stride 1"):
+        load_discriminator(file, known)
+
+
+def test_a_clone_does_what_was_shown_and_in_a_mirror_its_mirror() -> None:
+    rng = np.random.default_rng(0)
+    seen = rng.normal(size=(400, 4)).astype(np.float32)
+    shown = np.stack([seen[:, 0], 0.5 * seen[:, 1]], -1)  # of a robot whose mirror flips the second of both
+    mirrors = Mirrors(Mirror.join(Mirror.PLANAR, Mirror.PLANAR), Mirror.PLANAR)
+    network = cloned(seen, shown, mirrors, (16,), 600, 0)
+    assert np.abs(network(seen) - shown).mean() < 0.1
+    assert np.abs(network(mirrors.seen(seen)) - mirrors.decided(network(seen))).mean() < 0.05

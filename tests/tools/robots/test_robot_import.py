@@ -1,0 +1,117 @@
+"""A robot's file drafted from its model, and compared with it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from shutil import copy
+
+import numpy as np
+import pytest
+
+from servoid.hw.config import CONFIGS
+from servoid.hw.robot.description import load_robot
+from servoid.hw.robot.legs import Legs
+from servoid.tools.cli import main
+from servoid.tools.robots.compare import findings
+
+ROBOTS = CONFIGS / "robots"
+
+
+def imported(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, object]]:
+    code = main(["robot", "import", *words, "--no-picture", "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("name", ["op3", "wren"])
+def test_what_geometry_says_is_drafted_as_it_is_written_by_hand(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, said = imported(capsys, str(ROBOTS / f"{name}.xml"), "--out", str(tmp_path / "own.yaml"))
+    assert code == 0
+    assert "home of every joint: the model has no keyframe; on straight knees no robot can walk" in said["todo"]
+    ours, drafted = load_robot(name), load_robot(tmp_path / "own.yaml")
+    mirrors = [{joint.name: (joint.mirror, joint.mirror_sign) for joint in robot.joints} for robot in (ours, drafted)]
+    assert mirrors[1] == mirrors[0]
+    assert (drafted.base, drafted.imu_site) == (ours.base, ours.imu_site)
+    assert {side: foot.geoms for side, foot in drafted.feet.items()} == {s: f.geoms for s, f in ours.feet.items()}
+
+
+def test_an_origin_on_the_ground_is_moved_into_the_trunk(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Models out of drawing programs have it there, and how high such a base is says nothing of a fall."""
+    text = (ROBOTS / "wren.xml").read_text().replace('<freejoint name="root"/>', '<freejoint/><frame pos="0 0 0.19">')
+    (tmp_path / "low.xml").write_text(text.replace("    </body>\n  </worldbody>", "</frame></body></worldbody>"))
+    out = tmp_path / "low.yaml"
+    assert imported(capsys, str(tmp_path / "low.xml"), "--out", str(out))[0] == 0
+    robot = load_robot(out)
+    assert robot.origin == pytest.approx((0, 0, 0.178), abs=1e-3)
+    assert robot.standing_height == pytest.approx(load_robot("wren").standing_height - 0.005, abs=0.01)
+    assert [one.what for one in findings(robot) if not one.good] == []
+    out.write_text("\n".join(row for row in out.read_text().splitlines() if not row.startswith("origin")))
+    assert main(["robot", "check", str(out)]) == 2
+    assert "its origin must be in the trunk: give that as `origin`" in capsys.readouterr().err
+
+
+def test_what_does_not_fit_its_model_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy(ROBOTS / "wren.xml", tmp_path)
+    text = (ROBOTS / "wren.yaml").read_text()
+    knee = "range: [-0.05, 2.1], home: 0.7, mirror: l_knee, mirror_sign: 1"
+    assert knee in text
+    text = text.replace("mirror: r_sho_pitch, mirror_sign: 1", "mirror: r_sho_pitch, mirror_sign: -1")
+    text = text.replace("mirror: l_sho_pitch, mirror_sign: 1", "mirror: l_sho_pitch, mirror_sign: -1")
+    (tmp_path / "wren.yaml").write_text(text.replace(knee, knee.replace("2.1", "1.0")))
+    assert main(["robot", "check", str(tmp_path / "wren.yaml"), "--json"]) == 1
+    found = {one["what"]: one for one in json.loads(capsys.readouterr().out)["findings"]}
+    assert "l_knee, r_knee" in found["ranges"]["found"]
+    assert "most l_sho_pitch" in found["mirrors"]["found"] or "most r_sho_pitch" in found["mirrors"]["found"]
+    assert [what for what, one in found.items() if not one["good"]] == ["mirrors", "ranges"]
+
+
+@pytest.mark.parametrize("name", ["op3", "wren"])
+def test_shipped_robots_fit_their_models(name: str) -> None:
+    assert [one for one in findings(load_robot(name)) if not one.good] == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('<freejoint name="root"/>', "", "no body has a free joint: give the robot's base <freejoint/>"),
+        ('<site name="imu" pos="0 0 0.03"/>', "", 'add <site name="imu"/> to that body'),
+        ('name="r_sole" class="right_leg"', 'name="r_sole" class="visual"', "home"),
+        ("<worldbody>", '<asset><mesh name="m" file="no.stl"/></asset><worldbody>', "no.stl"),
+        ("</mujoco>", "", "not a valid MJCF or URDF"),
+    ],
+)
+def test_a_model_that_is_no_robots_is_refused_with_what_it_lacks(
+    old: str, new: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (ROBOTS / "wren.xml").read_text()
+    assert old in text
+    (tmp_path / "own.xml").write_text(text.replace(old, new))
+    code, answer = imported(capsys, str(tmp_path / "own.xml"), "--out", str(tmp_path / "own.yaml"))
+    assert said in str(answer)
+    assert code == (0 if said == "home" else 2)
+
+
+def test_a_robots_file_is_not_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "own.yaml").write_text("precious")
+    assert main(["robot", "import", str(ROBOTS / "wren.xml"), "--out", str(tmp_path / "own.yaml")]) == 2
+    assert "is there already: give another --out, or --force" in capsys.readouterr().err
+    assert (tmp_path / "own.yaml").read_text() == "precious"
+
+
+def test_the_small_robot_walks_by_its_own_gait() -> None:
+    """Its legs roll before they turn: the numeric inverse takes its steps."""
+    from servoid.stack.control.fleet import Fleet
+    from servoid.stack.control.gait import GaitPolicy
+
+    robot = load_robot("wren")
+    fleet = Fleet(robot, 3, None, seed=1, threads=1)
+    policy = GaitPolicy(robot, (3,))
+    fleet.reset(np.ones(3, bool))
+    for _ in range(200):
+        fleet.drive(policy, np.array([[0.2, 0, 0], [0, 0.06, 0], [0.1, 0, 0.4]]))
+    assert not fleet.truth.fallen.any()
+    assert fleet.truth.position[0, 0] > 0.4
+    assert fleet.truth.position[1, 1] > 0.1
+    assert np.isfinite(Legs(robot).stand(robot.home)[0])

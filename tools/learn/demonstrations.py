@@ -1,0 +1,103 @@
+"""An actor to begin with: a network that does what was demonstrated, given where the robot came to be (hindsight)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction
+from servoid.hw.geometry import turned
+from servoid.hw.robot.description import Robot
+from servoid.hw.robot.mirror import Mirror
+from servoid.policy.features import raw_layout, raw_mirror
+from servoid.policy.mlp import Mlp
+from servoid.policy.priors.goals import SeenGoal
+from servoid.policy.priors.observation import TaskObservation
+from servoid.tools.learn.progress import counted
+
+if TYPE_CHECKING:
+    from servoid.policy.recording import Recording
+
+AHEAD_SECONDS = (0.48, 2.0)  # how far ahead what came to pass is taken for what was asked
+_BATCH = 512
+_RATE = 1e-3  # learning rate at the start
+_EPS = 1e-2  # added to the deviation of inputs, as rsl-rl's normaliser adds it
+
+
+def demonstrated(
+    recording: Recording, robot: Robot, goal: SeenGoal, stride: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Observations `(n, size)` and joint targets `(n, n_joints)` rad at the decisions of a recording and in a mirror.
+
+    Each is given as a goal what the episode then did, over a time drawn from `AHEAD_SECONDS`: the mean velocity, the
+    way it faced, the place where it was.
+    """
+    observations, targets, mirror, joints = [], [], raw_mirror(robot), Mirror.joints(robot)
+    for first, end in recording.spans:
+        for side in (False, True):
+            raw, applied, wanted = (x[first:end] for x in (recording.raw, recording.applied, recording.action))
+            if side:
+                raw, applied, wanted = mirror(raw), joints(applied), joints(wanted)
+            rows = np.arange(1, len(raw) - round(AHEAD_SECONDS[0] * robot.rate), stride)
+            if not len(rows):
+                continue
+            told = _hindsight(raw, rows, robot, rng)
+            seen = goal.observe(told, robot.walking)
+            observe = TaskObservation(robot, goal)
+            observations += [observe.of_rows(raw[t], applied[t - 1], seen[i]) for i, t in enumerate(rows)]
+            # What was decided at each tick that the decision lasts: held for as long, it is late by half of that.
+            lasting = np.minimum(rows[:, None] + np.arange(stride), len(wanted) - 1)
+            targets.append(wanted[lasting].mean(1))
+    return np.stack(observations), np.concatenate(targets)
+
+
+def _hindsight(raw: Array, rows: Array, robot: Robot, rng: np.random.Generator) -> Instruction:
+    row = raw_layout(len(robot.joints)).split(raw)
+    ahead = (rng.uniform(*AHEAD_SECONDS, len(rows)) * robot.rate).astype(int)
+    then = np.minimum(rows + ahead, len(raw) - 1)
+    seconds = (then - rows)[:, None] / robot.rate
+    place = turned((row["displacement"][then] - row["displacement"][rows])[:, :2], -row["yaw"][rows, 0])
+    turn = (row["yaw"][then] - row["yaw"][rows] + np.pi) % (2.0 * np.pi) - np.pi
+    return Instruction(np.concatenate([place / seconds, turn], -1), goal=place)
+
+
+@dataclass(frozen=True)
+class Mirrors:
+    """Of what a network sees, and of what it decides."""
+
+    seen: Mirror
+    decided: Mirror
+
+
+def cloned(
+    observations: Array, actions: Array, mirrors: Mirrors, hidden: tuple[int, ...], steps: int, seed: int
+) -> Mlp:
+    """A network with so many `hidden` units, trained on the squared error of actions `(n, action_size)`, and to decide
+    in a mirror what it decides: PPO on mirrored samples spoils one that does not."""
+    import torch
+    from torch import nn
+
+    mean, std = observations.mean(0), observations.std(0) + _EPS
+    x, y = torch.from_numpy(observations).float(), torch.from_numpy(actions).float()
+    centre, scale = torch.from_numpy(mean).float(), torch.from_numpy(std).float()
+    torch.manual_seed(seed)
+    dense = [nn.Linear(a, b) for a, b in pairwise([x.shape[1], *hidden, y.shape[1]])]
+    network = nn.Sequential(*[part for layer in dense[:-1] for part in (layer, nn.ELU())], dense[-1])
+    optimiser = torch.optim.Adam(network.parameters(), _RATE)
+    generator = torch.Generator().manual_seed(seed)
+    for step in counted(steps, "imitating"):
+        for group in optimiser.param_groups:
+            group["lr"] = _RATE * (1.0 - 0.98 * step / steps)
+        pick = torch.randint(len(x), (_BATCH,), generator=generator)
+        both = torch.cat([x[pick], mirrors.seen(x[pick])])
+        done, mirrored = network((both - centre) / scale).chunk(2)
+        loss = (done - y[pick]).square().mean() + (mirrored - mirrors.decided(done)).square().mean()
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+    weights = [(layer.weight.detach().numpy().T, layer.bias.detach().numpy()) for layer in dense]
+    return Mlp(weights, mean.astype(np.float32), std.astype(np.float32))

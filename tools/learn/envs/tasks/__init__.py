@@ -1,0 +1,36 @@
+"""Tasks that policies learn under a motion prior, by name; or a user's own, `FILE.py:Class`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from servoid.hw.config import ConfigError, nearest
+from servoid.hw.plugins import load_plugin
+from servoid.hw.robot.description import Robot
+from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
+from servoid.tools.learn.envs.tasks.dodgeball import Dodgeball
+from servoid.tools.learn.envs.tasks.location import TargetLocation
+from servoid.tools.learn.envs.tasks.speed import TargetSpeed
+from servoid.tools.learn.envs.tasks.steering import TargetSteering
+
+GROUP = "servoid.learned_tasks"  # of entry points
+LEARNED_TASKS: Mapping[str, type[LearnedTask]] = {
+    cls.name: cls for cls in (TargetSpeed, TargetSteering, TargetLocation, Dodgeball)
+}
+
+
+def load_learned_task(name: str, robot: Robot) -> LearnedTask:
+    """A task by its name, or a user's own. Raises ConfigError with the nearest name, or what a class lacks."""
+    if name in LEARNED_TASKS:
+        return LEARNED_TASKS[name](robot)
+    plugin = load_plugin(name, GROUP, LearnedTask, "task")
+    if plugin is None:
+        raise ConfigError(f"unknown task '{name}': {nearest(name, LEARNED_TASKS)}")
+    try:
+        task: LearnedTask = plugin.cls(robot)
+    except TypeError as error:  # one without a reward, say
+        raise plugin.error(f"{plugin.cls.__name__}: {error}") from error
+    return task
+
+
+__all__ = ["LEARNED_TASKS", "LearnedTask", "TaskState", "load_learned_task"]

@@ -1,0 +1,71 @@
+"""What a task is that a policy learns under a prior: what is asked, and a reward of 0 to 1. A task is a small file."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.geometry import turned
+from servoid.hw.robot.description import Robot
+from servoid.policy.priors.goals import GOALS, SeenGoal
+
+
+@dataclass(frozen=True)
+class TaskState:
+    """What a task's reward may know of `n` worlds: the truth, in the frame that the episode began in."""
+
+    position: Array  # (n, 2) m of the base
+    yaw: Array  # (n,) rad
+    velocity: Array  # (n, 2) m/s over the ground, averaged over a cycle of the gait: within one, every walk sways
+
+
+class LearnedTask(ABC):
+    """A task: `draw` says what is asked, `instruct` tells the policy, `reward` judges."""
+
+    name: ClassVar[str]
+    goal: ClassVar[str]  # of `servoid.policy.priors.goals`: what the policy sees
+    size: ClassVar[int]  # numbers that are drawn
+    every: ClassVar[tuple[float, float]]  # s from one draw to the next
+    run: ClassVar[str]  # the task that `servoid run` runs it in
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+
+    @property
+    def seen(self) -> SeenGoal:
+        return GOALS[self.goal]
+
+    @abstractmethod
+    def draw(self, rng: np.random.Generator, position: Array) -> Array:
+        """What is asked next `(size,)`, in the frame that the episode began in; the base is at `position` `(2,)`."""
+
+    @abstractmethod
+    def instruct(self, asked: Array, state: State) -> Instruction:
+        """What the policy is told of `asked` `(n, size)`, by its own estimate."""
+
+    @abstractmethod
+    def reward(self, asked: Array, state: TaskState) -> Array:
+        """How well it does what is asked `(n,)`, 0 to 1."""
+
+    def advance(self, asked: Array, seconds: float) -> Array:
+        """What is asked `(n, size)` so much later [s]: a thing that moves has gone on."""
+        return asked
+
+    def ended(self, asked: Array, state: TaskState) -> Array:
+        """Where the episode is over, and earns nothing any more `(n,)` bool."""
+        return np.zeros(len(asked), bool)
+
+    def steady(self, speed: float) -> Array | None:
+        """What asks to walk straight on at `speed` [m/s] `(size,)`; None where the task asks for no speed."""
+        return None
+
+
+def over_ground(velocity: Array, state: State) -> Instruction:
+    """To move at `velocity` `(n, 2)` m/s of the odometry frame."""
+    ahead = turned(velocity, -state.yaw)
+    return Instruction(velocity=np.concatenate([ahead, np.zeros((*ahead.shape[:-1], 1))], -1), ground=ahead)

@@ -1,0 +1,244 @@
+"""Train a policy for a task with PPO, under a motion prior that rewards what is like its data (SMP).
+
+--task is speed, steering, location, dodgeball, or your own FILE.py:Class. The policy sees the estimate and its goal;
+it decides joint targets around the home pose as often as its prior has frames. --rewards weighs the task, the prior
+(manner) and their product (both); the paper adds the first two. With --demonstrations it begins as a network that
+does what a dataset shows, instead of at random.
+
+Ctrl-C saves, and the same command continues. The newest network is policy.safetensors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from servoid.hw.config import ConfigError
+from servoid.policy import checkpoint
+from servoid.policy.mlp import Mlp
+from servoid.policy.priors.task_policy import KIND, save_task_policy
+from servoid.tools.learn.envs.task_environment import TaskEnvironment
+from servoid.tools.learn.envs.task_judge import measure
+from servoid.tools.learn.flags import plain, read_settings
+from servoid.tools.learn.prior_settings import PolicyTraining
+from servoid.tools.learn.trainers.ppo import PpoTrainer
+from servoid.tools.learn.trainers.trainer import add_run_arguments
+
+if TYPE_CHECKING:
+    from servoid.hw.robot.description import Robot
+    from servoid.policy.priors.score_matching.model import Prior, Style
+    from servoid.tools.learn.envs.score_term import Rival
+
+_JUDGED = 32  # worlds
+_DISCRIMINATOR = "discriminator.safetensors"  # beside the policy
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `servoid train policy`."""
+    run = add_run_arguments(parser, PolicyTraining(), threads=1)  # the worlds use the cores
+    run.add_argument("--task", required=True, metavar="NAME|FILE.py:CLASS", help="what is learned")
+    run.add_argument("--prior", required=True, metavar="NAME|FILE", help="motion prior (`servoid train prior`)")
+    run.add_argument(
+        "--style",
+        metavar="NAME|UPPER+LOWER",
+        help="style of the prior, or one for the upper body and one for the lower",
+    )
+    run.add_argument(
+        "--style-weight", type=float, default=1.0, metavar="X", help="weight of classifier-free guidance (default: 1)"
+    )
+    run.add_argument("--init", type=Path, metavar="CHECKPOINT", help="start from this task policy")
+    run.add_argument(
+        "--demonstrations", type=Path, metavar="DIR", help="start from a network that imitates this dataset"
+    )
+    run.add_argument(
+        "--measure", action="store_true", help="train nothing: measure the policy that training would begin with"
+    )
+    run.add_argument(
+        "--adversarial",
+        type=Path,
+        metavar="DIR",
+        help="reward by a discriminator that learns from this dataset (AMP); the prior measures and starts episodes",
+    )
+    run.add_argument(
+        "--discriminator", type=Path, metavar="CHECKPOINT", help="reward by this discriminator, which stays as it is"
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    """Train; returns 0 when the budget is used up. Raises ConfigError."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # the worlds use the cores
+    import torch
+
+    from servoid.hw.robot.description import load_robot
+    from servoid.policy.priors.score_matching.model import Style, load_prior
+    from servoid.sim.kinematics import limbs_of
+
+    settings = read_settings(args, PolicyTraining())
+    if args.init is not None and args.demonstrations is not None:
+        raise ConfigError("give --init or --demonstrations, not both: a policy begins with one network")
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(settings.seed)
+    robot = load_robot(args.robot)
+    found = checkpoint.resolve(args.prior, robot)
+    prior = load_prior(found, robot, limbs_of(robot))
+    style = Style.parse(args.style, args.style_weight)
+    rival = _rival(args, prior, settings)
+    env = environment(args.task, prior, style, settings, settings.worlds, settings.seed, rival)
+    trainer = PolicyTrainer(env, style, settings, args.out, found)
+    trainer.rival = rival
+    trainer.start(args.resume, args.init)
+    if args.demonstrations is not None and not trainer.begun_with:
+        trainer.imitate(args.demonstrations)
+    if args.measure:
+        for name, value in trainer.measured().items():
+            print(f"{name:16} {value:.3f}")
+        return 0
+    trainer.run()
+    return 0
+
+
+def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> Rival | None:
+    """What rewards in the prior's place, where that was asked for. Raises ConfigError."""
+    from servoid.policy.priors.adversarial.discriminator import Adversary, Discriminator, load_discriminator
+    from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.tools.learn.envs.score_term import Rival
+    from servoid.tools.learn.trainers.prior import read_by_style
+
+    if args.discriminator is not None:
+        if args.adversarial is not None:
+            raise ConfigError("give --adversarial or --discriminator, not both: one that learns, or one that stays")
+        return Rival(load_discriminator(args.discriminator, prior), None)
+    if args.adversarial is None:
+        return None
+    if args.resume and (args.out / "resume.pt").exists():
+        raise ConfigError(f"{args.out}: a discriminator does not go on where it stopped: use --no-resume")
+    recordings = read_by_style(args.adversarial, prior.features.robot)
+    discriminator = Discriminator(prior)
+    data = PriorWindows(recordings, prior.features, prior.config)
+    return Rival(discriminator, Adversary(discriminator, data, settings.seed))
+
+
+def environment(
+    task: str,
+    prior: Prior,
+    style: Style,
+    settings: PolicyTraining,
+    worlds: int,
+    seed: int,
+    rival: Rival | None = None,
+) -> TaskEnvironment:
+    """Worlds of a task under a prior, or under a rival of it. Raises ConfigError."""
+    from servoid.stack.estimation.odometry import load_odometry
+    from servoid.tools.learn.envs.score_term import AdversarialTerm, GeneratedStarts, ScoreTerm
+    from servoid.tools.learn.envs.tasks import load_learned_task
+
+    robot: Robot = prior.features.robot
+    made = load_learned_task(task, robot)
+    given = prior, style, worlds, settings, seed
+    score = ScoreTerm(*given) if rival is None else AdversarialTerm(*given, rival)
+    starts = GeneratedStarts(prior, style, settings, seed)
+    return TaskEnvironment(made, score, starts, load_odometry(robot), settings, worlds, seed)
+
+
+class PolicyTrainer(PpoTrainer):
+    """A task policy; `policy.safetensors` is the newest one, which runs without torch."""
+
+    BEST = LAST = "policy.safetensors"
+    env: TaskEnvironment
+    settings: PolicyTraining
+    rival: Rival | None = None
+
+    def __init__(self, env: TaskEnvironment, style: Style, settings: PolicyTraining, out: Path, prior: Path) -> None:
+        from servoid.stack.log.provenance import sha256
+
+        digest = sha256(prior)
+        self._prior = {"name": prior.name, "sha256": digest}
+        self._style = {"upper": style.upper, "lower": style.lower, "weight": style.weight}
+        source = f"closed-loop experience of task {env.task.name} under prior {prior.name} {str(digest)[:12]}"
+        super().__init__(env, settings, out, source)
+        self.critic_alone = settings.critic_alone
+        nominal = replace(settings, randomised=0.0, generated=0.0, starts=1, unlike=0.0)
+        judged = environment(env.task.name, env.score.prior, style, nominal, _JUDGED, settings.seed + 1)
+        self._judged = judged
+        self.judge = lambda _: self.measured()
+        measured = ("return", "falls", "prior_error", "amplitude", "amplitude_error", "cadence")
+        self.columns = (*self.columns, *measured)
+        self.panels = (*self.panels, ("return", "falls"), ("prior_error",), ("amplitude", "cadence"))
+
+    def measured(self) -> dict[str, float]:
+        """What the newest actor does, from standing, on the nominal robot: see `measure`."""
+        actor = self.actor()
+        return measure(self._judged, lambda seen: actor(seen["actor"]))
+
+    def learn(self) -> dict[str, float]:
+        row = super().learn()
+        self.env.score.learn()
+        return row
+
+    @property
+    def title(self) -> str:
+        return f"a policy for task {self.env.task.name} in {self.env.n} worlds under {self._prior['name']}"
+
+    @property
+    def following(self) -> str:
+        return f"servoid rollout {self.env.task.run} --policy {self.best_path} --episodes 50"
+
+    def adopt(self, path: Path) -> None:
+        network, _ = Mlp.load(path, KIND, self.env.robot, self.env.observations["actor"].shape[1])
+        hidden = list(network.sizes[1:-1])
+        if hidden != list(self.settings.hidden):
+            raise checkpoint.CheckpointError(
+                f"{path}: its hidden layers are {hidden}; give --hidden {' '.join(map(str, hidden))}"
+            )
+        self.begin_with(network)
+
+    def imitate(self, folder: Path) -> None:
+        """Begin with a network that does what the dataset in `folder` shows. Raises DatasetError."""
+        import numpy as np
+
+        from servoid.policy.recording import read_recording
+        from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
+        from servoid.tools.learn.trainers.trainer import source_of
+
+        env, seed = self.env, self.settings.seed
+        recording = read_recording(folder, env.robot)
+        rng = np.random.default_rng(seed)
+        seen, targets = demonstrated(recording, env.robot, env.task.seen, env.stride, rng)
+        actions = (targets - env.robot.home) / env.reach
+        mirrors = Mirrors(env.mirrors["actor"], env.mirrors["action"])
+        self.begin_with(cloned(seen, actions, mirrors, self.settings.hidden, self.settings.imitation_steps, seed))
+        self.begun_with = {"demonstrations": source_of(folder, recording)}
+
+    def state(self) -> dict[str, Any]:
+        return {**super().state(), "score": self.env.score.state()}
+
+    def restore(self, path: Path, saved: Mapping[str, Any]) -> None:
+        super().restore(path, saved)
+        self.env.score.restore(saved["score"])
+
+    def ship(self, path: Path, results: Mapping[str, Any]) -> None:
+        env = self.env
+        config = {
+            "hidden": list(self.settings.hidden),
+            "task": env.task.name,
+            "goal": env.task.goal,
+            "stride": env.stride,
+            "reach": [round(float(x), 6) for x in env.reach],
+            "prior": self._prior,
+            "style": self._style,
+        }
+        about: dict[str, Any] = {
+            "data": self.source,
+            "licence": env.score.prior.header["licence"],
+            "results": results,
+            "training": plain(self.settings),
+        }
+        if self.rival is not None and self.rival.adversary is not None:
+            from servoid.policy.priors.adversarial.discriminator import save_discriminator
+
+            save_discriminator(path.with_name(_DISCRIMINATOR), self.rival.discriminator, env.score.prior, about)
+        save_task_policy(path, self.actor(), env.robot, config, about)

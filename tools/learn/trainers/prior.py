@@ -1,0 +1,225 @@
+"""Train a motion prior, a diffusion model of short windows of motion (SMP), on recorded datasets.
+
+The folder of --data is a dataset of `servoid collect`, or holds one for each style, in a folder named after it. A
+prior is judged by the error of the noise that it predicts in windows that it did not see (`error`). Beside it is what
+it makes of what they are not: the same windows played backward (`reversed_error`), at rest in their last frame
+(`still_error`) and with three tenths of their amplitude (`shuffling_error`).
+
+Ctrl-C saves, and the same command continues. The best network is prior.safetensors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from servoid.hw.config import ConfigError
+from servoid.policy.checkpoint import Origin
+from servoid.tools.learn.flags import plain, read_settings
+from servoid.tools.learn.prior_settings import PriorShape, PriorTraining
+from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments, require_same, source_of
+
+if TYPE_CHECKING:
+    from servoid.hw.robot.description import Robot
+    from servoid.policy.priors.features import PriorFeatures
+    from servoid.policy.priors.score_matching.model import Prior
+    from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.policy.recording import Recording
+
+_WARMUP = 200  # steps
+_SHUFFLE = 0.3  # of the amplitude: what walks under a weak prior does so
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `servoid train prior`."""
+    add_run_arguments(parser, PriorTraining(), data=True)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Train; returns 0 when the budget is used up. Raises ConfigError."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch is loaded
+    import torch
+
+    from servoid.hw.robot.description import load_robot
+    from servoid.policy.priors.features import PriorFeatures
+    from servoid.policy.priors.manner import manner_by_speed
+    from servoid.policy.priors.score_matching.network import PriorConfig
+    from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.sim.kinematics import limbs_of
+
+    settings = read_settings(args, PriorTraining())
+    torch.set_num_threads(args.threads)
+    robot = load_robot(args.robot)
+    recordings = read_by_style(args.data, robot)
+    features = PriorFeatures(robot, limbs_of(robot))
+    shape = {f.name: getattr(settings, f.name) for f in fields(PriorShape)}
+    config = PriorConfig(features.layout.size, **shape, styles=tuple(style for style in recordings if style))
+    windows = PriorWindows(recordings, features, config, settings.standing)
+    sources = [source_of(args.data / style, recording) for style, recording in recordings.items()]
+    trainer = PriorTrainer(windows, features, settings, args.out, "; ".join(sources))
+    trainer.manner = manner_by_speed(list(recordings.values()), robot)
+    trainer.start(args.resume)
+    trainer.run()
+    return 0
+
+
+def read_by_style(folder: Path, robot: Robot) -> dict[str, Recording]:
+    """The datasets in `folder` by style; of one that is a dataset itself, that alone, under an empty name.
+
+    Raises DatasetError.
+    """
+    from servoid.policy.recording import read_recording
+
+    styles = sorted(path.parent.name for path in folder.glob("*/meta") if path.is_dir())
+    if (folder / "meta").is_dir() or not styles:
+        return {"": read_recording(folder, robot)}
+    return {style: read_recording(folder / style, robot) for style in styles}
+
+
+class PriorTrainer(Trainer):
+    """Trains the denoiser; checkpoints hold the averaged network."""
+
+    settings: PriorTraining
+    manner: Mapping[str, Any] = {}  # of the data
+
+    BEST = "prior.safetensors"
+    LOSS = "error"
+    columns = (
+        "loss",
+        "learning_rate",
+        "steps_per_s",
+        "error",
+        "error_high",
+        "error_middle",
+        "error_low",
+        "reversed_error",
+        "still_error",
+        "shuffling_error",
+    )
+    panels = (
+        ("loss", "error", "reversed_error", "still_error", "shuffling_error"),
+        ("error_high", "error_middle", "error_low"),
+    )
+
+    def __init__(
+        self, windows: PriorWindows, features: PriorFeatures, settings: PriorTraining, out: Path, source: str
+    ) -> None:
+        import torch
+
+        from servoid.policy.diffusion.objective import Average
+        from servoid.policy.diffusion.schedule import cosine_signal
+        from servoid.policy.priors.score_matching.network import PriorNetwork
+
+        super().__init__(out, settings, source)
+        torch.manual_seed(settings.seed)
+        self.windows, self.features, self.config = windows, features, windows.config
+        self.network = PriorNetwork(self.config)
+        self.average = Average(self.network, settings.average)
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), settings.learning_rate, betas=(0.9, 0.99), weight_decay=settings.weight_decay
+        )
+        self.signal = torch.as_tensor(cosine_signal(self.config.levels), dtype=torch.float32)
+        self.generator = torch.Generator().manual_seed(settings.seed)
+
+    @property
+    def title(self) -> str:
+        styles = f", {len(self.config.styles)} styles" if self.config.styles else ""
+        return (
+            f"a prior of {self.network.parameter_count:,} parameters on {len(self.windows.training):,} windows{styles}"
+        )
+
+    @property
+    def following(self) -> str:
+        return f"servoid train policy --task speed --prior {self.best_path} --out runs/speed"
+
+    def learn(self) -> dict[str, float]:
+        import torch
+
+        s = self.settings
+        rate = s.learning_rate * min(1.0, (self.step + 1) / _WARMUP) * (0.5 + 0.5 * math.cos(math.pi * self.share))
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        clean, styles = self.windows.draw(s.batch, self.generator)
+        styles = styles * (torch.rand(len(styles), generator=self.generator) >= s.unstyled)
+        levels = torch.randint(1, self.config.levels + 1, (len(clean),), generator=self.generator)
+        signal = self.signal[levels][:, None, None]
+        noise = torch.randn(clean.shape, generator=self.generator)
+        predicted = self.network(signal.sqrt() * clean + (1 - signal).sqrt() * noise, levels, styles)
+        loss = (predicted - noise).square().mean()
+        if not torch.isfinite(loss):
+            raise ConfigError(f"the loss is not finite at step {self.step}: try a lower --learning-rate")
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimiser.step()
+        self.average.update(self.network)
+        self.step += 1
+        return {"loss": loss.item(), "learning_rate": rate}
+
+    def shown(self, means: Mapping[str, float], steps_per_s: float) -> tuple[dict[str, float], str]:
+        return {"steps_per_s": steps_per_s}, f"loss {means['loss']:.4f}, {steps_per_s:.0f} steps/s"
+
+    def held_out(self, count: int = 4096) -> dict[str, float]:
+        """Errors on held-out windows: of the levels that rewards use, highest first, and their mean; and of what those
+        windows are not."""
+        from servoid.policy.priors.score_matching.model import Style
+        from servoid.policy.priors.score_matching.score import Score
+
+        prior = self._prior()
+        windows = prior.decode(self.windows.held_out(count)[0])
+        errors = Score(prior, Style(), 0)(windows).mean(0)
+        speeds = [self.features.layout.slice(name) for name in ("velocity", "angular_velocity")]
+        backward, still = windows.flip(1), windows[:, -1:].expand_as(windows).clone()
+        for at in speeds:
+            backward[..., at] *= -1.0
+            still[..., at] = 0.0
+        middle = windows.mean(1, keepdim=True)
+        shuffling = middle + _SHUFFLE * (windows - middle)
+        named = {"reversed_error": backward, "still_error": still, "shuffling_error": shuffling}
+        names = ("error_high", "error_middle", "error_low")
+        return {
+            "error": float(errors.mean()),
+            **{name: float(error) for name, error in zip(names, errors, strict=True)},
+            **{name: float(Score(prior, Style(), 0)(unlike).mean()) for name, unlike in named.items()},
+        }
+
+    def _prior(self) -> Prior:
+        """The averaged network as it is used."""
+        from servoid.policy.priors.score_matching.model import Prior
+        from servoid.policy.priors.score_matching.network import PriorNetwork
+
+        network = PriorNetwork(self.config)
+        network.load_state_dict(self.average.weights, strict=False)
+        network.eval().requires_grad_(False)
+        return Prior(network, self.features, self.windows.mean, self.windows.std, self.manner, {})
+
+    def ship(self, path: Path, results: Mapping[str, Any]) -> None:
+        from servoid.policy.priors.score_matching.model import TrainedPrior, save_prior
+
+        windows = self.windows
+        trained = TrainedPrior(self.average.weights, self.config, self.features, windows.mean, windows.std, self.manner)
+        save_prior(path, trained, Origin(self.source, self.settings.licence, results, plain(self.settings)))
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "config": {**asdict(self.config), "styles": list(self.config.styles)},
+            "network": self.network.state_dict(),
+            "average": self.average.weights,
+            "updates": self.average.updates,
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def restore(self, path: Path, saved: Mapping[str, Any]) -> None:
+        ours = {**asdict(self.config), "styles": list(self.config.styles)}
+        require_same(path, "another network", ours, saved["config"])
+        self.network.load_state_dict(saved["network"])
+        self.average.weights = saved["average"]
+        self.average.updates = saved["updates"]
+        self.optimiser.load_state_dict(saved["optimiser"])
+        self.generator.set_state(saved["generator"])

@@ -1,0 +1,1 @@
+"""What belongs to a robot: its file, its gait, its servos."""

@@ -1,0 +1,152 @@
+"""What of a robot's file can be held against its model, each a finding."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
+from servoid.hw.robot.legs import Legs
+from servoid.policy.references.gait import Gait
+from servoid.sim.model import build
+
+_POSES = 50
+_EXACT = 1e-6  # m
+_MIRRORED = 0.005  # m that joints may be beside their mirror images
+_LOPSIDED = 0.015  # m more that a body's centre of mass may be: no robot is quite alike on both sides
+_LOADED = 0.6  # share of its stall torque that a servo may need to hold the robot at home
+_LEVEL = 0.05  # rad that soles may lean at home
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Something that was compared, and whether it is as it should be."""
+
+    good: bool
+    what: str
+    found: str
+
+
+def findings(robot: Robot) -> list[Comparison]:
+    """All comparisons. Raises ConfigError where the robot cannot be simulated at all."""
+    model = build(robot)
+    data = mujoco.MjData(model)
+    joints = np.array([int(model.joint(name).qposadr[0]) for name in robot.names])
+    mass = float(model.body_mass[1:].sum())
+    return [
+        Comparison(
+            True, "weight and height", f"{mass:.2f} kg, base {robot.standing_height:.3f} m above the ground at home"
+        ),
+        _kinematics(robot, model, data, joints),
+        _mirrors(robot, model, data, joints),
+        _ranges(robot),
+        _soles(robot),
+        _balance(robot, model, data, joints),
+        _load(robot, model, data, joints),
+        _steps(robot),
+    ]
+
+
+def _put(model: mujoco.MjModel, data: mujoco.MjData, joints: Array, pose: Array) -> None:
+    data.qpos[:] = 0.0
+    data.qpos[3] = 1.0
+    data.qpos[joints] = pose
+    mujoco.mj_fwdPosition(model, data)
+
+
+def _kinematics(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
+    legs, rng, worst = Legs(robot), np.random.default_rng(0), 0.0
+    for pose in rng.uniform(robot.lower, robot.upper, (_POSES, len(joints))):
+        _put(model, data, joints, pose)
+        mujoco.mj_sensorPos(model, data)
+        soles, _ = legs.soles(legs.pick(pose))
+        for sole, foot in zip(soles, robot.legs, strict=True):
+            worst = max(worst, float(np.abs(data.sensor(f"servoid/{foot}_position").data - sole).max()))
+    return Comparison(worst < _EXACT, "kinematics", f"soles {worst:.1e} m from MuJoCo's at {_POSES} random poses")
+
+
+def _mirrors(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
+    """Joints of a mirrored pose are at the mirror images of where they were."""
+    index, sign = robot.mirror
+    ids, flip = [model.joint(name).id for name in robot.names], np.array([1.0, -1.0, 1.0])
+    pose = robot.home + 0.3 * np.random.default_rng(1).uniform(-1.0, 1.0, len(joints)) * (robot.upper - robot.lower) / 2
+    _put(model, data, joints, pose)
+    bodies = model.jnt_bodyid[ids]
+    here, masses = data.xanchor[ids].copy(), data.xipos[bodies].copy()
+    _put(model, data, joints, pose[index] * sign)
+    apart, axes = data.xanchor[ids] - here[index] * flip, data.xaxis[ids]
+    away = np.linalg.norm(np.cross(apart, axes), axis=-1)  # where along its axis a joint's point is does not matter
+    off = np.linalg.norm(data.xipos[bodies] - masses[index] * flip, axis=-1) - _LOPSIDED
+    away = np.maximum(away, off)
+    worst = int(away.argmax())
+    text = f"joints {1000 * away.max():.1f} mm beside their images, most {robot.names[worst]}"
+    return Comparison(bool(away.max() < _MIRRORED), "mirrors", text)
+
+
+def _ranges(robot: Robot) -> Comparison:
+    """Both sides may go as far."""
+    index, sign = robot.mirror
+    ends = np.sort(np.stack([robot.lower[index] * sign, robot.upper[index] * sign]), axis=0)
+    off = np.abs(ends - np.stack([robot.lower, robot.upper])).max(0)
+    off[index == np.arange(len(index))] = 0.0
+    wrong = [robot.names[i] for i in np.flatnonzero(off > 1e-3)]
+    return Comparison(
+        not wrong, "ranges", f"differ from their mirrors': {', '.join(wrong)}" if wrong else "alike on both sides"
+    )
+
+
+def _soles(robot: Robot) -> Comparison:
+    legs = Legs(robot)
+    _, rotation, _, _ = legs.forward(legs.pick(robot.home))
+    tilt = float(np.arccos(np.clip(rotation[:, :, 2] @ rotation[0, :, 2], -1.0, 1.0)).max())
+    step = float(np.ptp(legs.soles(legs.pick(robot.home))[1] @ rotation[0, :, 2]))
+    return Comparison(tilt < _LEVEL, "soles at home", f"{tilt:.3f} rad and {1000 * step:.0f} mm from one plane")
+
+
+def _balance(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
+    """The centre of mass is above the soles at home."""
+    legs = Legs(robot)
+    _put(model, data, joints, robot.home)
+    mujoco.mj_comPos(model, data)
+    _, rotation, _, _ = legs.forward(legs.pick(robot.home))
+    corners = legs.soles(legs.pick(robot.home))[1].reshape(-1, 3) @ rotation[0]
+    centre = data.subtree_com[model.body(robot.base).id] @ rotation[0]
+    room = float(min(centre[0] - corners[:, 0].min(), corners[:, 0].max() - centre[0]))
+    return Comparison(room > 0, "balance at home", f"the centre of mass is {1000 * room:.0f} mm inside the soles' ends")
+
+
+def _load(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
+    """What holding each leg's share of the weight at home takes of the servos."""
+    legs = Legs(robot)
+    _put(model, data, joints, robot.home)
+    mujoco.mj_comPos(model, data)
+    q = legs.pick(robot.home)
+    _, rotation, origins, axes = legs.forward(q)
+    up = rotation[0, :, 2]
+    soles, _ = legs.soles(q)
+    centre = data.subtree_com[model.body(robot.base).id]
+    under = soles + (centre - soles.mean(0)) - up * ((centre - soles.mean(0)) @ up)  # where the ground carries
+    weight = 9.81 * float(model.body_mass[1:].sum()) / len(soles)
+    torque = np.abs((np.cross(axes, under[:, None] - origins) @ up) * weight)
+    stall = np.array([servo.stall_torque for servo in robot.servos])[legs.index]
+    leg, joint = np.unravel_index(int((torque / stall).argmax()), torque.shape)
+    share = float((torque / stall)[leg, joint])
+    name = robot.names[legs.index[leg, joint]]
+    return Comparison(share < _LOADED, "servos at home", f"{name} needs most: {100 * share:.0f} % of its stall torque")
+
+
+def _steps(robot: Robot) -> Comparison:
+    """The gait's steps are within the joints' ranges."""
+    gait, phase = Gait(robot), np.linspace(0.0, 1.0, 24, endpoint=False)
+    velocity = np.broadcast_to(np.array([0.5, 0.0, 0.0]) * gait.upper, (24, 3))
+    pose, _ = gait.pose(phase, velocity, np.ones(24))
+    margin = robot.limits.margin - 1e-9
+    beyond = ((pose < robot.lower + margin) | (pose > robot.upper - margin)).any(0)
+    legs = set(Legs(robot).index.ravel().tolist())  # others may rest at an end, and are held off it
+    wrong = [name for i, name in enumerate(robot.names) if np.asarray(beyond)[i] and i in legs]
+    speed = float(np.abs(np.diff(pose, axis=0, append=pose[:1])).max() * 24 / gait.settings.cycle)
+    text = f"beyond the ranges of {', '.join(wrong)}" if wrong else f"within the ranges, joints up to {speed:.1f} rad/s"
+    return Comparison(not wrong, "steps of the gait", text)

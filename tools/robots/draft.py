@@ -1,0 +1,247 @@
+"""A robot's file drafted from its model: what geometry says of joints, mirrors, feet and the IMU."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from servoid.hw.config import ConfigError, nearest
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import load_servo
+from servoid.hw.robot.mjcf import compiled, read_spec
+
+_NEAR = 0.01  # m between a joint and the mirror image of another, and of an axis
+_FLAT = 0.004  # m above a foot's lowest point that still is its sole
+_SPAN = 3.0  # rad to either side where the model says no range
+_BUS_HEAD = """rate: 50                    # TODO: control ticks a second
+bus:
+  baud: 1000000             # TODO
+  board: none               # TODO: opencr, if there is one
+limits:
+  joint_speed: {speed:g}        # rad/s a goal may move at
+  margin: 0.02              # rad kept from the ends of the ranges
+  homing_speed: 0.5         # rad/s
+  tilt: 1.047               # rad: beyond it the robot is falling and the guard damps
+  stale: {stale}                  # ticks that a sample may be old before the guard damps
+  temperature: {hot:g}           # degrees C at which the robot is lowered
+imu:                        # TODO: its kind and its port; with none the robot cannot balance
+  kind: none
+  gyro_noise: 0.003         # rad/s, standard deviation of a sample
+  gyro_bias: 0.02           # rad/s, half-width at power-on
+  accelerometer_noise: 0.1  # m/s2
+  accelerometer_bias: 0.1   # m/s2
+  average: 0.010            # s
+  latency: 0.010            # s
+"""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What a person chose, where the model leaves a choice."""
+
+    servo: str
+    base: str | None
+    imu: str | None
+
+
+@dataclass(frozen=True)
+class DraftedJoint:
+    """A joint: range and home [rad], and the joint on the other side with the sign that a pose takes there."""
+
+    name: str
+    range: tuple[float, float]
+    home: float
+    mirror: str
+    sign: int
+
+
+@dataclass(frozen=True)
+class Draft:
+    """What was found. `feet` are geoms by the name of their foot."""
+
+    name: str
+    model: Path
+    base: str
+    imu: str
+    servo: str
+    feet: dict[str, tuple[str, ...]]
+    joints: tuple[DraftedJoint, ...]
+    passive: tuple[str, ...]
+    origin: tuple[float, float, float]  # m, of the base in its body: the model's own may be on the ground
+    notes: tuple[str, ...]
+
+    def text(self, out: Path) -> str:
+        """The robot's file, which is to be at `out`."""
+        servo, model = load_servo(self.servo), self.model.resolve()
+        path = model.name if model.parent == out.parent.resolve() else str(model)
+        rows = [
+            f"  - {{name: {j.name}, servo: {self.servo}, id: {i + 1}, direction: 1, zero: 0.0, "
+            f"range: [{j.range[0]:.4f}, {j.range[1]:.4f}], home: {j.home:.4f}, "
+            f"mirror: {j.mirror}, mirror_sign: {j.sign}}}"
+            for i, j in enumerate(self.joints)
+        ]
+        feet = [f"  {name}: {{geoms: [{', '.join(geoms)}]}}" for name, geoms in self.feet.items()]
+        limits = _BUS_HEAD.format(speed=0.95 * servo.no_load_speed, stale=3, hot=servo.max_temperature - 10)
+        origin = f"origin: [{', '.join(f'{x:.4f}' for x in self.origin)}]\n" if any(self.origin) else ""
+        passive = f"passive: [{', '.join(self.passive)}]\n" if self.passive else ""
+        return (
+            f"# {self.name}: drafted by `servoid robot import`. TODO marks what its model does not say.\n"
+            f"name: {self.name}\nmjcf: {path}\nbase: {self.base}\n{origin}imu_site: {self.imu}\n"
+            f"{limits}{passive}feet:\n"
+            + "\n".join(feet)
+            + "\njoints: # TODO: servo, id, direction and zero of each\n"
+            + "\n".join(rows)
+            + "\n"
+        )
+
+
+def draft(path: Path, choices: Choices) -> Draft:
+    """Raises ConfigError for a model that is no humanoid's, with what is missing."""
+    load_servo(choices.servo)
+    spec = read_spec(path)
+    if spec.meshes:
+        compiled(spec, path)  # says which are missing
+    model = compiled(spec, path)
+    base = _base(model, choices.base, path)
+    notes = ["servo, id, direction and zero of every joint", "bus, rate and imu"]
+    inside = [b for b in range(model.nbody) if model.body_rootid[b] == model.body_rootid[base]]
+    driven = {model.eq_obj1id[i] for i in range(model.neq) if model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT}
+    hinges = [j for j in range(model.njnt) if model.jnt_bodyid[j] in inside and model.jnt_type[j] != _FREE]
+    passive = [j for j in hinges if j in driven or model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE]
+    joints = [j for j in hinges if j not in passive]
+    if not joints:
+        raise ConfigError(f"{path}: no hinge below body {model.body(base).name!r}")
+    if passive:
+        notes.append(f"passive joints, which no servo is taken to drive: {_names(model, passive)}")
+    if model.neq - len(driven):
+        notes.append("closed loops (equality constraints): their passive joints start at 0 whatever the pose")
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    turn = data.xmat[base].reshape(3, 3)
+    places, axes = (data.xanchor - data.xpos[base]) @ turn, data.xaxis @ turn
+    feet = _feet(model, data, base, inside)
+    if len(feet) != 2:
+        raise ConfigError(
+            f"{path}: {len(feet)} feet found where two are needed: collision geoms at the ends of limbs, at the lowest "
+            "point, left and right; without them write the robot's file by hand"
+        )
+    imu = choices.imu or _imu(model, base, notes)
+    drafted = tuple(_joint(model, j, joints, places, axes, notes) for j in joints)
+    if loose := [model.joint(j).name for j in joints if not model.jnt_limited[j]]:
+        notes.append(f"range of {', '.join(loose)}: the model has none")
+    if not model.nkey:
+        notes.append("home of every joint: the model has no keyframe; on straight knees no robot can walk")
+    name = path.stem.replace(" ", "-")
+    soles = min(_bottom(model, data, model.geom(geom).id, base) for geoms in feet.values() for geom in geoms)
+    bodies = [int(model.geom(geoms[0]).bodyid[0]) for geoms in feet.values()]
+    top = float(np.mean([_hip(model, data, body, base) for body in bodies]))
+    # Of an origin that is not well above the soles, a height says little of whether the robot has fallen.
+    origin = (0.0, 0.0, round(top, 4)) if -soles < 0.5 * (top - soles) else (0.0, 0.0, 0.0)
+    return Draft(
+        name=name,
+        model=path,
+        base=model.body(base).name,
+        imu=imu,
+        servo=choices.servo,
+        feet=feet,
+        joints=drafted,
+        passive=tuple(_each(model, passive)),
+        origin=origin,
+        notes=tuple(notes),
+    )
+
+
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+
+
+def _each(model: mujoco.MjModel, joints: Sequence[int]) -> list[str]:
+    return [model.joint(j).name for j in joints]
+
+
+def _names(model: mujoco.MjModel, joints: Sequence[int]) -> str:
+    return ", ".join(_each(model, joints))
+
+
+def _base(model: mujoco.MjModel, wanted: str | None, path: Path) -> int:
+    """The free body with the most bodies on it, or the one that was named."""
+    free = [int(model.jnt_bodyid[j]) for j in range(model.njnt) if model.jnt_type[j] == _FREE]
+    names = {model.body(b).name: b for b in free}
+    if wanted is not None and wanted not in names:
+        raise ConfigError(f"--base {wanted}: no body of that name with a free joint; {nearest(wanted, names)}")
+    if not free:
+        raise ConfigError(f"{path}: no body has a free joint: give the robot's base <freejoint/> in the MJCF")
+    return names[wanted] if wanted is not None else max(free, key=lambda b: int((model.body_rootid == b).sum()))
+
+
+def _imu(model: mujoco.MjModel, base: int, notes: list[str]) -> str:
+    sites = [model.site(s) for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == base]
+    named = [site.name for site in sites if "imu" in site.name.lower() or "gyro" in site.name.lower()]
+    chosen = next(iter(named or [site.name for site in sites]), "")
+    if not chosen:
+        raise ConfigError(
+            f'no site on the base {model.body(base).name!r}: add <site name="imu"/> to that body where the IMU sits'
+        )
+    if not named:
+        notes.append(f"imu_site: {chosen} is only a guess")
+    return chosen
+
+
+def _feet(model: mujoco.MjModel, data: mujoco.MjData, base: int, inside: Sequence[int]) -> dict[str, tuple[str, ...]]:
+    """Colliding geoms of the lowest bodies, left and right, that nothing moves below."""
+    low: dict[int, float] = {}
+    turn = data.xmat[base].reshape(3, 3)
+    bottom = [_bottom(model, data, geom, base) for geom in range(model.ngeom)]
+    solid = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
+    for geom in solid:
+        body = int(model.body_weldid[model.geom_bodyid[geom]])
+        if body in inside and body != base:
+            low[body] = min(low.get(body, np.inf), bottom[geom])
+    feet: dict[str, tuple[str, ...]] = {}
+    for name, side in (("left", 1.0), ("right", -1.0)):
+        beside = {b: z for b, z in low.items() if side * float(((data.xipos[b] - data.xpos[base]) @ turn)[1]) > 1e-3}
+        if beside:
+            foot = min(beside, key=lambda b: beside[b])
+            own = [g for g in solid if model.body_weldid[model.geom_bodyid[g]] == foot]
+            feet[name] = tuple(model.geom(g).name for g in own if bottom[g] < low[foot] + _FLAT)
+    return feet
+
+
+def _hip(model: mujoco.MjModel, data: mujoco.MjData, body: int, base: int) -> float:
+    """Height of the first body of the limb that this one is of, in the base's frame [m]."""
+    while model.body_parentid[body] != base:
+        body = int(model.body_parentid[body])
+    return float((data.xpos[body] - data.xpos[base]) @ data.xmat[base].reshape(3, 3)[:, 2])
+
+
+def _bottom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, base: int) -> float:
+    """The lowest height of a geom's box in the base's frame [m]."""
+    up = data.xmat[base].reshape(3, 3)[:, 2]
+    centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    along = data.geom_xmat[geom].reshape(3, 3).T @ up
+    return float((data.geom_xpos[geom] - data.xpos[base]) @ up + along @ centre - np.abs(along) @ half)
+
+
+def _joint(
+    model: mujoco.MjModel, joint: int, joints: Sequence[int], places: Array, axes: Array, notes: list[str]
+) -> DraftedJoint:
+    """A joint with its mirror: the one at its image in the base's x-z plane, about the image of its axis."""
+    name, flip = model.joint(joint).name, np.array([1.0, -1.0, 1.0])
+    apart = [places[other] - flip * places[joint] for other in joints]
+    away = np.linalg.norm(apart, axis=-1)
+    # Where along its axis a joint's point is does not matter.
+    beside = np.array([np.linalg.norm(np.cross(one, axes[other])) for one, other in zip(apart, joints, strict=True)])
+    # A turn is seen in the mirror about the image of its axis, the other way round.
+    along = np.array([float(-(flip * axes[joint]) @ axes[other]) for other in joints])
+    fits = np.flatnonzero((beside < _NEAR) & (np.abs(along) > 0.99))
+    best = int(fits[away[fits].argmin()]) if len(fits) else joints.index(joint)
+    if not len(fits):
+        notes.append(f"mirror of {name}: no joint is at its place on the other side")
+    low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-_SPAN, _SPAN)
+    low, high = max(float(low), -_SPAN), min(float(high), _SPAN)
+    key = float(model.key_qpos[0, model.jnt_qposadr[joint]]) if model.nkey else 0.0
+    sign = 1 if not len(fits) or along[best] > 0 else -1
+    return DraftedJoint(name, (low, high), float(np.clip(key, low, high)), model.joint(joints[best]).name, sign)

@@ -1,0 +1,65 @@
+"""Draft a robot's file from its MJCF or URDF, draw the robot, and list what a person must fill in.
+
+Joints, ranges and mirror pairs are read from the model by its geometry; feet are the lowest bodies at the ends of its
+limbs. What no model says, such as servos and their IDs, is guessed and marked with TODO.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+from pathlib import Path
+
+from servoid.hw.config import ConfigError
+from servoid.tools.common.output import add_json_argument, reporting
+from servoid.tools.common.pictures.drawing import choose_drawing
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `servoid robot import`."""
+    parser.add_argument("model", type=Path, metavar="FILE", help="MJCF or URDF of the robot")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help="robot's file to write (default: NAME.yaml in this folder)"
+    )
+    parser.add_argument(
+        "--servo", default="xm430-w350", metavar="NAME", help="servo of all joints (default: xm430-w350)"
+    )
+    parser.add_argument("--base", metavar="BODY", help="the base (default: the free body with the most joints)")
+    parser.add_argument("--imu", metavar="SITE", help="the IMU's site (default: one whose name has imu in it)")
+    parser.add_argument("--no-picture", action="store_false", dest="picture", help="do not draw the robot")
+    parser.add_argument("--force", action="store_true", help="write over a file that is there")
+    add_json_argument(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Draft, and draw where this machine can; returns 0. Raises ConfigError."""
+    with reporting(args.json) as report:
+        if args.picture:
+            with contextlib.suppress(ConfigError):  # said when the picture is drawn
+                choose_drawing("the picture")
+        from servoid.hw.robot.description import load_robot
+        from servoid.tools.robots.draft import Choices, draft
+        from servoid.tools.robots.pictures import poses
+
+        out = args.out or Path(f"{args.model.stem}.yaml")
+        if out.exists() and not args.force:
+            raise ConfigError(f"{out}: is there already: give another --out, or --force")
+        found = draft(args.model, Choices(args.servo, args.base, args.imu))
+        try:
+            out.write_text(found.text(out))
+        except OSError as error:
+            raise ConfigError(f"{out}: cannot be written: {error.strerror}") from error
+        report.line(
+            f"wrote {out}: {len(found.joints)} joints, feet {', '.join(found.feet) or 'none'}, base {found.base}"
+        )
+        for note in found.notes:
+            report.line(f"  to do: {note}")
+        robot = load_robot(out)
+        report.line(
+            f"{robot.name} stands {robot.standing_height:.3f} m high at home; legs of "
+            f"{', '.join(link.joint for link in next(iter(robot.legs.values())))} and their mirrors"
+        )
+        pictures = poses(robot, out.with_suffix(".png"), report) if args.picture else None
+        report.line(f"next: fill in what is marked TODO, then: servoid robot check {out}")
+        report.result({"out": str(out), "picture": pictures, "todo": list(found.notes), "joints": list(robot.names)})
+    return 0
