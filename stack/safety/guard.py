@@ -21,9 +21,9 @@ tests/stack/test_safety*.py:
 8. Gains only go down within a run: below what was asked for where servos get hot, the supply low or a joint blocked.
    While a robot that is to recover falls and lies, they are zero, but for its arms as they come in.
 9. A fall is survived only where `recover` was asked for, and only from RUNNING, or READY: it may lie as it begins,
-   and is brought home lying. The robot is moved again when it has
-   lain still, with the limits of 1 and 2, in at most so many tries and so much time (recovery.py); what ends a run ends
-   it then too, damped at once. It runs on when it has stood still, on flat soles, at the home pose.
+   and is brought home lying. It falls as soon as that is certain (falling.py). The robot is moved again when it has
+   lain still, with the limits of 1 and 2, in at most so many tries and so much time (recovery.py); what ends a
+   run ends it then too, damped at once. It runs on when it has stood still, on flat soles, at the home pose.
 
 Homing is the guard's own: from the pose that the robot is in, slowly, to the home pose.
 """
@@ -222,6 +222,8 @@ class Guard:
         """
         if self.phase in POWERED:
             self._check(observation, state)
+        if self.phase is Phase.RUNNING and self.recovery is not None and state is not None:
+            self._watch_fall(self.recovery.falls(state, self._tick))
         if self.phase in DOWN:
             self._watch_recovery(observation, state)
         if self.phase is Phase.STOPPING and self._rests():
@@ -319,6 +321,11 @@ class Guard:
             self._goals.popleft()
         goals = [goal for _, goal in self._goals]
         return self._tick - self._goals[0][0] >= window and float(np.ptp(goals, axis=0).max()) < REST_RANGE
+
+    def _watch_fall(self, why: str | None) -> None:
+        """Fall as soon as that is certain: so there is time for the arms to come in."""
+        if why is not None:
+            self._fall(why)
 
     def _fall(self, text: str) -> None:
         """Falling while it ran, of a robot that is to get up again."""

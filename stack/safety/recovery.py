@@ -15,6 +15,7 @@ from servoid.hw.contracts.body import Array, Observation
 from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
+from servoid.stack.safety.falling import Falling
 from servoid.stack.safety.health import Load
 
 TRIES = 3
@@ -40,15 +41,22 @@ class Recovery:
         self.stands = False  # upright on flat soles, and still, for STILL_SECONDS
         self.home = False  # and at the home pose
         self._robot, self._legs = robot, Legs(robot)
+        self._falling = Falling(self._legs, robot.rate)
         self._arms = np.ones(len(robot.names), bool)
         self._arms[robot.leg_index.ravel()] = False
         self._fell = self._lay = 0  # ticks at which it fell, and last began to lie
         self._still = self._standing = 0  # ticks in a row
         self._tick = 0
 
+    def falls(self, state: State, tick: int) -> str | None:
+        """Why a robot that runs counts as falling, or lying, at this tick; None where it does not."""
+        passed, self._tick = min(max(tick - self._tick, 1), self._robot.limits.stale), tick
+        return self._falling.watch(state, passed)
+
     def fall(self, tick: int) -> None:
         """It falls: its tries and its time begin."""
         self.tries, self._fell = 0, tick
+        self._falling.reset()
         self.lie(tick)
 
     def lie(self, tick: int) -> None:

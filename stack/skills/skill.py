@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from servoid.hw.config import CONFIGS, ConfigError, load_marked, nearest
 from servoid.hw.robot.description import Robot
-from servoid.policy.motion.clip import POSES, SUFFIX, Clip
-from servoid.policy.motion.library import Library, find
+from servoid.policy.motion.clip import POSES, SUFFIX, Clip, load
+from servoid.policy.motion.library import Library
 from servoid.stack.log.provenance import sha256
 
 UPRIGHT = "upright"
@@ -76,10 +76,10 @@ def load_skills(robot: Robot, folder: Path = CONFIGS / "skills") -> dict[str, Sk
 
     Raises ConfigError naming file, line and key for a file that is wrong, or that says something else than its clip.
     """
-    found = {}
+    found, library = {}, Library(robot)
     for path in sorted(folder.glob("*.yaml")):
         skill, marks = load_marked(path, Skill)
-        clip = find(skill.clip, robot)
+        clip = load(clip_path(skill.clip, library), robot)
         for key, said, is_so in (("entry", skill.entry, clip.about.begins), ("end", skill.end, clip.about.ends)):
             if said != is_so and not said.startswith(f"{is_so} "):
                 raise marks.error(key, f"'{said}', but its clip '{clip.name}' has '{is_so}'")
@@ -96,7 +96,7 @@ def chosen(name: str, skills: Mapping[str, Skill]) -> Skill:
 
 def clip_of(skill: Skill, robot: Robot) -> Clip:
     """The motion of a skill. Raises ConfigError."""
-    return find(skill.clip, robot)
+    return load(clip_path(skill.clip, Library(robot)), robot)
 
 
 def fingerprints(robot: Robot) -> dict[str, dict[str, Any]]:

@@ -238,4 +238,4 @@ def test_the_prompt_at_a_real_robot_says_that_it_gets_up_by_itself() -> None:
         with pytest.raises(KeyboardInterrupt):
             run(RunSettings("stand", policy="gait", recover=recover), backend=FakeBody(ROBOT), confirm=confirm)
     assert "gets up" not in asked[0]
-    assert "if it falls, it gets up by itself" in asked[1]
+    assert "if it lies or falls, it gets up by itself" in asked[1]
