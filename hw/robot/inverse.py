@@ -30,8 +30,7 @@ class NumericInverse:
 
     def __init__(self, robot: Robot, legs: Legs) -> None:
         self._legs = legs
-        count = np.bincount(legs.index.ravel(), minlength=len(robot.joints))
-        self._free = (count[legs.index] == 1).astype(float)  # (legs, joints)
+        self._free = legs.own
         if not self._free.any(-1).all():
             raise ConfigError(f"{robot.name}: a leg has no joint of its own: all of them are shared with another leg")
         margin = robot.limits.margin

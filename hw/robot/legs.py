@@ -35,6 +35,10 @@ class Legs:
     def __init__(self, robot: Robot) -> None:
         legs = list(robot.legs.values())
         self.index = robot.leg_index
+        counts = np.bincount(self.index.ravel())
+        self.own = (counts[self.index] == 1).astype(
+            float
+        )  # (legs, joints): 0 for joints that legs share, such as a waist
         self.names = [[link.joint for link in leg] for leg in legs]
         self.offset = np.array([[link.offset for link in leg] for leg in legs])  # (legs, joints, 3)
         self.axis = np.array([[link.axis for link in leg] for leg in legs], dtype=float)

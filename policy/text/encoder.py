@@ -6,13 +6,16 @@ import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from servoid.hw.config import ConfigError, nearest
 from servoid.hw.contracts.body import Array
 from servoid.policy.text.lexicon import FLAGS, flags, words
+
+if TYPE_CHECKING:
+    from servoid.policy.text.contextual import ContextualEncoder
 
 
 class TextEncoder(Protocol):
@@ -57,7 +60,7 @@ class WordEncoder:
     FLAG_WEIGHT = 1.0
     SCALE = 3.0
     size = WORD_SIZE + len(FLAGS)
-    token_size = WORD_SIZE
+    token_size = size
 
     def __init__(self) -> None:
         """Load the weights that the wheel brings. Raises ConfigError where it is missing or incomplete."""
@@ -67,26 +70,23 @@ class WordEncoder:
         return np.stack([self._encode(text) for text in texts]) if texts else np.zeros((0, self.size), np.float32)
 
     def tokens(self, texts: Sequence[str], most: int) -> Array:
-        """Word vectors, each of a mean square of one; parts of a rare word have one each."""
+        """Word vectors, each of a mean square of one, with the flags that the word sets; a rare word has several."""
         found = np.full((len(texts), most, self.token_size), np.nan, np.float32)
         for row, text in zip(found, texts, strict=True):
-            self._known(text)
-            pieces = self._model.tokenizer.encode(text.lower(), add_special_tokens=False).ids[:most]
-            vectors = self._model.embedding[pieces].astype(np.float32)
-            scale = np.sqrt(self.token_size) / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-6)
-            row[: len(pieces)] = scale * vectors
-        return found
-
-    @staticmethod
-    def _known(text: str) -> list[str]:
-        found = words(text)
-        if not found:
-            wrong = f"'{text}' has no English word in it" if text.strip() else "is empty"
-            raise ConfigError(f"the instruction {wrong}; write one such as 'walk forward' or 'turn left on the spot'")
+            known_words(text)
+            marked, filled = flags(text), 0
+            for word in text.lower().split():
+                pieces = self._model.tokenizer.encode(word, add_special_tokens=False).ids[: most - filled]
+                vectors = self._model.embedding[pieces].astype(np.float32)
+                lengths = np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-6)
+                at = slice(filled, filled + len(pieces))
+                row[at, : self.WORD_SIZE] = np.sqrt(self.WORD_SIZE) * vectors / lengths
+                row[at, self.WORD_SIZE :] = [self.SCALE * (flag in flags(word) & marked) for flag in FLAGS]
+                filled += len(pieces)
         return found
 
     def _encode(self, text: str) -> Array:
-        found = self._known(text)
+        found = known_words(text)
         # One text at a time: padding would let the last bits depend on the neighbours.
         sentence = self._model.embed([" ".join(found)])[0]
         norm = max(float(np.linalg.norm(sentence)), 1e-6)
@@ -95,7 +95,17 @@ class WordEncoder:
         return (self.SCALE * np.concatenate([sentence / norm, self.FLAG_WEIGHT * flagged])).astype(np.float32)
 
 
-_ENCODERS = {WordEncoder.name: WordEncoder}
+def known_words(text: str) -> list[str]:
+    """The words of a text, sorted. Raises ConfigError for one without an English word."""
+    found = words(text)
+    if not found:
+        wrong = f"'{text}' has no English word in it" if text.strip() else "is empty"
+        raise ConfigError(f"the instruction {wrong}; write one such as 'walk forward' or 'turn left on the spot'")
+    return found
+
+
+_CONTEXTUAL = "contextual"  # in a module of its own, which is imported when it is asked for
+_ENCODERS = (WordEncoder.name, _CONTEXTUAL)
 
 
 def load_encoder(name: str = WordEncoder.name) -> TextEncoder:
@@ -113,10 +123,14 @@ def token_size(name: str) -> int:
     return _encoder(name).token_size
 
 
-def _encoder(name: str) -> type[WordEncoder]:
+def _encoder(name: str) -> type[WordEncoder] | type[ContextualEncoder]:
     if name not in _ENCODERS:
         raise ConfigError(f"unknown text encoder '{name}'; {nearest(name, _ENCODERS)}")
-    return _ENCODERS[name]
+    if name == WordEncoder.name:
+        return WordEncoder
+    from servoid.policy.text.contextual import ContextualEncoder
+
+    return ContextualEncoder
 
 
 def _load_wordllama(size: int) -> Any:

@@ -11,13 +11,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from servoid.hw.config import ConfigError, load_yaml
 from servoid.hw.config import resolve as find
 from servoid.hw.contracts.body import Array
-from servoid.hw.contracts.control import Adopted, Instruction, State
+from servoid.hw.contracts.control import Adopted, Instruction, Plan, PlanRequest, State
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import CheckpointError, read_header, resolve
 from servoid.policy.diffusion.model.action_space import JOINT_TARGETS
@@ -30,6 +31,9 @@ from servoid.stack.control.base import BasePolicy
 from servoid.stack.control.planning.plan_buffer import History, Pace, PlanBuffer
 from servoid.stack.control.planning.planner import Answer, InlinePlanner, Planner, ProcessPlanner
 from servoid.stack.control.tracker import Tracker
+
+if TYPE_CHECKING:
+    from servoid.policy.diffusion.prefix.runtime import PlannerRuntime
 
 _NOW = np.array([0])
 
@@ -84,7 +88,7 @@ class ClosedLoopPolicy(BasePolicy):
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         """Joint targets `(..., n_joints)` rad for this tick. Raises PlannerError when the planner cannot plan any
-        more, and ConfigError for a sentence that says nothing."""
+        more. A sentence or a target that it cannot plan for is an event, and the last plan goes on."""
         plans, applied = self.plans, np.array(applied, dtype=float)
         self._see(state, applied)
         plans.adopt()
@@ -176,4 +180,13 @@ def _build(robot: Robot, path: str, settings: ClosedLoopSettings) -> Answer:
     frames = Frames(robot)
     runtime = PlannerRuntime(load(Path(path), robot, frames), robot, frames, settings)
     runtime.warm_up()
-    return runtime.plan
+    return partial(_plan, runtime)
+
+
+def _plan(runtime: PlannerRuntime, request: PlanRequest) -> Plan:
+    """The plan of a request, or why there is none: the last one then goes on, and the robot holds its last pose."""
+    try:
+        return runtime.plan(request)
+    except ConfigError as error:  # what was asked cannot be understood
+        nothing = np.full((1, 1), np.nan)
+        return Plan(request.tick, nothing, nothing, nothing, 0.0, str(error))

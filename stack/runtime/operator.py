@@ -99,7 +99,8 @@ class Held:
         return Instruction(np.zeros(3)) if silent else instruction
 
     def done(self, state: State) -> bool:
-        return self._behaviour.done(state)
+        """Also when the person in control ends the task."""
+        return self._behaviour.done(state) or self._operator.intent.ends
 
     def lost(self) -> None:
         self._behaviour.lost()

@@ -40,8 +40,9 @@ def lowered_pose(robot: Robot) -> Array:
 def _solve(legs: Legs, angles: Array, place: Array, rotation: Array) -> Array | None:
     """Angles `(n_legs, joints)` that put the last links at `place` `(n_legs, 3)`, turned by `rotation`, or None.
 
-    Newton's method on the twist, damped so that a stretched leg does no harm.
+    Newton's method on the twist, damped so that a stretched leg does no harm. Joints that legs share stay as they are.
     """
+    free = legs.own[:, None]
     for _ in range(30):
         at, turn, origins, axes = legs.forward(angles)
         between = turn @ np.swapaxes(rotation, -1, -2)
@@ -49,7 +50,7 @@ def _solve(legs: Legs, angles: Array, place: Array, rotation: Array) -> Array | 
         error = np.concatenate([at - place, twist], -1)  # (n_legs, 6)
         if np.abs(error).max() < TOLERANCE:
             return angles
-        jacobian = np.concatenate([np.cross(axes, at[:, None] - origins), axes], -1).swapaxes(-1, -2)
+        jacobian = np.concatenate([np.cross(axes, at[:, None] - origins), axes], -1).swapaxes(-1, -2) * free
         transposed = jacobian.swapaxes(-1, -2)
         damped = transposed @ jacobian + 1e-9 * np.eye(angles.shape[-1])
         angles = angles - np.linalg.solve(damped, (transposed @ error[..., None]))[..., 0]

@@ -88,8 +88,8 @@ def watch(values: dict[str, Any]) -> None:
     view = RigView(robot, Control(values["control"]))
     with open_page(View(values["host"], values["port"]), values["robot"]) as page:
         print(f"page: {page.url}  ({STOPS})", file=sys.stderr, flush=True)
-        title = "virtual rig: stop presses its board's button" if values["board"] else "virtual rig without a board"
-        page.link.begin(RunInfo(values["robot"], title, "virtual", "", simulated=False, insists=False))
+        title = "virtual rig (STOP presses its board's button)" if values["board"] else "virtual rig without a board"
+        page.link.begin(RunInfo(values["robot"], title, "virtual", "", simulated=False, steers=False, insists=False))
         while page.link.alive:
             select.select([page.link], [], [], FRAME_SECONDS)
             if (halt := page.link.take_halt()) is not Halt.NO and values["board"]:

@@ -66,6 +66,7 @@ class Player:
             simulated=False,  # the truth is in no log
             reach=episode.get("reach"),
             path=None if path is None else np.array(path, dtype=float),
+            steers=False,
             insists=False,
             length=float(ticks.times[-1]),
             events=tuple(ticks.events),

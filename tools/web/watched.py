@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.task import Assignment
 from servoid.stack.log.tick import Listener, TickRecord
@@ -37,14 +39,16 @@ def watched_run(
     try:
         assignment, body = prepare(settings)
         simulated = body.simulation is not None
-        link.begin(_info(settings, assignment, simulated), body.simulation.truth if body.simulation else None)
+        held = steered if held is None else held
+        info = replace(_info(settings, assignment, simulated), steers=steered or held)
+        link.begin(info, body.simulation.truth if body.simulation else None)
 
         def show(record: TickRecord) -> None:
             link(record)
             if on_tick is not None:
                 on_tick(record)
 
-        operator = Operator(link, held=steered if held is None else held)
+        operator = Operator(link, held=held)
         result = run(settings, backend=body if simulated else None, on_tick=show, confirm=confirm, operator=operator)
     except BaseException as error:
         link.end("error", explain(error))

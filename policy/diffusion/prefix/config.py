@@ -22,7 +22,7 @@ class PlannerShape:
     """What may be chosen of a planner's shape, whatever the robot. Frames are 25 a second."""
 
     layers: Annotated[int, "layers of the transformer"] = 3
-    width: Annotated[int, "numbers in a token"] = 192
+    width: Annotated[int, "numbers in a token"] = 128
     heads: Annotated[int, "attention heads; the width is a multiple of them"] = 4
     prefix: Annotated[int, "frames of the motion so far"] = 20
     frames: Annotated[int, "frames of a plan"] = 40

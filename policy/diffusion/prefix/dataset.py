@@ -54,6 +54,7 @@ class ToldSentences:
     def __init__(self, told: Mapping[str, Sequence[str]], encoder: TextEncoder, words: int) -> None:
         sides = [[list(texts) for texts in told.values()], [[other_side(t) for t in texts] for texts in told.values()]]
         flat = [text for side in sides for texts in side for text in texts]
+        self.texts = tuple(dict.fromkeys(flat))
         self.tokens = torch.from_numpy(encoder.tokens(flat, words))
         counts = np.array([len(texts) for texts in told.values()])
         first = np.cumsum([0, *counts[:-1]])
@@ -85,7 +86,7 @@ class PlanWindows:
         What is asked is that of the first frame to come. A motion may come to its end within the window, with `rest`,
         the label of standing, after it. Raises DatasetError without a window.
         """
-        self.kinematics, self.shape, self._sentences, self._untold = frames, shape, sentences, untold
+        self.kinematics, self.shape, self.sentences, self._untold = frames, shape, sentences, untold
         length = shape.prefix + shape.frames
         rows, labels, held, offset = [], [], [], 0
         for number, label in enumerate(sequences.label):
@@ -128,7 +129,7 @@ class PlanWindows:
         raw = self._frames[rows[:, None] + self._span]
         raw = torch.where(mirrored[:, None, None], self.kinematics.mirror(raw), raw)
         target = drawn(self.kinematics, raw[:, self.shape.prefix :], generator)
-        return Batch(self.normaliser.encode(raw), self._sentences.of(label, mirrored, generator), target)
+        return Batch(self.normaliser.encode(raw), self.sentences.of(label, mirrored, generator), target)
 
 
 def asked(ahead: Array, rest: int) -> Array:

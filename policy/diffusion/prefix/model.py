@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,35 +24,29 @@ class PlannerModel:
 
     network: PlannerNetwork
     normaliser: Normaliser
-    header: Mapping[str, Any]
+    sentences: tuple[str, ...]  # that it was trained with
 
     @property
     def config(self) -> PlannerConfig:
         return self.network.config
 
 
-def save(
-    path: Path,
-    weights: Mapping[str, Tensor],
-    config: PlannerConfig,
-    normaliser: Normaliser,
-    frames: Frames,
-    origin: Origin,
-) -> None:
-    """Write a planner. Raises CheckpointError."""
+def save(path: Path, weights: Mapping[str, Tensor], model: PlannerModel, frames: Frames, origin: Origin) -> None:
+    """Write a planner with other `weights`, averaged ones for instance. Raises CheckpointError."""
     head = checkpoint.header(
         KIND,
         frames.robot,
-        config=asdict(config),
+        config=asdict(model.config),
         data=origin.data,
         licence=origin.licence,
         results=origin.results,
         frame_layout=frames.layout.to_header(),
         key_points=list(frames.key_points.names),
+        sentences=list(model.sentences),
         training=dict(origin.training),
     )
     tensors = {f"network.{name}": value.detach().float().numpy() for name, value in weights.items()}
-    arrays = {f"frames.{name}": value for name, value in normaliser.to_numpy().items()}
+    arrays = {f"frames.{name}": value for name, value in model.normaliser.to_numpy().items()}
     checkpoint.write(path, tensors | arrays, head)
 
 
@@ -68,6 +61,7 @@ def load(path: Path, robot: Robot, frames: Frames) -> PlannerModel:
         if unknown or set(missing) - {name for name, _ in network.named_buffers()}:
             raise KeyError(", ".join([*missing, *unknown]))
         normaliser = Normaliser.from_numpy(checkpoint.part(arrays, "frames")).to_torch()
+        sentences = tuple(str(text) for text in head["sentences"])
     except (KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{path}: its tensors are not those of its config: {error}") from error
-    return PlannerModel(network, normaliser, head)
+    return PlannerModel(network, normaliser, sentences)

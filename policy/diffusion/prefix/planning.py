@@ -14,6 +14,7 @@ class Planning:
     feedback: bool = True  # plans go on from what was executed; False: from the plan before (open loop)
     steps: int = 0  # of denoising; 0: as many as the network has noise levels
     text_weight: float = 2.5  # of classifier-free guidance by the sentence; 0: unread, 1: as trained
+    text_nearest: bool = True  # a sentence is read as the nearest one of the training; False: word by word
     reach: float = 0.33  # m that a goal is asked for ahead at most, within one plan
 
     def __post_init__(self) -> None:

@@ -41,6 +41,7 @@ class PlannerRuntime:
         self._planner = PrefixPlanner(model, frames, steps=planning.steps, text_weight=planning.text_weight)
         self._model, self._robot, self._frames, self._planning = model, robot, frames, planning
         self._encoder = load_encoder(model.config.text)
+        self._known = self._encoder.encode(model.sentences) if planning.text_nearest and model.sentences else None
         self._read: dict[str, Tensor] = {}  # sentences that were encoded
 
     def warm_up(self) -> None:
@@ -180,6 +181,10 @@ class PlannerRuntime:
 
     def _sentence(self, text: str) -> Tensor:
         if text not in self._read:
-            tokens = self._encoder.tokens([text], self._model.config.words)
+            if self._known is not None:
+                apart = np.linalg.norm(self._known - self._encoder.encode([text]), axis=-1)
+                tokens = self._encoder.tokens([self._model.sentences[int(apart.argmin())]], self._model.config.words)
+            else:
+                tokens = self._encoder.tokens([text], self._model.config.words)
             self._read[text] = torch.from_numpy(tokens)
         return self._read[text]

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from servoid.hw.config import ConfigError, nearest
 from servoid.hw.contracts.body import Array
 from servoid.policy.diffusion.prefix.frames import Frames, turned, wrapped
 from servoid.policy.diffusion.prefix.key_points import AnyArray
@@ -114,14 +115,16 @@ def drawn(frames: Frames, future: AnyArray, generator: Any) -> BodyTarget:
 
 
 def of_points(frames: Frames, asked: Sequence[tuple[str, Sequence[float] | Array]]) -> BodyTarget:
-    """One target from names of `names` and their places [m], or angle [rad] for the heading. Raises KeyError."""
+    """One target from names of `names` and their places [m], or angle [rad] for the heading. Raises ConfigError."""
     import torch
 
     known, target = names(frames), none(frames, 1)
     for name, values in asked:
         if name not in known:
-            raise KeyError(f"a target cannot be set for '{name}': {', '.join(known)}")
+            raise ConfigError(f"no target can be set for '{name}': {nearest(name, known)}")
         given = torch.as_tensor(np.asarray(values, dtype=np.float32))
+        if not given.isfinite().all():
+            raise ConfigError(f"the target of '{name}' is not finite: was it seen?")
         if name == HEADING:
             target.heading[0] = given.reshape(())
         else:

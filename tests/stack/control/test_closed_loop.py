@@ -17,7 +17,7 @@ from servoid.policy.checkpoint import Origin
 from servoid.policy.diffusion.prefix import target
 from servoid.policy.diffusion.prefix.config import PlannerConfig
 from servoid.policy.diffusion.prefix.frames import Frames
-from servoid.policy.diffusion.prefix.model import load, save
+from servoid.policy.diffusion.prefix.model import PlannerModel, load, save
 from servoid.policy.diffusion.prefix.network import PlannerNetwork
 from servoid.policy.diffusion.prefix.runtime import PlannerRuntime
 from servoid.policy.features import Normaliser, raw_layout
@@ -52,8 +52,9 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> str:
     )  # fmt: skip
     path = tmp_path_factory.mktemp("planner") / "planner.safetensors"
     around = Normaliser(_standing().astype(np.float32), np.full(size, 0.01, np.float32)).to_torch()
-    weights = dict(PlannerNetwork(config).named_parameters())
-    save(path, weights, config, around, FRAMES, Origin("nothing", "Apache-2.0", {}, {}))
+    model = PlannerModel(PlannerNetwork(config), around, ("wave", "kick", "walk forward", "stand still"))
+    weights = dict(model.network.named_parameters())
+    save(path, weights, model, FRAMES, Origin("nothing", "Apache-2.0", {}, {}))
     return str(path)
 
 
@@ -124,10 +125,19 @@ def test_velocity_goal_and_targets_change_a_plan_and_a_far_goal_is_asked_for_in_
     assert all(not np.allclose(a, b, atol=1e-5) for i, a in enumerate(plans) for b in plans[:i])
     far, further = (plan(Instruction(np.zeros(3), goal=np.array([x, 0.0]))) for x in (2.0, 3.0))
     np.testing.assert_allclose(far, further, atol=1e-6)
-    with pytest.raises(KeyError, match="tail"):
+    with pytest.raises(ConfigError, match="tail"):
         plan(Instruction(np.zeros(3), targets={"tail": np.zeros(3)}))
     with pytest.raises(ConfigError, match="no English word"):
         plan(Instruction(np.zeros(3), text="???"))
+
+
+def test_a_sentence_is_read_as_the_nearest_of_the_training(checkpoint: str) -> None:
+    """So that one that no training saw asks for a motion all the same."""
+    nearest, plain = _runtime(checkpoint), _runtime(checkpoint, text_nearest=False)
+    told, meant = (_request(instruction=Instruction(np.zeros(3), text=text)) for text in ("wave now", "wave"))
+    np.testing.assert_array_equal(nearest.plan(told).states, nearest.plan(meant).states)
+    np.testing.assert_array_equal(plain.plan(meant).states, nearest.plan(meant).states)
+    assert not np.allclose(plain.plan(told).states, plain.plan(meant).states, atol=1e-5)
 
 
 def test_another_sentence_is_planned_for_at_once_and_a_run_is_repeated(checkpoint: str) -> None:
@@ -154,6 +164,18 @@ def test_another_sentence_is_planned_for_at_once_and_a_run_is_repeated(checkpoin
     np.testing.assert_array_equal(targets, again)
     np.testing.assert_allclose(targets[:4], np.tile(ROBOT.home, (4, 1)), atol=1e-6)  # held until the first plan
     assert np.abs(targets[5:] - ROBOT.home).max() > 1e-4
+
+
+def test_what_cannot_be_understood_is_said_and_the_last_plan_goes_on(checkpoint: str) -> None:
+    policy, fleet = closed_loop_policy(ROBOT, _settings(checkpoint), shape=(1,)), Fleet(ROBOT, 1, None, seed=0)
+    fleet.reset(np.ones(1, bool))
+    policy.reset(None, np.zeros(1, int))
+    events: list[str] = []
+    for tick in range(26):
+        told = Instruction(np.zeros((1, 3)), text="wave" if tick < 14 else "???")
+        fleet.step(policy.act(fleet.observe(), fleet.applied, told))
+        events += policy.take_events()
+    assert any("no English word" in event and "goes on" in event for event in events)
 
 
 def test_worlds_of_many_plan_together(checkpoint: str) -> None:

@@ -318,6 +318,15 @@ def test_release_tries_both_writes_and_says_that_it_failed():
     assert not rig.guard.off
 
 
+def test_a_waist_that_legs_share_stays_as_it_is_while_the_robot_is_lowered():
+    """Each leg bent it its own way, and the last one had its will: the robot twisted."""
+    heron = load_robot("heron")
+    low, legs = lowered_pose(heron), Legs(heron)
+    waist = [heron.names.index(name) for name in ("waist_yaw", "waist_roll")]
+    np.testing.assert_array_equal(low[waist], heron.home[waist])
+    assert -legs.soles(legs.pick(low))[1][..., 2].min() < 0.9 * heron.standing_height
+
+
 def test_crouch_keeps_the_soles_flat_and_the_base_over_them():
     legs = Legs(ROBOT)
     low = lowered_pose(ROBOT)

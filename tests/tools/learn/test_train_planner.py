@@ -16,6 +16,8 @@ from servoid.policy.checkpoint import read_header
 from servoid.policy.diffusion.prefix.frames import Frames, wrapped
 from servoid.policy.motion.library import Library
 from servoid.policy.text.captions import MOTIONS, NAMES
+from servoid.policy.text.encoder import load_encoder
+from servoid.tools.learn.settings import PlannerTraining
 from servoid.tools.learn.takes import TakeMaker, labels, told
 from servoid.tools.learn.trainers import planner
 
@@ -59,6 +61,19 @@ def test_what_leads_to_a_motion_is_called_like_it() -> None:
 def test_a_pose_that_nothing_leads_on_from_is_refused() -> None:
     with pytest.raises(ConfigError, match="no clip begins sitting"):
         TakeMaker(ROBOT, CLIPS[:2], np.random.default_rng(0))
+
+
+def test_recorded_walks_are_learned_from_too(synthetic_dataset: Path) -> None:
+    frames, encoder = Frames(ROBOT), load_encoder("words")
+    settings = PlannerTraining(
+        clips=("wave",), clip_takes=10, walk_takes=10, walk_seconds=5.0, prefix=4, frames=6, licence="CC0-1.0"
+    )
+    alone, _, licence = planner.learned_from(ROBOT, frames, encoder, settings)
+    both, source, _ = planner.learned_from(ROBOT, frames, encoder, settings, synthetic_dataset)
+    assert both.count > alone.count
+    assert "1 clips in 10 takes, 10 walks of the gait" in source
+    assert f"{synthetic_dataset.name}:" in source
+    assert licence.startswith("CC0-1.0 and ")
 
 
 @pytest.mark.slow

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from shutil import copy
 
 import numpy as np
 import pytest
 
-from servoid.hw.config import CONFIGS
+from servoid.hw.config import CONFIGS, available
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.legs import Legs
 from servoid.tools.cli import main
@@ -67,7 +68,7 @@ def test_what_does_not_fit_its_model_is_shown(tmp_path: Path, capsys: pytest.Cap
     assert [what for what, one in found.items() if not one["good"]] == ["mirrors", "ranges"]
 
 
-@pytest.mark.parametrize("name", ["op3", "wren"])
+@pytest.mark.parametrize("name", available("robots"))
 def test_shipped_robots_fit_their_models(name: str) -> None:
     assert [one for one in findings(load_robot(name)) if not one.good] == []
 
@@ -98,6 +99,42 @@ def test_a_robots_file_is_not_written_over(tmp_path: Path, capsys: pytest.Captur
     assert main(["robot", "import", str(ROBOTS / "wren.xml"), "--out", str(tmp_path / "own.yaml")]) == 2
     assert "is there already: give another --out, or --force" in capsys.readouterr().err
     assert (tmp_path / "own.yaml").read_text() == "precious"
+
+
+@pytest.mark.parametrize("name", ["wren", "heron"])
+def test_a_robot_without_networks_stands_and_says_what_it_goes_by(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`run stand` needed the odometry of an OP3."""
+    words = [
+        "--policy",
+        "gait",
+        "--fast",
+        "--seconds",
+        "1",
+        "--robot",
+        name,
+        "--record",
+        str(tmp_path / "log.mcap"),
+        "--json",
+    ]
+    assert main(["run", "stand", *words]) == 0
+    events = json.loads(capsys.readouterr().out)["events"]
+    assert any("odometry goes by the legs alone" in event["text"] for event in events)
+
+
+FOREIGN = [Path(path) for path in os.environ.get("SERVOID_FOREIGN_MODELS", "").split(os.pathsep) if path]
+
+
+@pytest.mark.skipif(not FOREIGN, reason="SERVOID_FOREIGN_MODELS names no models")
+@pytest.mark.parametrize("model", FOREIGN, ids=lambda path: path.stem)
+def test_strangers_models_are_imported_and_their_kinematics_are_mujocos(
+    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, said = imported(capsys, str(model), "--out", str(tmp_path / "own.yaml"))
+    assert code == 0, said
+    (kinematics,) = [one for one in findings(load_robot(tmp_path / "own.yaml")) if one.what == "kinematics"]
+    assert kinematics.good, kinematics.found
 
 
 def test_the_small_robot_walks_by_its_own_gait() -> None:

@@ -203,22 +203,23 @@ class PlannerTrainer(Trainer):
                 for given in (batch, shuffled)
             )
             few = windows.held_out(_PLANS)
-            planner = PrefixPlanner(PlannerModel(network, windows.normaliser, {}), windows.kinematics, text_weight=1.0)
+            planner = PrefixPlanner(PlannerModel(network, windows.normaliser, ()), windows.kinematics, text_weight=1.0)
             prefix = windows.normaliser.decode(few.frames[:, : self.config.prefix])
             planned = planner.plan(prefix, few.text, few.target, [seeded(i) for i in range(len(prefix))])
             distance, _ = few.target.error(windows.kinematics, planned)
             missed = distance[few.target.asked[:, :-1]].mean().item()
-        model = PlannerModel(network, windows.normaliser, {})
+        model = PlannerModel(network, windows.normaliser, ())
         milliseconds = _plan_ms(PrefixPlanner(model, windows.kinematics), prefix[:1], few.text[:1])
         return dict(zip(MEASURED, (loss, other, missed, milliseconds), strict=True))
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
         from servoid.policy.checkpoint import Origin
-        from servoid.policy.diffusion.prefix.model import save
+        from servoid.policy.diffusion.prefix.model import PlannerModel, save
 
         windows = self.windows
         origin = Origin(self.source, self.settings.licence, results, plain(self.settings))
-        save(path, self.average.weights, self.config, windows.normaliser, windows.kinematics, origin)
+        model = PlannerModel(self.network, windows.normaliser, windows.sentences.texts)
+        save(path, self.average.weights, model, windows.kinematics, origin)
 
     def state(self) -> dict[str, Any]:
         return {

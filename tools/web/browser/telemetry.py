@@ -106,6 +106,7 @@ class Telemetry:
                 "reach": info.reach,
                 "path": _numbers(info.path),
                 "length": info.length,
+                "steers": info.steers,
             },
             "outcome": self.outcome,
         }

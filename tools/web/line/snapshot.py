@@ -30,6 +30,7 @@ class RunInfo:
     goal: Array | None = None  # (2,) m in the frame that the robot starts in, where the episode fixes one
     reach: float | None = None  # m around the goal that count as there
     path: Array | None = None  # (n, 2) m, the way that the robot shall walk, in that frame
+    steers: bool = True  # whether there is anything to be in control of
     insists: bool = True  # whether a wish to stop that is not heeded is sent as the signal of Ctrl-C
     length: float | None = None  # s of a log that is looked back into; None: a run
     events: tuple[Event, ...] = ()  # that are known from the beginning: of a log

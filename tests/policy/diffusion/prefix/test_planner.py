@@ -36,7 +36,9 @@ CONFIG = PlannerConfig(
 def _model(seed: int = 0) -> PlannerModel:
     torch.manual_seed(seed)
     size = FRAMES.layout.size
-    return PlannerModel(PlannerNetwork(CONFIG).eval(), Normaliser(torch.zeros(size), torch.ones(size)), {})
+    return PlannerModel(
+        PlannerNetwork(CONFIG).eval(), Normaliser(torch.zeros(size), torch.ones(size)), ("wave", "kick")
+    )
 
 
 def _plan(planner: PrefixPlanner, prefix: torch.Tensor, text: str | None = "wave", count: int = 6) -> torch.Tensor:
@@ -84,8 +86,9 @@ def test_padding_of_a_sentence_says_nothing() -> None:
 def test_a_planner_is_kept_whole_in_its_file_and_refused_for_another_robot(tmp_path: Path) -> None:
     model, path = _model(), tmp_path / "planner.safetensors"
     origin = Origin("nothing", "Apache-2.0", {}, {})
-    save(path, dict(model.network.named_parameters()), CONFIG, model.normaliser, FRAMES, origin)
+    save(path, dict(model.network.named_parameters()), model, FRAMES, origin)
     loaded = load(path, ROBOT, FRAMES)
+    assert loaded.sentences == ("wave", "kick")
     prefix = torch.randn(1, 4, FRAMES.layout.size)
     torch.testing.assert_close(
         _plan(PrefixPlanner(loaded, FRAMES), prefix), _plan(PrefixPlanner(model, FRAMES), prefix), atol=1e-5, rtol=0.0

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
 from servoid.policy.diffusion.prefix import target
 from servoid.policy.diffusion.prefix.frames import Anchor, Frames
@@ -40,8 +41,10 @@ def test_only_what_is_asked_counts_and_a_point_of_the_ground_has_no_height() -> 
     assert float(ground.loss(FRAMES, still)) == pytest.approx((0.5 / target.SCALE) ** 2, rel=1e-4)
     pelvis = target.of_points(FRAMES, [("pelvis", [0.0, 0.0, 0.26])])
     assert float(pelvis.loss(FRAMES, still)) == pytest.approx(0.0, abs=1e-6)
-    with pytest.raises(KeyError, match="left hand"):
-        target.of_points(FRAMES, [("tail", [0.0, 0.0, 0.0])])
+    with pytest.raises(ConfigError, match="did you mean 'left hand'"):
+        target.of_points(FRAMES, [("left hnd", [0.0, 0.0, 0.0])])
+    with pytest.raises(ConfigError, match="was it seen"):
+        target.of_points(FRAMES, [("head", [0.0, np.nan, 0.0])])
 
 
 def test_a_target_drawn_from_frames_is_where_they_end() -> None:

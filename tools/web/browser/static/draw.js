@@ -90,7 +90,7 @@ export function drawMap(canvas, frame, run) {
   pen.restore();
   pen.fillStyle = "#5d6675";
   pen.font = "11px system-ui";
-  pen.fillText(`${(2 * reach).toFixed(1)} m across; a click sets the goal`, 6, size - 6);
+  pen.fillText(`${(2 * reach).toFixed(1)} m across`, 6, size - 6);
   const px2m = (pixel) => (size / 2 - pixel) / scale;
   return { place: (x, y) => [px + px2m(y * (size / canvas.clientHeight)), py + px2m(x * (size / canvas.clientWidth))].map((v) => Math.round(v * 1000) / 1000) };
 }

@@ -22,7 +22,7 @@ function connect() {
   const scheme = location.protocol === "https:" ? "wss:" : "ws:";
   socket = new WebSocket(`${scheme}//${location.host}${location.pathname}control`);
   socket.onmessage = (event) => hear(JSON.parse(event.data));
-  socket.onopen = () => { lost = false; sequence = 0; send("look"); banner(); };
+  socket.onopen = () => { lost = false; sequence = 0; byId("events").replaceChildren(); send("look"); banner(); };
   socket.onclose = () => { holder = "nobody"; lost = true; stand(); banner(); setTimeout(connect, 1000); };
 }
 
@@ -90,13 +90,14 @@ function gamepad() {
 // picture goes, for numbers, map and stop to stay quick.
 const SLOW = 200, SLOW_BEATS = 15; // ms that a beat is late, and how many of the last 30 may be
 let beats = [], expected = performance.now();
+let wanted = location.hash === "#picture"; // somebody wants to see it all the same
 
 function beat() {
   const now = performance.now();
   if (!document.hidden) beats.push(now - expected > SLOW);
   expected = now + BEAT;
   beats = beats.slice(-30);
-  if (beats.filter(Boolean).length > SLOW_BEATS) flatten("This machine draws in 3D too slowly for a page that must stop a robot at once.");
+  if (beats.filter(Boolean).length > SLOW_BEATS && !wanted && !hello?.run?.length) flatten("This machine draws in 3D too slowly for a page that must stop a robot at once.");
   if (holder === "you") send("beat", { way: way() });
 }
 setInterval(beat, BEAT);
@@ -173,10 +174,11 @@ byId("moment").oninput = () => send("seek", { at: Number(byId("moment").value) }
 function begin() {
   byId("robot").textContent = hello.robot;
   const run = hello.run;
-  byId("run").textContent = run ? `${run.title}, ${run.policy}, ${run.backend}` : "";
+  byId("run").textContent = run ? [run.title, run.policy, run.backend].filter(Boolean).join(", ") : "";
   if (!hello.history.length && !run?.length) byId("events").replaceChildren();
   byId("timeline").hidden = !run?.length;
   document.body.classList.toggle("looking-back", Boolean(run?.length));
+  document.body.classList.toggle("looking-on", run?.steers === false);
   if (run?.length) byId("moment").max = run.length;
   if (byId("joints").tBodies[0].rows.length !== hello.joints.length) makeTable();
   banner();
@@ -341,7 +343,7 @@ function raise() {
   view.src = "viser/";
 }
 view.onload = () => { try { listenForKeys(view.contentWindow); } catch { /* a page of an error, which hears no keys */ } };
-byId("raise").onclick = raise;
+byId("raise").onclick = () => { wanted = true; raise(); };
 if (location.hash === "#flat") flatten("The page was opened without the picture in 3D.");
 else raise();
 stand();
