@@ -19,6 +19,7 @@ from servoid.sim.model import spec
 from servoid.sim.multi_robot import prefix
 
 AZIMUTH, ELEVATION, DISTANCE = 140.0, -20.0, 5.02  # degrees and standing heights, of the camera that follows the robot
+CLOSE, LOOK = 3.67, 0.77  # standing heights: how near a camera of a given azimuth is, and how high it looks
 ABOVE, ROOM = -40.0, 0.8  # degrees, and m for each m between robots, of the camera that shows several of them
 ASIDE = 30.0  # degrees that it looks past the goal, where there is one: both are in the picture all the way
 FOLLOW = 0.08  # share of the way to the robot that the camera goes each frame: calm, yet never far behind
@@ -34,11 +35,18 @@ class RenderError(Exception):
 
 
 def render(
-    robot: Robot, frames: list[Frame], width: int = 1280, height: int = 720, shadows: bool | None = None
+    robot: Robot,
+    frames: list[Frame],
+    width: int = 1280,
+    height: int = 720,
+    shadows: bool | None = None,
+    azimuth: float | None = None,
 ) -> Iterator[Array]:
     """Pictures `(height, width, 3)` uint8 of `frames`, which all show as many robots.
 
-    `shadows` None: where drawing is quick enough. Raises RenderError when there is no way to draw.
+    `shadows` None: where drawing is quick enough. `azimuth` [degrees] is the camera's, instead of its own choice: at
+    180 it sees the front of a robot that faces along x, at 90 its right side. Raises RenderError when there is no way
+    to draw.
     """
     others = 0 if not frames or frames[0].robots is None else len(frames[0].robots)
     model = compiled(spec(robot, 1 + others), robot.mjcf)
@@ -55,6 +63,8 @@ def render(
         flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows is not False
         camera = _camera(robot, frames[0]) if frames else mujoco.MjvCamera()
+        if azimuth is not None:
+            camera.azimuth, camera.distance = azimuth, CLOSE * robot.standing_height
         trail: list[Array] = []
         for number, frame in enumerate(frames):
             _pose(model, data, robot, frame)
@@ -65,6 +75,8 @@ def render(
             data.light_xpos[:, :2] += frame.place[:2]  # the sun's shadow reaches some metres: it goes with the robot
             places = _places(frame)
             camera.lookat[:2] += FOLLOW * (places.mean(0) - camera.lookat[:2])
+            if azimuth is not None:
+                camera.lookat[:] = *frame.place[:2], LOOK * robot.standing_height
             renderer.update_scene(data, camera)
             if not trail or np.linalg.norm(frame.place[:2] - trail[-len(places)]) > 0.02:
                 trail += list(places)

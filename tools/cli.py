@@ -49,12 +49,14 @@ VERBS: dict[str, Verb] = {
         },
     ),
     "motions": Verb(
-        "import, author, list, play, check, mirror and blend clips",
+        "import, author, retarget, list, play, film, check, mirror and blend clips",
         verbs={
             "import": Verb("make clips from a file", "servoid.tools.motions.verbs.import_clip"),
             "author": Verb("make clips from keyframes", "servoid.tools.motions.verbs.author"),
+            "retarget": Verb("put a person's motion on the robot", "servoid.tools.motions.verbs.retarget"),
             "list": Verb("list the clips of a library", "servoid.tools.motions.verbs.list_clips"),
             "play": Verb("play a clip open loop in physics", "servoid.tools.motions.verbs.play"),
+            "film": Verb("film clips, or draw strips of them", "servoid.tools.motions.verbs.film"),
             "check": Verb("check joint ranges, speeds and feet of clips", "servoid.tools.motions.verbs.check"),
             "mirror": Verb("swap left and right", "servoid.tools.motions.verbs.mirror"),
             "blend": Verb("join two clips", "servoid.tools.motions.verbs.blend"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +13,13 @@ from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import LegInverse, Legs
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.motion.clip import Clip
-from servoid.sim.statics import Statics
+from servoid.sim.poses.statics import Statics
 from servoid.tools.motions.physics import play
 
 _ROUNDS = 60  # of moving the base until the centre of mass is in its place; each leaves about half of the error
 _SETTLE_TICKS = 50
+_FLIGHT = 25  # ticks without a foot on the ground in which servos are told to be ready for the weight
+_TAKING_OVER = 5  # ticks in which a foot takes over the weight from another
 
 
 @dataclass(frozen=True)
@@ -36,8 +39,9 @@ class Standing:
 
     def __init__(self, robot: Robot) -> None:
         self.robot, self.legs, self.statics = robot, Legs(robot), Statics(robot)
-        self._inverse = LegInverse(self.legs, robot.name)
+        self.inverse = LegInverse(self.legs, robot.name)
         self._stiffness = np.array([servo.stiffness for servo in robot.servos])
+        self._half = min(foot.half_size[1] for foot in robot.feet.values())
         self._braced = np.zeros(len(robot.joints))
         self.home, self._braced = self._settled()
 
@@ -71,8 +75,8 @@ class Standing:
         back = turn[:, None] * np.array([1.0, -1.0, -1.0, -1.0])
         rotation = matrix(back) @ matrix(quaternion(stance.turn))
         sole = rotate(back, stance.feet - place[:, None])
-        ankle = sole - np.einsum("tlij,lj->tli", rotation, self._inverse.sole - self._inverse.ankle)
-        return self._inverse(ankle, rotation)
+        ankle = sole - np.einsum("tlij,lj->tli", rotation, self.inverse.sole - self.inverse.ankle)
+        return self.inverse(ankle, rotation)
 
     def miss(self, stance: Stance, joints: Array, place: Array, turn: Array) -> Array:
         """How far each sole is from where it should be `(ticks, n_feet)` m: what is out of the legs' reach."""
@@ -86,12 +90,14 @@ class Standing:
     def loaded(self, joints: Array, place: Array, turn: Array, carries: Array) -> Array:
         """The goals `(ticks, n_joints)` rad that servos, which give under load, hold still poses by.
 
-        `carries` `(ticks, n_feet)` bool says which feet do. Each pushes straight up, the centre of pressure being below
-        that of mass, and against the others as much as in the home pose.
+        `carries` `(ticks, n_feet)` bool says which feet do, from one to the other over some ticks. Each pushes straight
+        up, the centre of pressure being below that of mass, as far as soles reach, and against the others as much as in
+        the home pose.
         """
         soles, centre = self.soles(joints, place, turn), self.statics.centre(joints, place, turn)
-        weight = shares(soles[..., :2], centre, carries)
+        weight = _averaged(shares(soles[..., :2], centre, carries))
         off = centre - (weight[..., None] * soles[..., :2]).sum(1)
+        off = off * np.minimum(1.0, self._half / np.maximum(np.linalg.norm(off, axis=-1, keepdims=True), 1e-9))
         points = soles + np.concatenate([off, np.zeros((len(off), 1))], -1)[:, None]
         torque = self.statics.torque(joints, place, turn, points, weight)
         both = weight.shape[1] * weight.min(-1, keepdims=True)
@@ -121,6 +127,17 @@ def shares(soles: Array, centre: Array, carries: Array) -> Array:
     share = np.einsum("tfi,ti->tf", arm, centre - middle) / spread + 1.0 / n
     share = np.where(carries, np.clip(share, 0.0, 1.0), 0.0)
     return share / np.maximum(share.sum(-1, keepdims=True), 1e-9)
+
+
+def _averaged(share: Array) -> Array:
+    """Over `_TAKING_OVER` ticks; between short flights and the ground there is no change."""
+    carried = np.flatnonzero(share.sum(-1) > 0.0)
+    for last, first in itertools.pairwise(carried):
+        if 1 < first - last <= _FLIGHT:
+            way = (np.arange(last + 1, first) - last)[:, None] / (first - last)
+            share[last + 1 : first] = share[last] + way * (share[first] - share[last])
+    padded = np.pad(share, ((_TAKING_OVER // 2,) * 2, (0, 0)), mode="edge")
+    return np.mean([padded[i : i + len(share)] for i in range(_TAKING_OVER)], axis=0)
 
 
 def quaternion(angles: Array) -> Array:

@@ -1,10 +1,11 @@
 """Train the planner of CLoSD: what follows a motion, told by a sentence and by where body parts are to be.
 
 It learns from takes made here: the clips of the library, with what leads from one to the next, mirrored twins, and
-walks of the gait; with --data, from recorded walks, too. On takes that it does not learn from it measures the error of
-the clean frames (`validation_loss`), the same with other windows' sentences (`shuffled_loss`: no higher means that
-sentences are not read), by how far plans miss targets (`target_error_m`), and the milliseconds of one core that a plan
-takes, with its sentence (`plan_ms`).
+walks of the gait; with --tracker, from the takes as that executes them, too, and with --data, from recorded walks.
+
+On takes that it does not learn from it measures the error of the clean frames (`validation_loss`), the same with other
+windows' sentences (`shuffled_loss`: no higher means that sentences are not read), by how far plans miss targets
+(`target_error_m`), and the milliseconds of one core that a plan takes, with its sentence (`plan_ms`).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import argparse
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,13 +27,16 @@ from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments, req
 if TYPE_CHECKING:
     import torch
 
+    from servoid.hw.contracts.body import Array
     from servoid.hw.robot.description import Robot
     from servoid.policy.diffusion.prefix.dataset import PlanWindows
     from servoid.policy.diffusion.prefix.frames import Frames
     from servoid.policy.diffusion.prefix.planner import PrefixPlanner
     from servoid.policy.text.encoder import TextEncoder
+    from servoid.tools.learn.takes import Take
 
 MEASURED = ("validation_loss", "shuffled_loss", "target_error_m", "plan_ms")
+_EXECUTED = 2**30  # sets the worlds in which takes are executed apart from others of the same seed
 _PLANS = 64  # that the missing of targets is measured on
 
 
@@ -40,6 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid train planner`."""
     run = add_run_arguments(parser, PlannerTraining())
     run.add_argument("--data", type=Path, metavar="DIR", help="recorded walks (`servoid collect`) to learn from, too")
+    run.add_argument(
+        "--tracker",
+        metavar="CHECKPOINT",
+        help="a tracker of clips: learn from the takes as it executes them in simulation, too",
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -56,7 +65,7 @@ def main(args: argparse.Namespace) -> int:
     torch.set_num_threads(args.threads)
     robot = load_robot(args.robot)
     frames, encoder = Frames(robot), load_encoder(settings.text)
-    windows, source, licence = learned_from(robot, frames, encoder, settings, args.data)
+    windows, source, licence = learned_from(robot, frames, encoder, settings, args.data, args.tracker)
     trainer = PlannerTrainer(windows, encoder, replace(settings, licence=licence), args.out, source)
     trainer.start(args.resume)
     trainer.run()
@@ -64,7 +73,12 @@ def main(args: argparse.Namespace) -> int:
 
 
 def learned_from(
-    robot: Robot, frames: Frames, encoder: TextEncoder, settings: PlannerTraining, data: Path | None = None
+    robot: Robot,
+    frames: Frames,
+    encoder: TextEncoder,
+    settings: PlannerTraining,
+    data: Path | None = None,
+    tracker: str | None = None,
 ) -> tuple[PlanWindows, str, str]:
     """Windows of takes, what they come from, and its licence. Raises ConfigError."""
     import numpy as np
@@ -82,6 +96,11 @@ def learned_from(
     made = sequences(takes, frames)
     source = f"{len(clips)} clips in {settings.clip_takes} takes, {settings.walk_takes} walks of the gait"
     licence = " and ".join(dict.fromkeys([settings.licence, *(clip.about.licence for clip in clips)]))
+    if tracker is not None:
+        followed = executed_by(tracker, takes, frames, settings.seed)
+        source += f", {len(followed)} of these takes as executed by {Path(tracker).name}"
+        for raw, label in followed:
+            made.add(frames, frames.of_states(raw), label)
     if data is not None:
         recording = read_recording(data, robot)
         source += f", {source_of(data, recording)}"
@@ -106,6 +125,23 @@ def _plan_ms(planner: PrefixPlanner, prefix: torch.Tensor, text: torch.Tensor, p
         for number in range(plans):
             planner.plan(prefix, text, nothing, [seeded(number)])
         return 1000.0 * (time.process_time() - start) / plans
+
+
+def executed_by(
+    tracker: str, takes: Sequence[Take], frames: Frames, seed: int, worlds: int = 256
+) -> list[tuple[Array, Array]]:
+    """Takes as a tracker executes them, so many at a time. Raises CheckpointError where it knows no clips."""
+    from servoid.stack.control.fleet import Fleet
+    from servoid.stack.control.tracker import Tracker
+    from servoid.stack.estimation.odometry import load_odometry
+    from servoid.tools.learn.executed import execute
+
+    robot, found = frames.robot, list[Any]()
+    for first in range(0, len(takes), worlds):
+        part = takes[first : first + worlds]
+        fleet = Fleet(robot, len(part), load_odometry(robot), randomise=0.5, seed=seed, tag=_EXECUTED + first)
+        found += execute(part, fleet, Tracker(robot, tracker, (len(part),), clips=True), frames)
+    return found
 
 
 class PlannerTrainer(Trainer):
