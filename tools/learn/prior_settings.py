@@ -58,8 +58,8 @@ class ScoreSettings:
     """How a prior judges, and where episodes begin."""
 
     sharpness: Annotated[Range, "w_s of the prior's reward, at the start and at the end, geometric in between"] = (
-        0.1,
-        0.1,
+        0.5,
+        1.0,
     )
     scale: Annotated[
         Literal["running", "data"], "what errors are relative to: their running mean, as in SMP, or held-out data's"

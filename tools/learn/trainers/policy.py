@@ -158,7 +158,10 @@ class PolicyTrainer(PpoTrainer):
         digest = sha256(prior)
         self._prior = {"name": prior.name, "sha256": digest}
         self._style = {"upper": style.upper, "lower": style.lower, "weight": style.weight}
-        source = f"closed-loop experience of task {env.task.name} under prior {prior.name} {str(digest)[:12]}"
+        style_text = f" in style {style.upper}+{style.lower} x {style.weight:g}" if style.lower else ""
+        source = (
+            f"closed-loop experience of task {env.task.name} under prior {prior.name} {str(digest)[:12]}{style_text}"
+        )
         super().__init__(env, settings, out, source)
         self.critic_alone = settings.critic_alone
         nominal = replace(settings, randomised=0.0, generated=0.0, starts=1, unlike=0.0)
