@@ -73,9 +73,10 @@ class Skill:
 
 
 def load_skills(robot: Robot, folder: Path = CONFIGS / "skills") -> dict[str, Skill]:
-    """The skills of a folder that `robot` has clips for, by name.
+    """The skills of a folder, by name.
 
-    Raises ConfigError naming file, line and key for a file that is wrong, or that says something else than its clip.
+    Raises ConfigError for a clip of another robot, and, naming file, line and key, for a file that is wrong or says
+    something else than its clip.
     """
     found, library = {}, Library(robot)
     for path in sorted(folder.glob("*.yaml")):

@@ -137,12 +137,14 @@ def test_strangers_models_are_imported_and_their_kinematics_are_mujocos(
     assert kinematics.good, kinematics.found
 
 
-def test_the_small_robot_walks_by_its_own_gait() -> None:
-    """Its legs roll before they turn: the numeric inverse takes its steps."""
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["wren", "heron"])
+def test_robots_with_other_legs_walk_by_their_own_gaits(name: str) -> None:
+    """Legs that roll or pitch before they turn, and a waist: the numeric inverse takes their steps."""
     from servoid.stack.control.fleet import Fleet
     from servoid.stack.control.gait import GaitPolicy
 
-    robot = load_robot("wren")
+    robot = load_robot(name)
     fleet = Fleet(robot, 3, None, seed=1, threads=1)
     policy = GaitPolicy(robot, (3,))
     fleet.reset(np.ones(3, bool))
