@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -255,14 +256,18 @@ class Trajectory:
         """Of the predicted states, `(horizon,)` s from now."""
         return self.dt * self.ticks
 
+    @cached_property
+    def _even(self) -> bool:
+        return bool((np.diff(self.ticks, prepend=0) == self.ticks[0]).all())
+
     def mean(self, values: AnyArray, axis: int = -1) -> AnyArray:
         """Mean over time of `values` of the horizon along `axis`, or of its first part.
 
         Each state stands for the time since the one before it.
         """
-        spans = np.diff(self.ticks[: values.shape[axis]], prepend=0)
-        if (spans == spans[0]).all():
+        if self._even:
             return values.mean(axis)
+        spans = np.diff(self.ticks[: values.shape[axis]], prepend=0)
         weights = values.new_tensor(spans / spans.sum())
         return (values * weights.reshape(-1, *[1] * (-1 - axis))).sum(axis)
 

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -48,7 +50,7 @@ class Sampler:
         were at level `stabilization_level`, with their values untouched (UniPhys, algorithm 1, line 5).
         """
         self._predict = predict
-        self._signal = torch.as_tensor(signal, dtype=torch.float32)
+        self._levels = signal.astype(np.float32).tobytes()
         self._eta = eta
         self._stabilization_level = stabilization_level
 
@@ -66,12 +68,13 @@ class Sampler:
         first row. Raises Diverged.
         """
         matrix = matrix.hold(known.state_mask.numpy(), known.action_mask.numpy())
-        state_rows, action_rows = torch.as_tensor(matrix.states), torch.as_tensor(matrix.actions)
+        rows = matrix.states, matrix.actions
+        state_rows, action_rows = (torch.as_tensor(x) for x in rows)
         if start is None:
             start = draw_noise(generators, *known.states.shape[1:]), draw_noise(generators, *known.actions.shape[1:])
         states = torch.where(known.state_mask[:, None], known.states, start[0])
         actions = torch.where(known.action_mask[:, None], known.actions, start[1])
-        state_steps, action_steps = self._steps(state_rows), self._steps(action_rows)
+        state_steps, action_steps = (_steps(x.tobytes(), x.shape[1], self._levels, self._eta) for x in rows)
         shown = [rows.masked_fill(rows == 0, self._stabilization_level) for rows in (state_rows, action_rows)]
         for call, (of_states, of_actions) in enumerate(zip(state_steps, action_steps, strict=True)):
             # Once all states are finished, guidance has nothing to move.
@@ -87,19 +90,6 @@ class Sampler:
             actions = self._step(actions, clean_actions, of_actions, generators)
         return states, actions
 
-    def _steps(self, rows: Tensor) -> list[DenoisingStep]:
-        """The steps between the rows `(calls + 1, tokens)` of a denoising matrix."""
-        a, b = self._signal[rows[:-1]][..., None], self._signal[rows[1:]][..., None]
-        fresh = self._eta**2 * (1 - b) / (1 - a).clamp_min(1e-6) * (1 - a / b)  # variance of the noise drawn anew
-        factors = (
-            a.sqrt(),
-            (1 - a).sqrt().clamp_min(1e-6),
-            b.sqrt(),
-            (1 - b - fresh).clamp_min(0.0).sqrt(),
-            fresh.clamp_min(0.0).sqrt(),
-        )
-        return [DenoisingStep(*parts) for parts in zip(rows[1:] < rows[:-1], *factors, strict=True)]
-
     def _step(self, noisy: Tensor, clean: Tensor, step: DenoisingStep, generators: Sequence[torch.Generator]) -> Tensor:
         """Tokens after a call that predicted them `clean`."""
         noise = (noisy - step.signal_before * clean) / step.noise_before
@@ -107,3 +97,20 @@ class Sampler:
         if self._eta:
             stepped = stepped + step.noise_fresh * draw_noise(generators, *noisy.shape[1:])
         return torch.where(step.moving[:, None], stepped, noisy)
+
+
+@lru_cache(maxsize=64)  # plan after plan walks the same matrix
+def _steps(rows: bytes, tokens: int, signal: bytes, eta: float) -> list[DenoisingStep]:
+    """The steps between the rows `(calls + 1, tokens)` int64 of a denoising matrix; `signal` is float32, by level."""
+    levels = torch.from_numpy(np.frombuffer(rows, dtype=np.int64).reshape(-1, tokens).copy())
+    kept = torch.from_numpy(np.frombuffer(signal, dtype=np.float32).copy())
+    a, b = kept[levels[:-1]][..., None], kept[levels[1:]][..., None]
+    fresh = eta**2 * (1 - b) / (1 - a).clamp_min(1e-6) * (1 - a / b)  # variance of the noise drawn anew
+    factors = (
+        a.sqrt(),
+        (1 - a).sqrt().clamp_min(1e-6),
+        b.sqrt(),
+        (1 - b - fresh).clamp_min(0.0).sqrt(),
+        fresh.clamp_min(0.0).sqrt(),
+    )
+    return [DenoisingStep(*parts) for parts in zip(levels[1:] < levels[:-1], *factors, strict=True)]
