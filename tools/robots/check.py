@@ -7,7 +7,6 @@ with what its servos can hold.
 from __future__ import annotations
 
 import argparse
-import contextlib
 from pathlib import Path
 
 from servoid.hw.config import ConfigError
@@ -26,9 +25,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Compare; returns 1 where something has to be looked at. Raises ConfigError."""
     with reporting(args.json) as report:
-        if args.picture is not None:
-            with contextlib.suppress(ConfigError):  # said when the picture is drawn
-                choose_drawing("the picture")
+        picture: Path | None = args.picture
+        if picture is not None:
+            try:
+                choose_drawing("--picture")
+            except ConfigError as error:  # to draw all the same would end the process
+                report.line(f"no picture: {error}")
+                picture = None
         from servoid.hw.robot.description import load_robot
         from servoid.tools.robots.compare import findings
         from servoid.tools.robots.pictures import poses
@@ -36,8 +39,8 @@ def main(args: argparse.Namespace) -> int:
         robot = load_robot(args.robot)
         found = findings(robot)
         report.table(("", "what", "found"), [("ok" if one.good else "look", one.what, one.found) for one in found])
-        if args.picture is not None:
-            poses(robot, args.picture, report)
+        if picture is not None:
+            poses(robot, picture, report)
         wrong = [one for one in found if not one.good]
         report.line(f"{robot.name}: {len(wrong)} to look at" if wrong else f"{robot.name}: all fits")
         report.result({"ok": not wrong, "findings": [vars(one) for one in found]})

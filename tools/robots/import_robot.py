@@ -7,7 +7,6 @@ limbs. What no model says, such as servos and their IDs, is guessed and marked w
 from __future__ import annotations
 
 import argparse
-import contextlib
 from pathlib import Path
 
 from servoid.hw.config import ConfigError
@@ -34,9 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Draft, and draw where this machine can; returns 0. Raises ConfigError."""
     with reporting(args.json) as report:
-        if args.picture:
-            with contextlib.suppress(ConfigError):  # said when the picture is drawn
+        draws = bool(args.picture)
+        if draws:
+            try:
                 choose_drawing("the picture")
+            except ConfigError as error:  # to draw all the same would end the process
+                report.line(f"no picture: {error}")
+                draws = False
         from servoid.hw.robot.description import load_robot
         from servoid.tools.robots.draft import Choices, draft
         from servoid.tools.robots.pictures import poses
@@ -59,7 +62,7 @@ def main(args: argparse.Namespace) -> int:
             f"{robot.name} stands {robot.standing_height:.3f} m high at home; legs of "
             f"{', '.join(link.joint for link in next(iter(robot.legs.values())))} and their mirrors"
         )
-        pictures = poses(robot, out.with_suffix(".png"), report) if args.picture else None
+        pictures = poses(robot, out.with_suffix(".png"), report) if draws else None
         report.line(f"next: fill in what is marked TODO, then: servoid robot check {out}")
         report.result({"out": str(out), "picture": pictures, "todo": list(found.notes), "joints": list(robot.names)})
     return 0
