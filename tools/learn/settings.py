@@ -183,6 +183,7 @@ class PlannerTraining(DecayedOptimiser, PlannerTakes, PlannerShape, StepRun):
     learning_rate: float = 4e-4
     text: Annotated[str, "encoder of sentences"] = "words"
     target_weight: Annotated[float, "weight of the target loss"] = 1.0
+    root: Annotated[float, "by how much deviations of the base's rates and height count more than others'"] = 5.0
     warmup_steps: Annotated[int, "steps over which the learning rate rises"] = 200
     average: Annotated[float, "decay of the averaged weights, which are the ones saved"] = 0.999
     precision: Annotated[Literal["bf16", "fp32"], "arithmetic of the network"] = "bf16"
@@ -190,8 +191,8 @@ class PlannerTraining(DecayedOptimiser, PlannerTakes, PlannerShape, StepRun):
     def __post_init__(self) -> None:
         for part in (StepRun, PlannerShape, PlannerTakes, Optimiser):
             part.__post_init__(self)
-        if self.target_weight < 0 or self.warmup_steps < 1:
-            raise ValueError("target_weight must not be negative, and warmup_steps must be at least 1")
+        if self.target_weight < 0 or self.root <= 0 or self.warmup_steps < 1:
+            raise ValueError("target_weight must not be negative, root positive, and warmup_steps at least 1")
 
 
 @dataclass(frozen=True)

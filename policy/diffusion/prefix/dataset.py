@@ -19,6 +19,7 @@ from servoid.policy.recording import DatasetError
 from servoid.policy.text.encoder import TextEncoder
 
 HELD_OUT = 20  # one take in so many is kept for validation
+ROOT = ("yaw_rate", "velocity", "height")  # what adds up over a plan, or is a number alone among so many
 UNTOLD = -1  # a window over which what is asked changes
 
 
@@ -80,11 +81,13 @@ class PlanWindows:
         sentences: ToldSentences,
         untold: float,
         rest: int,
+        root: float = 1.0,
     ) -> None:
         """`untold` is the share of windows that are told nothing since what is asked changes on the way.
 
         What is asked is that of the first frame to come. A motion may come to its end within the window, with `rest`,
-        the label of standing, after it. Raises DatasetError without a window.
+        the label of standing, after it. Deviations of the `ROOT` count `root` times as much as others', as in
+        HumanML3D: a small error of theirs adds up. Raises DatasetError without a window.
         """
         self.kinematics, self.shape, self.sentences, self._untold = frames, shape, sentences, untold
         length = shape.prefix + shape.frames
@@ -100,9 +103,10 @@ class PlanWindows:
             raise DatasetError(f"fewer than {HELD_OUT} takes are longer than the {length} frames of a window")
         row, label, kept = np.concatenate(rows), np.concatenate(labels), np.concatenate(held)
         self._frames = torch.from_numpy(np.concatenate(sequences.frames).astype(np.float32))
-        self.normaliser = Normaliser.fit(
-            np.concatenate([self._frames.numpy(), frames.mirror(self._frames.numpy())])
-        ).to_torch()
+        fitted = Normaliser.fit(np.concatenate([self._frames.numpy(), frames.mirror(self._frames.numpy())]))
+        for name in ROOT:
+            fitted.std[frames.layout.slice(name)] /= root
+        self.normaliser = fitted.to_torch()
         self.count = int((~kept).sum())
         self._training, self._validation = (
             {int(k): torch.from_numpy(row[mine & (label == k)]) for k in np.unique(label[mine])}

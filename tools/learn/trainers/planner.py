@@ -109,7 +109,9 @@ def learned_from(
             label = motion_of(recording.command[first:last], robot.walking.scale)
             made.add(frames, motion, label)
     sentences = ToldSentences(told, encoder, settings.words)
-    return PlanWindows(made, frames, settings, sentences, settings.untold, NAMES.index("stand")), source, licence
+    stand = NAMES.index("stand")
+    windows = PlanWindows(made, frames, settings, sentences, settings.untold, stand, settings.root)
+    return windows, source, licence
 
 
 def _plan_ms(planner: PrefixPlanner, prefix: torch.Tensor, text: torch.Tensor, plans: int = 5) -> float:

@@ -128,5 +128,9 @@ def test_batches_hold_mirrored_windows_with_the_other_side_s_words() -> None:
     raw = windows.normaliser.decode(batch.frames)
     distance, _ = batch.target.error(FRAMES, raw[:, 4:])
     assert float(distance[batch.target.asked[:, :-1]].max()) < 1e-3
+    finer = PlanWindows(made, FRAMES, SHAPE, sentences, 0.1, 0, 5.0).normaliser.std / windows.normaliser.std
+    root = torch.cat([finer[FRAMES.layout.slice(name)] for name in ("yaw_rate", "velocity", "height")])
+    torch.testing.assert_close(root, torch.full((4,), 0.2))
+    assert int((finer < 1.0).sum()) == 4
     with pytest.raises(DatasetError, match="longer"):
         PlanWindows(made, FRAMES, replace(SHAPE, frames=200), sentences, 0.1, 0)
