@@ -105,7 +105,7 @@ def test_a_file_is_refused_by_line_and_key(tmp_path: Path, text: str, message: s
 
 
 def test_a_reward_that_is_no_term_is_refused_by_file_line_and_nearest_name(tmp_path: Path) -> None:
-    text = (CONFIGS / "training" / "tracker.yaml").read_text().replace("  slip: -0.5", "  slipp: -0.5")
+    text = (CONFIGS / "training" / "expert.yaml").read_text().replace("  slip: -0.5", "  slipp: -0.5")
     (tmp_path / "tracker.yaml").write_text(text)
     line = text.splitlines().index("  slipp: -0.5") + 1
     with pytest.raises(ConfigError, match=rf"tracker.yaml:{line}: .*slipp: no such reward term; did you mean 'slip'"):
