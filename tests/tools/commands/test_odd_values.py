@@ -24,6 +24,7 @@ from servoid.stack.log.recorder import Recorder
 from servoid.stack.runtime.run import Run
 from servoid.tools.cli import VERBS, main, parser_of
 from servoid.tools.common.worker_pool import Worker
+from servoid.tools.learn.takes import TakeMaker
 
 ODD = (
     "", ".", "..", "/", "-1", "0", "1", "nan", "1e999", "1e-320", "folder", "folder/", "missing", "missing.yaml",
@@ -36,7 +37,7 @@ NEEDED = {
     "run": "walk", "rollout": "walk --workers 1", "replay": "a.mcap", "export": "a.mcap --csv", "plot": "a.mcap",
     "evaluate": "papers --rows uniphys/goal-near --workers 1", "collect": "--out o", "completion": "bash",
     "train tracker": "--out o", "train odometry": "--policy gait", "train latent": "--data d --out o",
-    "train diffusion": "--data d --out o",
+    "train diffusion": "--data d --out o", "train planner": "--out o",
     "train prior": "--data d --out o", "train policy": "--task speed --prior prior --out o",
     "motions import": "a.mcap --name n --caption c --licence MIT --out lib",
     "motions list": "--library lib", "motions play": "k --library lib", "motions check": "k --library lib",
@@ -56,7 +57,8 @@ def refused(*_: object, **__: object) -> NoReturn:
 @pytest.fixture(autouse=True)
 def nothing_begins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for owner, name in ((Run, "connect"), (Worker, "__init__"), (RigProcess, "__init__"), (Server, "serve"),
-                        (Worlds, "__init__"), (BaseProcess, "start"), (subprocess.Popen, "__init__")):  # fmt: skip
+                        (Worlds, "__init__"), (TakeMaker, "__init__"), (BaseProcess, "start"),
+                        (subprocess.Popen, "__init__")):  # fmt: skip
         monkeypatch.setattr(owner, name, refused)
     monkeypatch.setattr("servoid.stack.log.provenance.git_commit", lambda: "unknown")
     monkeypatch.chdir(tmp_path)
