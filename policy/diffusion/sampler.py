@@ -74,7 +74,7 @@ class Sampler:
             start = draw_noise(generators, *known.states.shape[1:]), draw_noise(generators, *known.actions.shape[1:])
         states = torch.where(known.state_mask[:, None], known.states, start[0])
         actions = torch.where(known.action_mask[:, None], known.actions, start[1])
-        state_steps, action_steps = (_steps(x.tobytes(), x.shape[1], self._levels, self._eta) for x in rows)
+        state_steps, action_steps = (_steps(x.tobytes(), x.shape, self._levels, self._eta) for x in rows)
         shown = [rows.masked_fill(rows == 0, self._stabilization_level) for rows in (state_rows, action_rows)]
         for call, (of_states, of_actions) in enumerate(zip(state_steps, action_steps, strict=True)):
             # Once all states are finished, guidance has nothing to move.
@@ -100,9 +100,9 @@ class Sampler:
 
 
 @lru_cache(maxsize=64)  # plan after plan walks the same matrix
-def _steps(rows: bytes, tokens: int, signal: bytes, eta: float) -> list[DenoisingStep]:
-    """The steps between the rows `(calls + 1, tokens)` int64 of a denoising matrix; `signal` is float32, by level."""
-    levels = torch.from_numpy(np.frombuffer(rows, dtype=np.int64).reshape(-1, tokens).copy())
+def _steps(rows: bytes, shape: tuple[int, ...], signal: bytes, eta: float) -> list[DenoisingStep]:
+    """The steps between the rows of a denoising matrix of `shape` `(calls + 1, tokens)`, int64; `signal` float32, by level."""
+    levels = torch.from_numpy(np.frombuffer(rows, dtype=np.int64).reshape(shape).copy())
     kept = torch.from_numpy(np.frombuffer(signal, dtype=np.float32).copy())
     a, b = kept[levels[:-1]][..., None], kept[levels[1:]][..., None]
     fresh = eta**2 * (1 - b) / (1 - a).clamp_min(1e-6) * (1 - a / b)  # variance of the noise drawn anew
