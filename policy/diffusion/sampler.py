@@ -101,7 +101,7 @@ class Sampler:
 
 @lru_cache(maxsize=64)  # plan after plan walks the same matrix
 def _steps(rows: bytes, shape: tuple[int, ...], signal: bytes, eta: float) -> list[DenoisingStep]:
-    """The steps between the rows of a denoising matrix of `shape` `(calls + 1, tokens)`, int64; `signal` float32, by level."""
+    """Steps between rows of a denoising matrix of `shape` `(calls + 1, tokens)` int64; `signal` float32, by level."""
     levels = torch.from_numpy(np.frombuffer(rows, dtype=np.int64).reshape(shape).copy())
     kept = torch.from_numpy(np.frombuffer(signal, dtype=np.float32).copy())
     a, b = kept[levels[:-1]][..., None], kept[levels[1:]][..., None]
