@@ -19,6 +19,7 @@ AFTER_SECONDS = 0.5  # that the last pose is held
 REACHED = 2e-3  # m that a foot or a hand may miss its place by
 SPEED_SHARE = 0.95  # of the speed that the guard allows
 _STRETCHES = 8
+_LIFTED_WEIGHT = 0.25  # of the robot's, that a foot may still be said to carry when it is lifted
 _CARRIES = 5e-4  # m: a sole that is no higher is on the ground
 
 
@@ -117,6 +118,7 @@ class _Author:
             many, keyframe = self._between(wanted, poses, seconds)
             stance = self._stance(many)
             carries = stance.feet[..., 2] <= _CARRIES
+            self._check_weight(wanted.name, keyframe, many.weight, carries)
             solved = self._standing.solve(stance)
             goals = self._standing.loaded(*solved, carries)
             self._check(wanted.name, keyframe, stance, solved, goals)
@@ -157,6 +159,15 @@ class _Author:
         yaw = (pose.weight * heading).sum(-1)
         lean = np.concatenate([pose.lean, np.zeros((len(yaw), 1))], -1)
         return Stance(pose.height, pose.tilt, under + turned(lean, yaw)[:, :2], feet, pose.turn, pose.joints)
+
+    def _check_weight(self, name: str, keyframe: Array, weight: Array, carries: Array) -> None:
+        early = ~carries & (weight > _LIFTED_WEIGHT)
+        if early.any():
+            tick, foot = np.argwhere(early)[0]
+            raise ConfigError(
+                f"clip '{name}', keyframe {keyframe[tick]}: the {list(self._robot.feet)[foot]} foot leaves the ground "
+                f"with {weight[tick, foot]:.0%} of the weight on it: shift the weight off it first"
+            )
 
     def _check(self, name: str, keyframe: Array, stance: Stance, solved: Solved, goals: Array) -> None:
         missed = self._standing.miss(stance, *solved)

@@ -129,7 +129,10 @@ def test_ablations_have_the_papers_figures_and_none_to_reach(name: str) -> None:
 def test_no_other_row_claims_to_be_published() -> None:
     published = {row.name for row in ROWS if row.published is not None and "@" not in row.name}
     known = {name for name, value in ABLATIONS.items() if value is not None}
-    assert published == {*MAIN, *BESIDE, *ALONE, *MOTION, *known}
+    ahead = {name for name in published if "-ahead" in name}  # another planner's, beside what the paper has of its own
+    assert published - ahead == {*MAIN, *BESIDE, *ALONE, *MOTION, *known}
+    for name in ahead:
+        assert BY_NAME[name].published == BY_NAME[name.split("-ahead")[0]].published, name
     for name, value in MOTION.items():
         assert BY_NAME[name].published == value
 

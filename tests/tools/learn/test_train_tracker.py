@@ -168,7 +168,7 @@ def test_a_folder_of_another_run_is_not_gone_on_with(trained: tuple[Path, Tracke
     with pytest.raises(ConfigError, match=r"did not start from .*--no-resume"):
         trainer(out, init=out / "tracker.safetensors")
     with pytest.raises(
-        ConfigError, match=r"hidden was \(32, 16\), is \(16, 16\); hardest_push was 0.9, is 0.5.*--no-resume"
+        ConfigError, match=r"hidden was \(32, 16\), is \(16, 16\); hardest_push was 0.6, is 0.5.*--no-resume"
     ):
         trainer(out, hidden=(16, 16), hardest_push=0.5)
     (tmp_path / "state.pt").write_bytes(b"")
