@@ -56,7 +56,7 @@ def answers(script: Path, line: str, folder: Path | None = None) -> list[str]:
     ("line", "found"),
     [
         ("servoid ", {*VERBS, "--help", "--version"}),
-        ("servoid rol", {"rollout"}),
+        ("servoid ro", {"robot", "rollout"}),
         ("servoid bringup ", {*VERBS["bringup"].verbs}),
         ("servoid train od", {"odometry"}),
         ("servoid run wa", {"walk"}),
