@@ -17,7 +17,7 @@ from servoid.stack.control.tracker import Tracker
 from servoid.stack.skills.skill import UPRIGHT, Skill, clip_of, way
 from servoid.tools.learn.collect.skills import FIRST_SECONDS, Drill, drawn, skills_of
 
-STOP_SECONDS = (0.6, 1.2)  # that a robot that walks is told to stand before a skill
+STOP_SECONDS = (0.6, 1.2)  # that a robot that walks, or left a skill half done, is told to stand before another
 REST_SECONDS = (0.0, 1.5)  # from the end of a skill until something else is told,
 AT_ONCE = 0.3  # but for this share, which goes on at the clip's end
 HOLD_SECONDS = 0.2  # of a clip's last frame, before the robot goes home
@@ -108,7 +108,7 @@ class Performances(BasePolicy):
         else:
             weights = self._upright / (50.0 + self.told)
             chosen = int(rng.choice(len(weights), p=weights / weights.sum()))
-            if now < 0 and self.velocity[i].any():
+            if self.velocity[i].any() or (now >= 0 and self._since[i] < self._ticks[now]):
                 self._walk(i, self._drills[0], STOP_SECONDS, rng)
                 self._coming[i] = chosen
             else:
