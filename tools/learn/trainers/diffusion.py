@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
 from importlib import import_module
@@ -126,16 +126,17 @@ class DiffusionTrainer(Trainer):
     settings: DiffusionTraining
 
     LOSS = "validation_action_loss"
-    columns = (
-        *("loss", "state_loss", "action_loss", "learning_rate", "tokens_per_s", LOSS, "survival", "velocity_error"),
-        *("followed", "followed_walks", "followed_skills"),
+    columns: Sequence[str] = (
+        "loss",
+        "state_loss",
+        "action_loss",
+        "learning_rate",
+        "tokens_per_s",
+        LOSS,
+        "survival",
+        "velocity_error",
     )
-    panels = (
-        ("state_loss", "action_loss", LOSS),
-        ("survival",),
-        ("velocity_error",),
-        ("followed", "followed_walks", "followed_skills"),
-    )
+    panels: Sequence[Sequence[str]] = (("state_loss", "action_loss", LOSS), ("survival",), ("velocity_error",))
 
     def __init__(
         self,
@@ -156,6 +157,9 @@ class DiffusionTrainer(Trainer):
         torch.manual_seed(settings.seed)
         self.windows, self.robot, self.config = windows, robot, windows.config
         self.skills: Mapping[str, tuple[str, ...]] = {}  # that are learned, with their phrasings
+        if self.config.clock:
+            shares = ("followed", "followed_walks", "followed_skills")
+            self.columns, self.panels = (*self.columns[:-1], *shares), (*self.panels[:-1], shares)
         self.network = Denoiser(self.config)
         self.average = Average(self.network, settings.average)
         self.optimiser = torch.optim.AdamW(
