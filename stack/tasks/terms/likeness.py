@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from servoid.hw.contracts.body import Array
 
@@ -13,6 +14,7 @@ LATEST_SECONDS = 2.6  # from being told to beginning: to end what may not be lef
 SHOWN_SECONDS = 1.4  # of a motion, or all of a shorter one, that must be seen
 ALIKE = 0.15  # rad, root mean square over joints and time, up to which a motion is the one that was told
 STILL = "stand"
+_STEP = 2  # ticks between the shifts that are tried
 
 
 @dataclass(frozen=True)
@@ -29,17 +31,26 @@ def misfit(joints: Array, motion: Shown, dt: float) -> tuple[float, float]:
 
     Infinite where there are too few ticks to see it.
     """
-    ticks, length = len(joints), len(motion.joints)
+    ticks, (length, n) = len(joints), motion.joints.shape
     latest = min(round(LATEST_SECONDS / dt), ticks - min(length, round(SHOWN_SECONDS / dt)))
-    best = np.inf, np.inf
-    for at in range(0, latest + 1, 2):
-        shown = min(length, ticks - at)
-        before = (joints[:at] - motion.joints[0]) ** 2
-        during = (joints[at : at + shown] - motion.joints[:shown]) ** 2
-        after = (joints[at + shown :] - motion.after) ** 2
-        whole = (before.sum() + during.sum() + after.sum()) / joints.size
-        best = min(best, (float(np.sqrt(whole)), float(np.sqrt(during.mean()))))
-    return best
+    if latest < 0:
+        return np.inf, np.inf
+    at = np.arange(0, latest + 1, _STEP)
+    shown = np.minimum(length, ticks - at)
+    before, after = (_sums((joints - pose) ** 2) for pose in (motion.joints[0], motion.after))
+    # Sums of (j - m)^2, as those of j^2 and m^2, which are the same of all shifts, and of j m.
+    padded = np.concatenate([joints, np.zeros((length, n))])
+    product = np.einsum("akt,tk->a", sliding_window_view(padded, length, 0)[at], motion.joints)
+    seen, meant = _sums(joints**2), _sums(motion.joints**2)
+    during = np.maximum(seen[at + shown] - seen[at] + meant[shown] - 2.0 * product, 0.0)
+    whole = before[at] + during + after[-1] - after[at + shown]
+    best = int(whole.argmin())
+    return float(np.sqrt(whole[best] / joints.size)), float(np.sqrt(during[best] / (shown[best] * n)))
+
+
+def _sums(values: Array) -> Array:
+    """Of the first 0, 1, ... rows: `(rows + 1,)`."""
+    return np.concatenate([[0.0], np.cumsum(values.sum(-1))])
 
 
 def nearest(joints: Array, motions: Mapping[str, Shown], home: Array, dt: float) -> tuple[str, float]:
