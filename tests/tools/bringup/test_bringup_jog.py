@@ -21,7 +21,7 @@ from servoid.sim.rig.in_process import InProcessLine
 from servoid.sim.rig.process.control import RigProcess
 from servoid.sim.rig.rig import Rig
 from servoid.tools.bringup import watch
-from servoid.tools.bringup.jogging import IDLE_SECONDS, KEY_SECONDS, SPAN, SPEED, There, Wish, reach, restrict
+from servoid.tools.bringup.desk.jogging import IDLE_SECONDS, KEY_SECONDS, SPAN, SPEED, There, Wish, reach, restrict
 from servoid.tools.bringup.line import Line
 from servoid.tools.cli import main
 
