@@ -22,7 +22,7 @@ from servoid.policy.text.captions import MOTIONS, followed, twist_of
 from servoid.stack.skills.skill import UPRIGHT, Skill, clip_of, load_skills
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 from servoid.stack.tasks.terms import metrics as measures
-from servoid.stack.tasks.terms.likeness import Shown, performed
+from servoid.stack.tasks.terms.likeness import SeenMotion, performed
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,13 @@ class Text(BaseTask):
         return {name: skill for name, skill in load_skills(self.robot or shipped_robot()).items() if skill.alone}
 
     @cached_property
-    def shown(self) -> dict[str, Shown]:
+    def shown(self) -> dict[str, SeenMotion]:
         """What each of them looks like."""
         robot = self.robot or shipped_robot()
         clips = {name: clip_of(skill, robot).joints for name, skill in self.skills.items()}
-        return {name: Shown(j, robot.home if self.skills[name].end == UPRIGHT else j[-1]) for name, j in clips.items()}
+        return {
+            name: SeenMotion(j, robot.home if self.skills[name].end == UPRIGHT else j[-1]) for name, j in clips.items()
+        }
 
     def _understood(self, sentence: str) -> int | str:
         from servoid.policy.text.encoder import load_encoder

@@ -18,14 +18,14 @@ _STEP = 2  # ticks between the shifts that are tried
 
 
 @dataclass(frozen=True)
-class Shown:
+class SeenMotion:
     """A motion to be told apart from others: its joints `(ticks, n_joints)` rad, and those that it comes to rest in."""
 
     joints: Array
     after: Array
 
 
-def misfit(joints: Array, motion: Shown, dt: float) -> tuple[float, float]:
+def misfit(joints: Array, motion: SeenMotion, dt: float) -> tuple[float, float]:
     """How far joints `(ticks, n_joints)` rad are off a motion that begins somewhere in them: root mean squares over all
     ticks, its first pose held before it and its rest after it, and over the motion alone; where the first is least.
 
@@ -53,7 +53,7 @@ def _sums(values: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(values.sum(-1))])
 
 
-def nearest(joints: Array, motions: Mapping[str, Shown], home: Array, dt: float) -> tuple[str, float]:
+def nearest(joints: Array, motions: Mapping[str, SeenMotion], home: Array, dt: float) -> tuple[str, float]:
     """The motion that joints `(ticks, n_joints)` rad are least off, `STILL` where that is standing at `home`; and how
     far off they are while it lasts [rad]."""
     off = {name: misfit(joints, motion, dt) for name, motion in motions.items()}
@@ -62,7 +62,7 @@ def nearest(joints: Array, motions: Mapping[str, Shown], home: Array, dt: float)
     return name, still if name == STILL else off[name][1]
 
 
-def performed(asked: str, joints: Array, motions: Mapping[str, Shown], home: Array, dt: float) -> bool:
+def performed(asked: str, joints: Array, motions: Mapping[str, SeenMotion], home: Array, dt: float) -> bool:
     """Whether joints went through the motion that was `asked` for, rather than any other."""
     name, off = nearest(joints, motions, home, dt)
     return name == asked and off <= ALIKE

@@ -16,7 +16,7 @@ from servoid.policy.text.captions import MOTIONS
 from servoid.policy.text.encoder import code_size
 from servoid.stack.skills.skill import clip_of, load_skills
 from servoid.tools import cli
-from servoid.tools.learn.told import images_of, skills_in, told_of
+from servoid.tools.learn.collect.told import images_of, skills_in, told_of
 
 ROBOT = load_robot()
 COMMAND = "collect --skills --worlds 16 --frames 3000 --seconds 8 --threads 1 --json --out"

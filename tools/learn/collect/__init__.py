@@ -178,7 +178,7 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
     return result | {"out": str(args.out), "seconds": round(time.perf_counter() - begin, 1)}
 
 
-def _features(robot: Robot, performances: Performances | None) -> dict[str, Feature]:
+def _features(robot: Robot, performances: Performances | None = None) -> dict[str, Feature]:
     """The dataset's columns and the names of their numbers."""
     from servoid.policy.features import recorded_names
     from servoid.policy.recording import CLOCK, SKILLS_NOTE

@@ -30,7 +30,7 @@ class RecordedEpisode:
     skill: Array
 
 
-class Script(Protocol):
+class Drilled(Protocol):
     """What the worlds are asked: `Commands`, or `Performances`."""
 
     velocity: Array  # (n, 3) m/s forward, m/s left, rad/s
@@ -68,7 +68,7 @@ class EpisodeCutter:
         policy: Policy,
         settings: DisturbanceSettings,
         seconds: float,
-        script: Script | None = None,
+        script: Drilled | None = None,
     ) -> None:
         """Episodes end after `seconds`, or with a fall. `policy` is of shape `(fleet.n,)`; without a `script` it is
         asked to walk by `Commands`."""
@@ -80,7 +80,7 @@ class EpisodeCutter:
             raise ConfigError(
                 f"episodes of {seconds:g} s are too short: at least {FALL_SECONDS + SHORTEST_SECONDS:g} s are needed"
             )
-        self._script: Script = script or Commands(robot, fleet.n)
+        self._script: Drilled = script or Commands(robot, fleet.n)
         self._disturbances = Disturbances(robot, fleet.n, settings)
         n = len(robot.joints)
         sizes = {"observation.state": raw_layout(n).size, "action": n, "action_applied": n, "command": 3}

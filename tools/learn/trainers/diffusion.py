@@ -59,7 +59,7 @@ def main(args: argparse.Namespace) -> int:
     from servoid.policy.diffusion.dataset import Windows
     from servoid.policy.latent.actions import load_latents
     from servoid.policy.recording import read_recording
-    from servoid.tools.learn.told import skills_in, told_of
+    from servoid.tools.learn.collect.told import skills_in, told_of
 
     # What cannot be trained or measured is refused before the data is read.
     settings = read_settings(args, DiffusionTraining())
