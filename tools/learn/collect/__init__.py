@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
     from servoid.tools.learn.collect.disturbances import DisturbanceSettings
     from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
-    from servoid.tools.learn.collect.lerobot import Feature
     from servoid.tools.learn.collect.performances import Performances
+    from servoid.tools.learn.dataset.schema import Feature
 
 LICENCE = "Apache-2.0"
 MIRRORING = "applied when read (servoid.policy.diffusion.dataset): each window also serves with left and right swapped"
@@ -131,9 +131,10 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
     from servoid.stack.skills.skill import load_skills
     from servoid.tools.learn.collect.disturbances import DisturbanceSettings
     from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
-    from servoid.tools.learn.collect.lerobot import DatasetWriter, Schema
     from servoid.tools.learn.collect.performances import Performances
     from servoid.tools.learn.collect.skills import SKILLS
+    from servoid.tools.learn.dataset.lerobot import DatasetWriter
+    from servoid.tools.learn.dataset.schema import Schema
 
     begin = time.perf_counter()
     robot = load_robot(args.robot)
@@ -182,7 +183,7 @@ def _features(robot: Robot, performances: Performances | None = None) -> dict[st
     """The dataset's columns and the names of their numbers."""
     from servoid.policy.features import recorded_names
     from servoid.policy.recording import CLOCK, SKILLS_NOTE
-    from servoid.tools.learn.collect.lerobot import Feature
+    from servoid.tools.learn.dataset.schema import Feature
 
     notes = {
         "observation.state": {"mirroring": MIRRORING},
