@@ -18,8 +18,8 @@ from servoid.stack.skills.skill import Skill
 # are many skills, and what is performed by mistake may throw the robot over. And by how much more it must be like a
 # skill than like a walk.
 SURE, MARGIN = 0.55, 0.02
-# By how much more a text is like a skill or a walk all of whose telling words are in its phrases: of the training phrases,
-# each read by all others, 43 of 190 were taken for another skill, and 54 without it.
+# By how much more a text is like a skill, or a walk, whose phrases have all of its telling words. Chosen on the phrases of
+# skills, each read by the others: 43 of 190 were taken for another skill, and 54 without it.
 SHARED = 0.2
 # Words that tell nothing.
 _EMPTY = {"the", "your", "a", "to", "with", "and", "in", "on", "of", "at", "it", "is", "my", "me", "us", "you"}
@@ -107,15 +107,15 @@ class SkillWords:
         return similarity(code, self._codes)[0], similarity(code, self._walking.codes)[0]
 
     def _shared(self, text: str) -> Mapping[str, float]:
-        """Share, 0 to 1, of a text's telling words that the phrases of each skill, and of each walk, have: a word counts
-        the more, the fewer have it (inverse document frequency)."""
+        """Share, 0 to 1, of a text's telling words that the phrases of each skill, and of each walk, have.
+
+        A word counts the more, the fewer have it (inverse document frequency).
+        """
         found = set(words(text)) - _EMPTY
         count = {word: sum(word in known for known in self._known.values()) for word in found}
         weight = {word: np.log(len(self._known) / n) for word, n in count.items() if n}
         whole = sum(weight.values()) or 1.0
-        return {
-            name: sum(weight.get(word, 0.0) for word in found & known) / whole for name, known in self._known.items()
-        }
+        return {name: sum(weight[word] for word in found & known) / whole for name, known in self._known.items()}
 
     def _walks(self, text: str) -> bool:
         """Whether a text that names no skill is about walking."""
