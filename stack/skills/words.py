@@ -18,7 +18,7 @@ from servoid.stack.skills.skill import Skill
 # are many skills, and what is performed by mistake may throw the robot over. And by how much more it must be like a
 # skill than like a walk.
 SURE, MARGIN = 0.55, 0.02
-# By how much more a text is like a skill, or a walk, whose phrases have all of its telling words. Chosen on the phrases of
+# By how much more a text is like a skill, or a walk, whose phrases have all its telling words. Chosen on the phrases of
 # skills, each read by the others: 43 of 190 were taken for another skill, and 54 without it.
 SHARED = 0.2
 # Words that tell nothing.
