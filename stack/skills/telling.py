@@ -13,6 +13,7 @@ from servoid.hw.contracts.control import Adopted, Instruction, Policy, State
 from servoid.hw.robot.description import Robot
 from servoid.policy.text.captions import MOTIONS, NAMES, motion_of, twist_of
 from servoid.policy.text.encoder import TextEncoder
+from servoid.policy.text.told import walk_clock
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.skills.skill import UPRIGHT, Skill, chosen, steps, way
 from servoid.stack.skills.words import SkillWords
@@ -38,9 +39,9 @@ class Teller:
 
     @property
     def since(self) -> float:
-        """Seconds since a skill began, as training counted them; 0 of a walk."""
+        """Seconds since a skill began, as training counted them; of a walk its clock (`walk_clock`)."""
         if isinstance(self.now, int):
-            return 0.0
+            return float(walk_clock(np.array(self._ticks * self._dt)))
         return min(self._ticks * self._dt, self._skills[self.now].seconds + PAST_SECONDS)
 
     def tell(self, asked: str | int) -> None:
