@@ -124,24 +124,25 @@ class ToldPolicy(BasePolicy):
         if now != before or not self._told:
             self._told = self._phrase(now)
             self._events.append(f"told: {self._told}")
+        since = np.array(self._teller.since)
         if now == asked and instruction.text is None and instruction.skill is None:
-            return self._planner.act(state, applied, instruction)  # a velocity, which says more than a sentence
+            # A velocity, which says more than a sentence.
+            return self._planner.act(state, applied, replace(instruction, since=since))
         velocity = twist_of(now, self._robot.walking.scale) if isinstance(now, int) else np.zeros(3)
         told = replace(
             instruction,
             velocity=velocity,
             text=self._told,
-            since=np.array(self._teller.since),
+            since=since,
             stand=instruction.stand and now == _STAND,
         )
         return self._planner.act(state, applied, told)
 
     def _phrase(self, now: str | int) -> str:
-        """How to tell it: in the words of the sentence that asked, or those of the training nearest to them."""
-        same = now == self._last and self._sentence != ""
+        """How to tell it: a skill in its clearest phrase, a walk in the words of the sentence that asked for it."""
         if isinstance(now, str):
-            return self._words.phrase(now, self._sentence if same else "")
-        return self._sentence if same else MOTIONS[now].phrasings[0]
+            return self._words.clearest(now)
+        return self._sentence if now == self._last and self._sentence else MOTIONS[now].phrasings[0]
 
     def _asked(self, instruction: Instruction) -> str | int | None:
         """What is asked for; None: nothing that is understood, so what was asked for last."""

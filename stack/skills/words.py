@@ -89,12 +89,15 @@ class SkillWords:
             )
         return str(self._names[fitting.argmax()])
 
-    def phrase(self, name: str, text: str = "") -> str:
-        """The phrase of a skill that is nearest to a text that asks for it; the first one without a text."""
-        rows = np.flatnonzero(self._names == name)
-        if not text:
-            return self._texts[rows[0]]
-        return self._texts[rows[similarity(self._encoder.encode([text]), self._codes[rows])[0].argmax()]]
+    def clearest(self, name: str) -> str:
+        """The phrase of a skill that is least like those of anything else.
+
+        "Kick with the left foot" is nearly "kick high with the left foot"; "strike the ball with the left leg" is not.
+        """
+        own = self._names == name
+        others = np.concatenate([self._codes[~own], self._walking.codes])
+        apart = np.linalg.norm(self._codes[own][:, None] - others, axis=-1).min(1)
+        return self._texts[int(np.flatnonzero(own)[apart.argmax()])]
 
     def about_skill(self, text: str) -> bool:
         """Whether a text is about a skill rather than about walking, understood or not. Raises ConfigError for one

@@ -34,6 +34,11 @@ def test_most_held_out_phrases_are_understood() -> None:
     assert sum(name == found for name, found in pairs) >= 0.93 * len(pairs)
 
 
+def test_a_skill_is_told_in_the_phrase_that_is_least_like_any_others() -> None:
+    assert WORDS.clearest("kick-left") == "strike the ball with the left leg"
+    assert all(WORDS.clearest(name) in skill.phrases for name, skill in SKILLS.items())
+
+
 def test_sentences_about_walking_stay_about_walking() -> None:
     assert all(isinstance(WORDS.understand(text), int) for motion in MOTIONS for text in motion.phrasings)
 
