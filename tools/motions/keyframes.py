@@ -42,10 +42,30 @@ class Keyframe:
 
 
 @dataclass(frozen=True)
+class Step:
+    """Goals of joints, those of legs too, and the time that they take: nothing is solved for, and physics says where it
+    leads. What a step does not name stays as it was. Joints that go on the same way pass through."""
+
+    seconds: float  # from the step before
+    joints: dict[str, float] = field(default_factory=dict)  # rad
+    hold: float = 0.0  # s
+    home: bool = False  # first, every joint goes back to the home pose
+
+    def __post_init__(self) -> None:
+        if self.seconds <= 0.0:
+            raise ValueError("seconds: must be above 0")
+        if self.hold < 0.0:
+            raise ValueError("hold: must not be negative")
+
+
+@dataclass(frozen=True)
 class AuthoredClip:
+    """Made of keyframes that keep their balance, or of steps that need not."""
+
     name: str
     captions: tuple[str, ...]
-    frames: tuple[Keyframe, ...]
+    frames: tuple[Keyframe, ...] = ()
+    steps: tuple[Step, ...] = ()
     begins: str = "upright"  # one of `clip.POSES`
     ends: str = "upright"
     after: str | None = None  # begins in the last pose of this clip
@@ -53,8 +73,8 @@ class AuthoredClip:
     mirrored: str | None = None  # name of the clip that is made of it with left and right swapped
 
     def __post_init__(self) -> None:
-        if not self.frames:
-            raise ValueError("frames: at least one is needed")
+        if bool(self.frames) == bool(self.steps):
+            raise ValueError("frames, or steps: at least one is needed, and not of both")
 
     def about(self, source: str, licence: str) -> About:
         """Raises ConfigError where it does not say enough, or says what cannot be."""

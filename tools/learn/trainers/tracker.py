@@ -17,7 +17,7 @@ from servoid.policy import checkpoint
 from servoid.policy.mlp import Mlp
 from servoid.policy.motion.clip import Clip
 from servoid.policy.motion.library import Library
-from servoid.policy.tracker.network import load_tracker
+from servoid.policy.tracker.network import load_tracker, written
 from servoid.tools.learn.envs.tracking import Tracking
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.settings import TrackerTraining
@@ -71,6 +71,11 @@ class TrackerTrainer(PpoTrainer):
         self.begin_small(_FIRST)  # with the references as they are, and little more
 
     @property
+    def _clips(self) -> bool:
+        """Whether it tracks clips, too, and not the gait alone."""
+        return self.env.observation.clips
+
+    @property
     def title(self) -> str:
         return f"the tracker in {self.env.n} worlds"
 
@@ -93,8 +98,9 @@ class TrackerTrainer(PpoTrainer):
             raise checkpoint.CheckpointError(
                 f"{path}: its hidden layers are {hidden}; give --hidden {' '.join(map(str, hidden))}"
             )
-        if not clips:
-            raise checkpoint.CheckpointError(f"{path}: a tracker of the gait alone, which sees less than this one")
+        if clips != self._clips:
+            what = "of clips, too, which sees more" if clips else "of the gait alone, which sees less"
+            raise checkpoint.CheckpointError(f"{path}: a tracker {what} than this one: choose another --clip-share")
         self.begin_with(network)
 
     def actor(self) -> Mlp:
@@ -107,12 +113,11 @@ class TrackerTrainer(PpoTrainer):
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
         s = self.settings
-        config = {
-            "hidden": list(s.hidden),
-            "clips": [clip.name for clip in self.env.motions.clips],
-            "rewards": s.rewards,
-            "clip_rewards": s.clip_rewards,
-        }
+        config: dict[str, Any] = {"hidden": list(s.hidden), "rewards": s.rewards}
+        if self._clips:
+            config |= {"clips": [clip.name for clip in self.env.motions.clips], "clip_rewards": s.clip_rewards}
+        if s.gait:
+            config["gait"] = written(self.env.reference.gait.settings)
         about: dict[str, Any] = {
             "data": _SOURCE,
             "licence": "Apache-2.0",
