@@ -7,7 +7,6 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.contracts.control import State
 from servoid.hw.geometry import up_vector
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
@@ -51,14 +50,13 @@ class Feedback:
             self._signs.append(np.array(signs))
         self._upright = -up_vector(legs.stand(robot.home)[1])
 
-    def __call__(self, target: Array, state: State, gains: Array) -> Array:
-        """`target` `(..., n_joints)` rad, corrected by what the gyro and gravity say."""
+    def __call__(self, target: Array, gravity: Array, rate: Array, gains: Array) -> Array:
+        """`target` `(..., n_joints)` rad, corrected by gravity's direction and what the gyro says `(..., 3)` rad/s."""
         out = target.copy()
-        tilt = state.gravity - self._upright  # small: its x is a pitch forward, its y a roll to the right
+        tilt = gravity - self._upright  # small: its x is a pitch forward, its y a roll to the right
         for i, (joints, signs) in enumerate(zip(self._joints, self._signs, strict=True)):
             pitch = i % 2 == 0
-            rate = state.angular_velocity[..., 1 if pitch else 0]
             lean = tilt[..., 0] if pitch else -tilt[..., 1]
-            answer = gains[..., i, 0] * rate + gains[..., i, 1] * lean
+            answer = gains[..., i, 0] * rate[..., 1 if pitch else 0] + gains[..., i, 1] * lean
             out[..., joints] += signs * answer[..., None]
         return out

@@ -43,7 +43,9 @@ class ClipPolicy(BasePolicy):
             self._entering = np.zeros_like(self._entering)
         target = self._reference.frames(_NOW).position[..., 0, :]
         self._reference.advance()
-        return target if self._gains is None else self._feedback(target, state, self._gains)
+        if self._gains is None:
+            return target
+        return self._feedback(target, state.gravity, state.angular_velocity, self._gains)
 
     @property
     def ended(self) -> bool:

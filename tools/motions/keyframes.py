@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from servoid.hw.config import ConfigError, load_yaml, resolve
 from servoid.policy.motion.clip import About
+from servoid.stack.control.balance import Balance
 
 Vector = tuple[float, float, float]
 
@@ -66,6 +67,7 @@ class AuthoredClip:
     captions: tuple[str, ...]
     frames: tuple[Keyframe, ...] = ()
     steps: tuple[Step, ...] = ()
+    balance: Balance = field(default_factory=Balance)  # beside steps, as the skill has it that performs the clip
     begins: str = "upright"  # one of `clip.POSES`
     ends: str = "upright"
     after: str | None = None  # begins in the last pose of this clip

@@ -85,7 +85,8 @@ class KickTrial:
                 faced = truth.yaw.copy()
             if tick >= look:
                 over = tick - look - length
-                kick = self._feedback(reference.frames(_NOW).position[:, 0], state, gain)
+                kick = reference.frames(_NOW).position[:, 0]
+                kick = self._feedback(kick, state.gravity, state.angular_velocity, gain)
                 reference.advance()
                 offset = np.where((over == 0)[:, None], applied - target, offset)
                 left = 1.0 - smooth((over + 1.0) / fade)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import accumulate
 
 import numpy as np
 
@@ -10,6 +12,8 @@ from servoid.hw.config import ConfigError, nearest
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import About, Clip
+from servoid.stack.control.balance import Feedback
+from servoid.stack.safety.limits import limit
 from servoid.tools.motions.keyframes import AuthoredClip, Step
 from servoid.tools.motions.physics import play
 
@@ -23,11 +27,16 @@ def stepped(wanted: AuthoredClip, robot: Robot, about: About) -> Clip:
         raise ConfigError(f"clip '{wanted.name}': steps begin at the home pose: leave out begins and after")
     goals = stepped_goals(wanted.steps, robot, f"clip '{wanted.name}'")
     held = np.concatenate([goals, np.repeat(goals[-1:], round(AFTER_SECONDS * robot.rate), 0)])
-    played = play(held, robot)
+    feedback, gains = Feedback(robot), wanted.balance.gains
+    played = play(
+        held, robot, corrected=lambda target, truth: feedback(target, truth.gravity, truth.angular_velocity, gains)
+    )
     if played.fallen.any():
         tick = int(played.fallen[0].argmax())
         raise ConfigError(f"clip '{wanted.name}': the robot falls {tick * robot.dt:.1f} s into it")
-    return played.as_clip(wanted.name, about)
+    # The goals alone, as the limits let them through: what corrects them is the performer's.
+    alone = list(accumulate(held, lambda before, goal: limit(goal, before, robot), initial=robot.home))[1:]
+    return replace(played.as_clip(wanted.name, about), joints=np.array(alone))
 
 
 def stepped_goals(steps: Sequence[Step], robot: Robot, where: str = "steps") -> Array:

@@ -38,9 +38,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--recipe", default="kick", metavar="NAME|FILE", help="motion to begin with, of steps (default: kick)"
     )
-    parser.add_argument(
-        "--skill", default="kick-right", metavar="NAME", help="skill whose balance to begin with (default: kick-right)"
-    )
     parser.add_argument("--foot", default="right", choices=("left", "right"), help="foot that kicks (default: right)")
     parser.add_argument(
         "--generations", type=int, default=150, metavar="N", help="generations of the search (default: 150)"
@@ -69,7 +66,6 @@ def main(args: argparse.Namespace) -> int:
         except ImportError as error:
             raise ConfigError("the search needs the package cma: pip install --editable '.[tune]'") from error
         from servoid.hw.robot.description import load_robot
-        from servoid.stack.skills.skill import chosen, load_skills
         from servoid.stack.tasks import load_task
         from servoid.tools.motions.keyframes import load_authored
         from servoid.tools.motions.kicks import KickTrial
@@ -79,8 +75,7 @@ def main(args: argparse.Namespace) -> int:
         if len(recipe.clips) != 1 or not recipe.clips[0].steps:
             raise ConfigError(f"--recipe {args.recipe}: must hold one clip, made of steps")
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        clip = recipe.clips[0]
-        space = Space(clip, chosen(args.skill, load_skills(robot)).balance or Balance(), robot)
+        space = Space(recipe.clips[0], robot)
         ball: Any = load_task("kick", {}).settings
         trial = KickTrial(robot, args.candidates, args.worlds, ball, randomise=args.randomise, seed=args.seed)
         options = {"popsize": args.candidates, "seed": args.seed + 1, "verbose": -9, "CMA_diagonal": _DIAGONAL}
@@ -88,8 +83,8 @@ def main(args: argparse.Namespace) -> int:
 
         def tried(points: list[Array], generation: int) -> Kicks:
             made = [space.at(point) for point in points]
-            goals = [stepped_goals(found.steps, robot) for found, _ in made]
-            return trial.kick(goals, np.array([balance.gains for _, balance in made]), args.foot, generation)
+            goals = [stepped_goals(clip.steps, robot) for clip in made]
+            return trial.kick(goals, np.array([clip.balance.gains for clip in made]), args.foot, generation)
 
         try:
             for generation in range(args.generations):
@@ -98,18 +93,18 @@ def main(args: argparse.Namespace) -> int:
                 costs = cost(kicks)
                 search.tell(points, costs.tolist())
                 leader = int(costs.argmin())
-                _write(args.out, recipe, *space.at(search.mean), words(kicks, leader))
+                _write(args.out, recipe, space.at(search.mean), words(kicks, leader))
                 report.line(f"{generation + 1:3d} of {args.generations}: {words(kicks, leader)}")
         except KeyboardInterrupt:
             report.line("stopped: what was found so far is kept")
         kicks = tried([search.mean] * args.candidates, 0)
-        found, balance = space.at(search.mean)
-        _write(args.out, recipe, found, balance, words(kicks))
+        found = space.at(search.mean)
+        _write(args.out, recipe, found, words(kicks))
         report.line(f"{words(kicks)}; written to {args.out}")
-        report.line("balance: " + ", ".join(f"{name}: {_gains(value)}" for name, value in asdict(balance).items()))
+        report.line(f"its skills' files take this: balance: {_rounded(found.balance)}")
         report.line(f"next: servoid motions author {args.out} --out runs/clips")
         figures = {"ball_speed_mps": float(kicks.speed.mean()), "stands_share": float(kicks.stands.mean())}
-        report.result({"out": str(args.out), **figures, "balance": asdict(balance)})
+        report.result({"out": str(args.out), **figures, "balance": _rounded(found.balance)})
     return 0
 
 
@@ -131,26 +126,26 @@ def words(kicks: Kicks, of: int | slice = slice(None)) -> str:
 
 
 class Space:
-    """Points `(size,)` of the search: changes of a clip's steps and of a balance, in steps of the search."""
+    """Points `(size,)` of the search: changes of a clip's steps and of its balance, in steps of the search."""
 
-    def __init__(self, clip: AuthoredClip, balance: Balance, robot: Robot) -> None:
-        self._clip, self._balance = clip, balance
+    def __init__(self, clip: AuthoredClip, robot: Robot) -> None:
+        self._clip = clip
         margin = robot.limits.margin
         self._ranges = {
             name: (low + margin, high - margin)
             for name, low, high in zip(robot.names, robot.lower.tolist(), robot.upper.tolist(), strict=True)
         }
-        self.size = sum(len(step.joints) + 1 + (step.hold > 0.0) for step in clip.steps) + balance.gains.size
+        self.size = sum(len(step.joints) + 1 + (step.hold > 0.0) for step in clip.steps) + clip.balance.gains.size
 
-    def at(self, point: Array) -> tuple[AuthoredClip, Balance]:
-        """The clip and the balance there, within the joints' ranges."""
+    def at(self, point: Array) -> AuthoredClip:
+        """The clip there, within the joints' ranges."""
         rest = iter(np.asarray(point, float).tolist())
         steps = tuple(self._step(step, rest) for step in self._clip.steps)
         gains = {
             name: (rate + _RATE * next(rest), tilt + _TILT * next(rest))
-            for name, (rate, tilt) in asdict(self._balance).items()
+            for name, (rate, tilt) in asdict(self._clip.balance).items()
         }
-        return replace(self._clip, steps=steps), Balance(**gains)
+        return replace(self._clip, steps=steps, balance=Balance(**gains))
 
     def _step(self, step: Step, rest: Any) -> Step:
         joints = {
@@ -162,15 +157,13 @@ class Space:
         return replace(step, joints=joints, seconds=seconds, hold=hold)
 
 
-def _write(path: Path, recipe: Authored, clip: AuthoredClip, balance: Balance, how: str) -> None:
+def _write(path: Path, recipe: Authored, clip: AuthoredClip, how: str) -> None:
     """The recipe with this clip, as a file."""
     import yaml
 
-    about = {key: value for key, value in asdict(clip).items() if key not in ("frames", "steps") and value}
+    about = {key: value for key, value in asdict(clip).items() if value and key not in ("frames", "steps", "balance")}
+    about = {key: value for key, value in about.items() if key not in ("begins", "ends")}  # it begins and ends upright
     about["captions"] = list(clip.captions)
-    for pose in ("begins", "ends"):
-        if about[pose] == "upright":
-            del about[pose]
     steps = []
     for step in clip.steps:
         row: dict[str, Any] = {"seconds": round(step.seconds, 4)}
@@ -178,11 +171,11 @@ def _write(path: Path, recipe: Authored, clip: AuthoredClip, balance: Balance, h
         row |= {"home": True} if step.home else {}
         row |= {"joints": {name: round(angle, 4) for name, angle in step.joints.items()}} if step.joints else {}
         steps.append(row)
-    gains = ", ".join(f"{name}: {_gains(value)}" for name, value in asdict(balance).items())
-    head = f"# By `servoid tune kick`: {how}.\n# The balance that its skills' files have: {{{gains}}}\n"
-    body = {"licence": recipe.licence, "clips": [{**about, "steps": steps}]}
+    made = {**about, "balance": _rounded(clip.balance), "steps": steps}
+    head = f"# By `servoid tune kick`: {how}.\n"
+    body = {"licence": recipe.licence, "clips": [made]}
     path.write_text(head + yaml.safe_dump(body, sort_keys=False, default_flow_style=None, width=120))
 
 
-def _gains(pair: tuple[float, float]) -> str:
-    return f"[{pair[0]:.3f}, {pair[1]:.3f}]"
+def _rounded(balance: Balance) -> dict[str, list[float]]:
+    return {name: [round(gain, 3) for gain in gains] for name, gains in asdict(balance).items()}

@@ -11,9 +11,9 @@ from servoid.hw.robot.description import Robot, Walking
 from servoid.policy.references.gait import Gait
 
 _FAST = 0.85  # of the top speed: what is asked to go as fast is what the curriculum judges
-_FOLLOWED = 0.85  # of what was asked, on the mean
-_MEMORY = 200  # ticks over which it is judged, of all worlds together
-_GROWTH = 5e-4  # a tick, of the top speed
+_FOLLOWED = 0.8  # of what was asked, on the mean
+_MEMORY = 100  # ticks over which it is judged, of all worlds together
+_GROWTH = 1e-3  # a tick, of the top speed
 _FORWARD, _TURNING = 0, 2
 
 
@@ -21,7 +21,7 @@ class Speeds:
     """Top speeds straight ahead and of turning on the spot, `walking`: at first the robot's own; those of the `gait` in
     the end, where one is given.
 
-    Each grows for as long as worlds that are asked for nearly all of it go at 0.85 of what is asked; one that has
+    Each grows for as long as worlds that are asked for nearly all of it go at 0.8 of what is asked; one that has
     fallen goes at nothing.
     """
 

@@ -79,7 +79,7 @@ class PpoTrainer(Trainer):
     """Trains an actor and its critic in an environment; a subclass says what its checkpoint is."""
 
     settings: Ppo
-    critic_alone: float = 600_000  # samples, or a tenth of all where those are fewer; where the actor was adopted
+    critic_alone: float = 600_000  # samples, where the actor was adopted
 
     def __init__(self, env: Environment, settings: Ppo, out: Path, source: str) -> None:
         super().__init__(out, settings, source)
@@ -131,7 +131,7 @@ class PpoTrainer(Trainer):
         if self.begun_with:
             progress = _BEGUN_AT + (1.0 - _BEGUN_AT) * progress
             # An adopted actor must not learn from a critic that knows nothing yet.
-            self.ppo.actor.mlp.requires_grad_(self.step >= min(self.critic_alone, 0.1 * s.samples))
+            self.ppo.actor.mlp.requires_grad_(self.step >= self.critic_alone)
         self.env.schedule(progress)
         self.ppo.actor.distribution.log_std_param.fill_(np.log(np.interp(progress, [0.0, 1.0], s.noise)))
         self.ppo.learning_rate = s.learning_rate * (1.0 - 0.85 * progress)
