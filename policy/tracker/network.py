@@ -30,7 +30,10 @@ def gait_of_tracker(path: Path, robot: Robot) -> GaitSettings:
     if own is None:
         return gait_of(robot)
     try:
-        return GaitSettings(**{name: tuple(value) if isinstance(value, list) else value for name, value in own.items()})
+        values: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in own.items()
+        }
+        return GaitSettings(**values)
     except (AttributeError, TypeError) as error:
         raise CheckpointError(f"{path}: its gait is not one of this program: {error}") from error
 
