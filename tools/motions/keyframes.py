@@ -43,7 +43,7 @@ class Keyframe:
 
 
 @dataclass(frozen=True)
-class Step:
+class JointStep:
     """Goals of joints, those of legs too, and the time that they take: nothing is solved for, and physics says where it
     leads. What a step does not name stays as it was. Joints that go on the same way pass through."""
 
@@ -66,7 +66,7 @@ class AuthoredClip:
     name: str
     captions: tuple[str, ...]
     frames: tuple[Keyframe, ...] = ()
-    steps: tuple[Step, ...] = ()
+    steps: tuple[JointStep, ...] = ()
     balance: Balance = field(default_factory=Balance)  # beside steps, as the skill has it that performs the clip
     begins: str = "upright"  # one of `clip.POSES`
     ends: str = "upright"

@@ -14,7 +14,7 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import About, Clip
 from servoid.stack.control.balance import Feedback
 from servoid.stack.safety.limits import limit
-from servoid.tools.motions.keyframes import AuthoredClip, Step
+from servoid.tools.motions.keyframes import AuthoredClip, JointStep
 from servoid.tools.motions.physics import play
 
 AFTER_SECONDS = 0.5  # that the last step is held, so that what it leads to is seen
@@ -39,7 +39,7 @@ def stepped(wanted: AuthoredClip, robot: Robot, about: About) -> Clip:
     return replace(played.as_clip(wanted.name, about), joints=np.array(alone))
 
 
-def stepped_goals(steps: Sequence[Step], robot: Robot, where: str = "steps") -> Array:
+def stepped_goals(steps: Sequence[JointStep], robot: Robot, where: str = "steps") -> Array:
     """Goals `(ticks, n_joints)` rad at the robot's rate, from the home pose on. Raises ConfigError naming the step."""
     times, poses = [0.0], [robot.home]
     for number, step in enumerate(steps, 1):

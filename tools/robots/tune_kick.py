@@ -19,11 +19,11 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.stack.control.balance import Balance
 from servoid.tools.common.output import add_json_argument, reporting
-from servoid.tools.motions.keyframes import Authored, AuthoredClip, Step
+from servoid.tools.motions.keyframes import Authored, AuthoredClip, JointStep
 
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
-    from servoid.tools.motions.kicks import Kicks
+    from servoid.tools.robots.kicks import Kicks
 
 _ANGLE, _TIME, _RATE, _TILT = 0.15, 0.25, 0.03, 0.15  # a step of the search: rad, of the logarithm, s, 1
 _DIAGONAL = 40  # generations in which the search learns no correlations: there are too many
@@ -68,8 +68,8 @@ def main(args: argparse.Namespace) -> int:
         from servoid.hw.robot.description import load_robot
         from servoid.stack.tasks import load_task
         from servoid.tools.motions.keyframes import load_authored
-        from servoid.tools.motions.kicks import KickTrial
         from servoid.tools.motions.stepped import stepped_goals
+        from servoid.tools.robots.kicks import KickTrial
 
         robot, recipe = load_robot(args.robot), load_authored(args.recipe)
         if len(recipe.clips) != 1 or not recipe.clips[0].steps:
@@ -147,7 +147,7 @@ class Space:
         }
         return replace(self._clip, steps=steps, balance=Balance(**gains))
 
-    def _step(self, step: Step, rest: Any) -> Step:
+    def _step(self, step: JointStep, rest: Any) -> JointStep:
         joints = {
             name: float(np.clip(angle + _ANGLE * next(rest), *self._ranges[name]))
             for name, angle in step.joints.items()

@@ -13,9 +13,9 @@ from servoid.hw.robot.description import load_robot
 from servoid.stack.skills.skill import load_skills
 from servoid.tools.cli import main
 from servoid.tools.motions.author import author
-from servoid.tools.motions.keyframes import Authored, Step, load_authored
-from servoid.tools.motions.kicks import Kicks
+from servoid.tools.motions.keyframes import Authored, JointStep, load_authored
 from servoid.tools.motions.stepped import stepped_goals, through
+from servoid.tools.robots.kicks import Kicks
 from servoid.tools.robots.tune_kick import Space, cost
 
 ROBOT = load_robot()
@@ -43,7 +43,7 @@ def test_a_curve_passes_where_it_goes_on_and_rests_where_it_turns() -> None:
 
 def test_steps_say_what_changes_and_home_brings_everything_back() -> None:
     goals = stepped_goals(
-        (Step(0.2, {"r_knee": -1.2}), Step(0.2, {"l_el": -0.8}, hold=0.1), Step(0.2, home=True)), ROBOT
+        (JointStep(0.2, {"r_knee": -1.2}), JointStep(0.2, {"l_el": -0.8}, hold=0.1), JointStep(0.2, home=True)), ROBOT
     )
     assert len(goals) == 35
     assert goals[[9, 24], KNEE] == pytest.approx([-1.2, -1.2])
