@@ -179,11 +179,11 @@ class Sender:
     """Whoever steers, in a process of its own. `wire` is the cable between them and the page."""
 
     process: subprocess.Popen[str]
-    wire: Wire
+    wire: Cable
 
     @classmethod
     def connect(cls, url: str) -> Sender:
-        wire = Wire(int(url.rstrip("/").rsplit(":", 1)[1]))
+        wire = Cable(int(url.rstrip("/").rsplit(":", 1)[1]))
         line = [sys.executable, "-m", "servoid.tools.faults.sender", url, str(wire.port)]
         process = subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
@@ -291,7 +291,7 @@ class Ending:
         """The page stays for the next walk."""
 
 
-class Wire:
+class Cable:
     """A cable to a port of this machine that carries nothing while it is not `open`, and tells neither end."""
 
     def __init__(self, to: int) -> None:
