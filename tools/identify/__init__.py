@@ -10,7 +10,7 @@ are named. Everything is recorded: after an interruption, or to fit again, give 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,6 +21,7 @@ from servoid.hw.robot.description import Load, Robot
 from servoid.tools.bringup.line import add_line_arguments, assembled, is_virtual
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, reporting
+from servoid.tools.identify.figures import MODELS
 
 if TYPE_CHECKING:
     from servoid.tools.identify.excitation import Motion
@@ -45,6 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="folder of logs, servo files and picture (default: identified/ROBOT)"
     )
+    parser.add_argument(
+        "--friction", choices=list(MODELS), metavar="MODEL",
+        help=f"model of friction: {', '.join(MODELS)} (default: what predicts motions best that it was not fitted on)",
+    )  # fmt: skip
     parser.add_argument("--start", action="store_true", help="switch torque on without asking")
 
 
@@ -63,7 +68,7 @@ def main(args: argparse.Namespace) -> int:
         logs = args.logs or _record(args, robot, groups, out, report)
         if isinstance(logs, int):
             return logs
-        report.result(_fit(robot, logs, out, report))
+        report.result(_fit(robot, logs, out, report, MODELS if args.friction is None else (args.friction,)))
     return exit_codes.DONE
 
 
@@ -160,7 +165,7 @@ def _announce(report: Report, robot: Robot, motions: Sequence[Motion], args: arg
         report.line(f"On {body} hang {load.mass:g} kg.")
 
 
-def _fit(robot: Robot, logs: Sequence[Path], out: Path, report: Report) -> dict[str, Any]:
+def _fit(robot: Robot, logs: Sequence[Path], out: Path, report: Report, models: Iterable[str]) -> dict[str, Any]:
     """Fit, tell, write the servos' files and draw. Returns the result."""
     import math
 
@@ -170,7 +175,7 @@ def _fit(robot: Robot, logs: Sequence[Path], out: Path, report: Report) -> dict[
 
     pieces = read_pieces(logs, robot)
     report.line(f"fitting {len(pieces)} motions; Ctrl-C loses nothing: fit again with --from")
-    best, fits = identify(robot, pieces, report.line)
+    best, fits = identify(robot, pieces, report.line, tuple(models))
     announce(best, report)
     files = write(best, pieces, out, report)
     return {

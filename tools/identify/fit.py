@@ -18,8 +18,8 @@ from servoid.tools.identify.rehearsal import Candidate, Rehearsal
 DETERMINED = 0.1  # of a figure: with a larger spread, the data do not determine it
 _NOISE = 0.002  # rad: of an encoder's tick and of what no model has
 _ALIKE = 10  # ticks in a row whose errors are as good as one
-_CANDIDATES, _GENERATIONS = 10, 10
-_ITERATIONS, _STEP = 6, 0.05  # of least squares; of a figure's spread, for the slopes
+_CANDIDATES, _GENERATIONS = 10, 6
+_ITERATIONS, _STEP = 5, 0.05  # of least squares; of a figure's spread, for the slopes
 _DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)  # tried at each iteration
 _FARTHEST = 4.0  # spreads that a figure may be from its file's
 _BETTER = 0.98  # of the held-out error, that a model with more figures must come below
