@@ -54,7 +54,7 @@ class Servo:
 
 
 @dataclass(frozen=True)
-class Load:
+class Payload:
     """A known weight [kg] on a body of the MJCF, at a point of that body's frame [m]."""
 
     mass: float
@@ -238,7 +238,7 @@ class Robot:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, of the base's frame, in that of its body in the MJCF
     passive: tuple[str, ...] = ()  # joints that no servo drives: not commanded, not read
     weight: float | None = None  # N; None: the file does not say it
-    loads: dict[str, Load] = field(default_factory=dict)  # what the MJCF lacks, by the body that carries it
+    loads: dict[str, Payload] = field(default_factory=dict)  # what the MJCF lacks, by the body that carries it
     # Settings of its gait: a name in configs/policies/, or a .yaml file beside the robot's; empty: none of its own.
     gait: str = ""
     folder: str = ""  # of its networks and its gait; absolute once loaded
@@ -319,7 +319,7 @@ def geared(servo: Servo, gear: float) -> Servo:
 
 
 def load_servo(name: str) -> Servo:
-    """Load a servo model by name, checked. Raises ConfigError naming file, line and key."""
+    """Payload a servo model by name, checked. Raises ConfigError naming file, line and key."""
     servo, marks = load_marked(resolve("servos", name), Servo)
     check_servo(servo, marks)
     return servo
@@ -333,7 +333,7 @@ def save_servo(servo: Servo, path: Path, head: str = "") -> None:
 
 
 def load_robot(name: str | Path = "op3") -> Robot:
-    """Load a robot by name or file, with what its MJCF says, checked. Raises ConfigError naming file, line and key."""
+    """Payload a robot by name or file, with what its MJCF says, checked. Raises ConfigError naming file, line and key."""
     path = resolve("robots", name)
     robot, marks = load_marked(path, Robot)
     check_robot(robot, marks)

@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError, nearest
-from servoid.hw.robot.description import Load, Robot
+from servoid.hw.robot.description import Payload, Robot
 from servoid.tools.bringup.line import add_line_arguments, assembled, is_virtual
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, reporting
 from servoid.tools.identify.figures import MODELS
 
 if TYPE_CHECKING:
-    from servoid.tools.identify.excitation import Motion
+    from servoid.tools.identify.excitation import Exercise
 
 _GAINS = (1.0, 0.5)
 _AMPLITUDES = (0.05, 0.6)  # rad
@@ -97,13 +97,13 @@ def _checked(args: argparse.Namespace, report: Report) -> tuple[Robot, list[Sequ
     return replace(robot, loads=loads), groups
 
 
-def _load(text: str) -> tuple[str, Load]:
+def _load(text: str) -> tuple[str, Payload]:
     body, _, rest = text.partition("=")
     mass, _, at = rest.partition("@")
     try:
         place = [float(part) for part in at.split(",")] if at else [0.0, 0.0, 0.0]
         x, y, z = place
-        load = Load(float(mass), (x, y, z))
+        load = Payload(float(mass), (x, y, z))
     except ValueError:
         raise ConfigError(f"--load {text}: write BODY=KG or BODY=KG@X,Y,Z, such as l_foot=0.2@0.02,0,-0.03") from None
     if not 0.0 < load.mass < 100.0:
@@ -152,7 +152,7 @@ def _record(
     return logs
 
 
-def _announce(report: Report, robot: Robot, motions: Sequence[Motion], args: argparse.Namespace) -> None:
+def _announce(report: Report, robot: Robot, motions: Sequence[Exercise], args: argparse.Namespace) -> None:
     seconds = len(_GAINS) * sum(len(motion.goals) for motion in motions) * robot.dt
     moving = ", ".join(args.joints) if args.joints else f"all {len(robot.joints)} joints"
     how = "one after the other" if args.one_by_one else "at once"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
 from servoid.hw.config import ConfigError
@@ -26,14 +25,14 @@ _SEED = 17
 
 
 @dataclass(frozen=True)
-class Motion:
+class Exercise:
     """A motion of some joints: goals `(ticks, n_joints)` rad that begin and end in the middle pose."""
 
     name: str
     goals: Array
 
 
-def plan(robot: Robot, groups: Sequence[Sequence[str]], amplitude: float = AMPLITUDE) -> list[Motion]:
+def plan(robot: Robot, groups: Sequence[Sequence[str]], amplitude: float = AMPLITUDE) -> list[Exercise]:
     """The motions of each group of joints, one group after the other, while the others hold still.
 
     The middle pose is the home pose, inside the ranges; mirrored joints move as in walking, so that legs keep apart
@@ -61,7 +60,7 @@ def middle_pose(robot: Robot) -> Array:
     return np.clip(robot.home, robot.lower + margin, robot.upper - margin)
 
 
-def _motions(robot: Robot, middle: Array, room: Array, group: Sequence[str]) -> list[Motion]:
+def _motions(robot: Robot, middle: Array, room: Array, group: Sequence[str]) -> list[Exercise]:
     rng, n = np.random.default_rng(_SEED), len(robot.joints)
     moving = np.array([name in group for name in robot.names])
     index, sign = robot.mirror
@@ -72,8 +71,8 @@ def _motions(robot: Robot, middle: Array, room: Array, group: Sequence[str]) -> 
     reach, dt, fast = room * moving, robot.dt, _SPEED_SHARE * robot.limits.joint_speed
     rest = np.zeros((round(_REST / dt), n))
 
-    def motion(name: str, shape: Array) -> Motion:
-        return Motion(name, middle + way * np.concatenate([rest, shape, rest]))
+    def motion(name: str, shape: Array) -> Exercise:
+        return Exercise(name, middle + way * np.concatenate([rest, shape, rest]))
 
     steps = np.repeat(np.array(_STEPS)[:, None] * reach, round(_STEP_SECONDS / dt), 0)
     quarter = max(round(_RAMP_SHARE * float(reach.max()) / _RAMP_SPEED / dt), 1)
@@ -97,8 +96,10 @@ def _motions(robot: Robot, middle: Array, room: Array, group: Sequence[str]) -> 
     ]
 
 
-def _touch(robot: Robot, middle: Array, motions: Sequence[Motion]) -> str | None:
+def _touch(robot: Robot, middle: Array, motions: Sequence[Exercise]) -> str | None:
     """The first two bodies that touch in a motion and do not in the middle pose; None where none do."""
+    import mujoco
+
     model = hanging_model(robot, collide=True)
     data = mujoco.MjData(model)
     joints = np.array([int(model.joint(name).qposadr[0]) for name in robot.names])

@@ -50,7 +50,7 @@ _STRIBECK, _FADES, _LOAD, _OHMS = 0.3, 0.15, 0.1, 0.04  # of the friction; rad/s
 
 
 @dataclass(frozen=True)
-class Figure:
+class ServoFigure:
     """One number that is fitted: `servo` is its servo's name, empty for the supply."""
 
     servo: str
@@ -84,10 +84,10 @@ class Figures:
             if joint.name in moved:
                 self.servos[servo.name] = servo
         self.all = [
-            Figure(servo.name, name, start)
+            ServoFigure(servo.name, name, start)
             for servo in self.servos.values()
             for name, start in _starts(servo, MODELS[model]).items()
-        ] + [Figure("", SUPPLY, robot.bus.supply_resistance or _OHMS)]
+        ] + [ServoFigure("", SUPPLY, robot.bus.supply_resistance or _OHMS)]
 
     def values(self, point: Array) -> dict[tuple[str, str], float]:
         """Every figure at a point, by servo and name."""

@@ -11,7 +11,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot, Servo
 from servoid.tools.identify.excitation import HELD_OUT
-from servoid.tools.identify.figures import MODELS, Figure, Figures
+from servoid.tools.identify.figures import MODELS, Figures, ServoFigure
 from servoid.tools.identify.recording import Piece
 from servoid.tools.identify.rehearsal import Candidate, Rehearsal
 
@@ -29,10 +29,10 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Found:
+class Estimate:
     """A figure, how far it may be off (a share of it), and whether the data determine it."""
 
-    figure: Figure
+    figure: ServoFigure
     value: float
     spread: float
 
@@ -48,7 +48,7 @@ class Fit:
     model: str
     figures: Figures
     point: Array
-    found: tuple[Found, ...]
+    found: tuple[Estimate, ...]
     error: float  # on the motions that it was fitted on
     held_out: float  # on the others
 
@@ -151,7 +151,7 @@ class _Trial:
         moved = self._residuals([point + _STEP * step for step in np.eye(self._n)])
         return np.stack([(error - errors) / _STEP for error in moved], -1)
 
-    def _spread(self, point: Array, slopes: Array, errors: Array) -> tuple[Found, ...]:
+    def _spread(self, point: Array, slopes: Array, errors: Array) -> tuple[Estimate, ...]:
         """How far each figure may be off, by the curvature of the fit and by what single seconds of single joints say:
         H^-1 (sum g g' + P) H^-1, g being the slope of the cost in a block and P what was known before."""
         weight = 1.0 / (_NOISE**2 * _ALIKE)
@@ -169,7 +169,7 @@ class _Trial:
         deviation = np.sqrt(np.diag(inverse @ (blocks.T @ blocks + np.eye(self._n)) @ inverse))
         values = self.figures.values(point)
         return tuple(
-            Found(f, values[f.servo, f.name], f.relative(float(d), values[f.servo, f.name]))
+            Estimate(f, values[f.servo, f.name], f.relative(float(d), values[f.servo, f.name]))
             for f, d in zip(self.figures.all, deviation, strict=True)
         )
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
-from servoid.hw.robot.description import Load, Robot
+from servoid.hw.robot.description import Payload, Robot
 from servoid.stack.log.flightlog import FlightLog, read_log
 
 PIECE, END = "piece", "end"  # kind of the events that a motion begins with, and the text of the one it ends with
@@ -63,7 +63,7 @@ def _pieces(log: FlightLog, robot: Robot) -> list[Piece]:
     if not marks or not len(ticks):
         return []
     hung = log.header["robot"].get("loads", {})
-    loads = {body: Load(load["mass"], tuple(load["at"])) for body, load in hung.items()}
+    loads = {body: Payload(load["mass"], tuple(load["at"])) for body, load in hung.items()}
     held = replace(robot, loads=loads)
     position, goal = log.column("/observation", "position"), log.column("/command", "position")
     gain = log.column("/command", "gain")

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from mujoco.batch import Batch
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot, Servo
 from servoid.sim.friction import friction
 from servoid.sim.model import TIMESTEP
-from servoid.tools.identify.hanging import hanging_model
+from servoid.tools.identify.hanging import BASE, HELD, hanging_model
 from servoid.tools.identify.recording import Piece
 
 _R, _K, _KP, _KD, _VMAX = 0, 1, 4, 6, 7  # indices in a dcmotor's gainprm, as in sim/model.py
@@ -48,6 +47,8 @@ class Rehearsal:
         return [found[i] for i in range(len(self.pieces))]
 
     def _run(self, pieces: Sequence[Piece], candidates: Sequence[Candidate]) -> list[Array]:
+        from mujoco.batch import Batch
+
         model = hanging_model(pieces[0].robot)
         model.opt.gravity[:] = pieces[0].gravity
         n, m, nj, sub = len(candidates), len(pieces), len(self.robot.joints), self._substeps
@@ -69,7 +70,10 @@ class Rehearsal:
         bounds = batch.expand("actuator_forcerange")
         bounds[:, :, 0], bounds[:, :, 1] = -limit, limit
         batch.expand("dof_damping")[:, dofs] = _padded(servos("damping"), batch.expand("dof_damping")[:, dofs])
-        batch.expand("dof_armature")[:, dofs] = servos("armature")
+        armature = batch.expand("dof_armature")
+        armature[:, dofs] = servos("armature")
+        batch.set_const(np.arange(n * m))
+        armature[:, BASE] = HELD
         loss = batch.expand("dof_frictionloss")
         laws = [servos(name) for name in ("friction", "stribeck_friction", "stribeck_speed", "load_friction")]
         loss[:, dofs] = laws[0]
@@ -82,19 +86,20 @@ class Rehearsal:
         wanted = _delayed(goal[np.tile(np.arange(m), n)], servos("command_delay"), self.robot.dt, sub)
         stiffness, ampere = servos("stiffness") / volts, servos("torque_per_ampere")
 
-        qpos[:, dofs] = np.tile(np.stack([piece.measured[0] for piece in pieces]), (n, 1))
+        joints = np.array([int(model.joint(name).qposadr[0]) for name in self.robot.names])
+        qpos[:, joints] = np.tile(np.stack([piece.measured[0] for piece in pieces]), (n, 1))
         went = np.empty((n * m, ticks * sub + 1, nj))
-        went[:, 0] = qpos[:, dofs]
+        went[:, 0] = qpos[:, joints]
         supply = rest.copy()
         for step in range(ticks * sub):
-            error = wanted[:, step] - qpos[:, dofs]
+            error = wanted[:, step] - qpos[:, joints]
             kp = stiffness * supply * factor[:, step // sub]
             gain[:, :, _KP], gain[:, :, _VMAX] = kp, supply
             control[:] = wanted[:, step]
             if varies:
                 loss[:, dofs] = friction(laws[0], laws[1], laws[2], laws[3], qvel[:, dofs], force)
             batch.step()
-            went[:, step + 1] = qpos[:, dofs]
+            went[:, step + 1] = qpos[:, joints]
             duty = np.clip(kp * r / k * error / supply, -1.0, 1.0)
             drawn = np.maximum(duty * force / ampere, 0.0).sum(-1, keepdims=True)
             supply = np.maximum(rest - resistance * drawn, 0.3 * rest)
@@ -102,8 +107,8 @@ class Rehearsal:
         # A tick reads what the encoders said a latency ago.
         at = np.clip(np.arange(ticks)[:, None] * sub - servos("position_latency")[0] / TIMESTEP, 0.0, None)
         before = np.floor(at + _TINY).astype(int)
-        share, joints = at - before, np.arange(nj)
-        seen = went[:, before, joints] * (1 - share) + went[:, before + (share > _TINY), joints] * share
+        share, each = at - before, np.arange(nj)
+        seen = went[:, before, each] * (1 - share) + went[:, before + (share > _TINY), each] * share
         seen = seen.reshape(n, m, ticks, nj)
         return [seen[:, i, : len(piece.goal)] for i, piece in enumerate(pieces)]
 

@@ -26,7 +26,7 @@ from servoid.stack.runtime.interrupt import Interrupt, Stops
 from servoid.stack.runtime.loop import ControlledRobot, Loop
 from servoid.stack.safety.guard import Guard, Phase
 from servoid.stack.safety.min_jerk import MIN_JERK_PEAK, MinJerk
-from servoid.tools.identify.excitation import Motion, middle_pose
+from servoid.tools.identify.excitation import Exercise, middle_pose
 from servoid.tools.identify.recording import END, PIECE
 
 _WAIT_SECONDS = 1.0  # for a first sample of everything
@@ -35,7 +35,7 @@ _SLOW_READS = 0.5  # s of torque before anything moves, so that temperatures and
 
 
 @dataclass(frozen=True)
-class Recorded:
+class Session:
     """How a recording ended: `cause` is the guard's, "task" where it came to its end."""
 
     log: Path
@@ -46,7 +46,7 @@ class Recorded:
 class Excitation:
     """Supervises a recording: torque on where each joint is, slowly to the middle pose, then motion after motion."""
 
-    def __init__(self, robot: Robot, guard: Guard, motions: Sequence[Motion]) -> None:
+    def __init__(self, robot: Robot, guard: Guard, motions: Sequence[Exercise]) -> None:
         self._robot, self._guard = robot, guard
         self._goals = np.concatenate([motion.goals for motion in motions])
         lengths = [len(motion.goals) for motion in motions]
@@ -99,10 +99,10 @@ def record(
     body: Backend,
     handles: tuple[Sensors, Motors],
     robot: Robot,
-    motions: Sequence[Motion],
+    motions: Sequence[Exercise],
     gain: float,
     log: Path,
-) -> Recorded:
+) -> Session:
     """Do motions at a gain on a connected robot, and record them. However it ends, the robot is off then.
 
     Raises ConfigError where the log cannot be written, BackendError where the robot cannot be reached: the log is kept.
@@ -127,7 +127,7 @@ def record(
         recorder.events(last)
         outcome["outcome"] = guard.cause or "task"
     texts = tuple(event.text for event in events if event.kind not in ("phase", "task", PIECE))
-    return Recorded(log, guard.cause, texts)
+    return Session(log, guard.cause, texts)
 
 
 def _header(robot: Robot, body: str, gain: float) -> dict[str, Any]:
