@@ -319,7 +319,7 @@ def geared(servo: Servo, gear: float) -> Servo:
 
 
 def load_servo(name: str) -> Servo:
-    """Payload a servo model by name, checked. Raises ConfigError naming file, line and key."""
+    """Load a servo model by name, checked. Raises ConfigError naming file, line and key."""
     servo, marks = load_marked(resolve("servos", name), Servo)
     check_servo(servo, marks)
     return servo
@@ -333,7 +333,7 @@ def save_servo(servo: Servo, path: Path, head: str = "") -> None:
 
 
 def load_robot(name: str | Path = "op3") -> Robot:
-    """Payload a robot by name or file, with what its MJCF says, checked. Raises ConfigError naming file, line and key."""
+    """Load a robot by name or file, with what its MJCF says, checked. Raises ConfigError naming file, line and key."""
     path = resolve("robots", name)
     robot, marks = load_marked(path, Robot)
     check_robot(robot, marks)

@@ -35,7 +35,7 @@ _SLOW_READS = 0.5  # s of torque before anything moves, so that temperatures and
 
 
 @dataclass(frozen=True)
-class Session:
+class GantryRun:
     """How a recording ended: `cause` is the guard's, "task" where it came to its end."""
 
     log: Path
@@ -102,7 +102,7 @@ def record(
     motions: Sequence[Exercise],
     gain: float,
     log: Path,
-) -> Session:
+) -> GantryRun:
     """Do motions at a gain on a connected robot, and record them. However it ends, the robot is off then.
 
     Raises ConfigError where the log cannot be written, BackendError where the robot cannot be reached: the log is kept.
@@ -127,7 +127,7 @@ def record(
         recorder.events(last)
         outcome["outcome"] = guard.cause or "task"
     texts = tuple(event.text for event in events if event.kind not in ("phase", "task", PIECE))
-    return Session(log, guard.cause, texts)
+    return GantryRun(log, guard.cause, texts)
 
 
 def _header(robot: Robot, body: str, gain: float) -> dict[str, Any]:
