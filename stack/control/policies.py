@@ -153,6 +153,19 @@ def make_policy(
     return _maker(name)(name, robot, task, realtime, shape)
 
 
+def skills_known(name: str, robot: Robot, planner: DiffusionSettings | None = None) -> tuple[str, ...]:
+    """Names of the skills that a policy performs by itself, when it is told them: those that its network learned.
+
+    `planner` are settings as in `make_policy`. Raises ConfigError.
+    """
+    from servoid.policy.checkpoint import read_header, resolve
+
+    if planner is None and _maker(name) is not _diffusion:
+        return ()
+    settings = planner or _planner(name)
+    return tuple(read_header(resolve(settings.checkpoint, robot)).get("skills", {}))
+
+
 def policy_fingerprint(name: str, robot: Robot | None = None) -> dict[str, Any]:
     """Name of a policy and what it is made of, for the flight log: its checkpoint and that of odometry by their hashes,
     settings of the planner, of a closed loop with its tracker or of the robot's gait, and the file of a user's own.

@@ -71,6 +71,11 @@ class Skill:
         """Whether the robot is lower than one that stands, somewhere on the way."""
         return self.contacts != ("feet",) or not self.entry == self.end == UPRIGHT
 
+    @property
+    def alone(self) -> bool:
+        """Whether it takes nothing but the ground: no seat, say."""
+        return self.entry in POSES and self.end in POSES
+
 
 def load_skills(robot: Robot, folder: Path = CONFIGS / "skills") -> dict[str, Skill]:
     """The skills of a folder, by name.
