@@ -63,7 +63,7 @@ def main(args: argparse.Namespace) -> int:
         if args.file.suffix == ".bin":
             clips = make_clips(args.file, recipe, robot)
         elif args.file.is_dir():
-            from servoid.tools.motions.episodes import clip_of_episode
+            from servoid.tools.motions.verbs.episodes import clip_of_episode
 
             wanted = recipe.clips[0]
             source = f"dataset {args.file.resolve().name}, episode {args.episode or 0}"
