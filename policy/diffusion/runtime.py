@@ -33,6 +33,7 @@ from servoid.policy.features import joints_seen, raw_layout, to_raw, to_tokens
 from servoid.policy.text.captions import MOTIONS, caption, motion_of
 from servoid.policy.text.encoder import load_encoder
 from servoid.policy.text.nearest_phrase import Phrasebook
+from servoid.policy.text.told import clock_code
 from servoid.policy.trajectory import Trajectory, by_tokens, sloped
 
 # (trajectory, instruction) -> cost (batch,), as tasks define it
@@ -79,6 +80,8 @@ class Runtime:
         self._used = used[0][:, None], used[1][:, None]  # state and action tokens
         self._state_mask = torch.from_numpy((config.state_ticks <= 0) & used[0])
         self._action_ticks = torch.arange(len(config.action_ticks))
+        # Phrasings of skills are told as they are; who tells them has chosen one that the model knows.
+        self._skills = {text for texts in model.header.get("skills", {}).values() for text in texts}
 
     def plan(self, request: PlanRequest) -> Plan:
         """The plan of one robot's request, or of many at once. Raises ValueError when it does not fit, and Diverged."""
@@ -246,16 +249,23 @@ class Runtime:
         if self._encoder is None or instruction.text == "":
             return None
         velocity = instruction.velocity
-        if instruction.text is not None:
+        if instruction.texts is not None:
+            sentences = list(instruction.texts)
+        elif instruction.text is not None:
             sentences = [instruction.text] * batch
         elif velocity.ndim == 1:
             sentences = [self._caption(*velocity.tolist())] * batch
         else:
             sentences = [MOTIONS[i].phrasings[0] for i in motion_of(velocity, self._top)]
         for sentence in set(sentences) - self._read.keys():
-            phrasing = self._phrasebook.familiar(sentence) if self._phrasebook else sentence
+            book = None if sentence in self._skills else self._phrasebook
+            phrasing = book.familiar(sentence) if book else sentence
             self._read[sentence] = torch.from_numpy(self._encoder.encode([phrasing])[0])
-        return torch.stack([self._read[sentence] for sentence in sentences])
+        codes = torch.stack([self._read[sentence] for sentence in sentences])
+        if not (waves := self.model.config.clock):
+            return codes
+        since = np.zeros(batch) if instruction.since is None else np.broadcast_to(instruction.since, batch)
+        return torch.cat([codes, torch.from_numpy(clock_code(since, waves))], 1)
 
     def _guidance(self, instruction: Instruction) -> Guidance | None:
         if (cost := self.cost) is None:
