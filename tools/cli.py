@@ -120,6 +120,7 @@ VERBS: dict[str, Verb] = {
     "view": Verb("look at a recorded run in the browser", "servoid.tools.web.view"),
     "replay": Verb("repeat a recorded run and compare", "servoid.tools.commands.replay"),
     "export": Verb("write a recorded run as CSV or Parquet", "servoid.tools.commands.export"),
+    "onnx": Verb("write a diffusion policy for ONNX Runtime alone", "servoid.tools.commands.onnx_policy"),
     "plot": Verb("draw a recorded run", "servoid.tools.commands.plot"),
     "completion": Verb("print what completes commands in a shell", "servoid.tools.completion"),
 }
