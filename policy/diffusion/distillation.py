@@ -67,16 +67,15 @@ def distilled_losses(
     """
     config, (states, actions, text) = student.config, window
     before, after = draw_step(config, len(states), steps, generator, objective.inference_delay)
-    middle = tuple((a + b + 1) // 2 for a, b in zip(before, after, strict=True))
-    start = tuple(add_noise(x, k, signal, generator) for x, k in zip((states, actions), before, strict=True))
+    middle = (before[0] + after[0] + 1) // 2, (before[1] + after[1] + 1) // 2
+    start = [add_noise(x, k, signal, generator) for x, k in zip((states, actions), before, strict=True)]
     text_mask = torch.rand(len(states), generator=generator) >= UNTOLD
     with torch.no_grad():
-        at, reached = before, start
+        at, reached = before, list(start)
         for then in (middle, after):
             clean = teacher(*reached, *at, text, text_mask)
-            reached = tuple(
-                stepped(noisy, x.float(), a, b, signal) for noisy, x, a, b in zip(reached, clean, at, then, strict=True)
-            )
+            moves = zip(reached, clean, at, then, strict=True)
+            reached = [stepped(noisy, x.float(), a, b, signal) for noisy, x, a, b in moves]
             at = then
     wanted = [target(*parts, signal) for parts in zip(start, reached, before, after, strict=True)]
     predicted = student(*start, *before, text, text_mask)
