@@ -386,21 +386,3 @@ def test_the_log_of_a_resumed_run_drops_what_was_logged_beyond_its_checkpoint(tm
         with pytest.raises(KeyError, match="no column 'speed'"):
             logger.log(4, {"speed": 1.0})
     np.testing.assert_equal(len(Logger(tmp_path, ("loss",)).read()), 0)
-
-
-def test_a_student_begins_as_its_teacher_and_learns_from_it_alone(
-    windows: Windows, synthetic_dataset: Path, tmp_path: Path
-) -> None:
-    first = trainer(windows, tmp_path / "teacher", Measured(1.0))
-    first.learn()
-    first.ship(tmp_path / "teacher.safetensors", {"step": 1})
-    student = trainer(windows, tmp_path / "student", Measured(1.0))
-    student.teach(tmp_path / "teacher.safetensors")
-    student.start(False, tmp_path / "teacher.safetensors")
-    for name, weight in load(tmp_path / "teacher.safetensors", ROBOT).denoiser.state_dict().items():
-        torch.testing.assert_close(student.network.state_dict()[name], weight)
-    loss = student.learn()["loss"]
-    assert loss < 0.5 * first.learn()["loss"]  # what a teacher makes of two steps is hardly another thing than of one
-    wider = Windows(read_recording(synthetic_dataset, ROBOT), ROBOT, replace(CONFIG, width=32))
-    with pytest.raises(ConfigError, match="--distil takes a model of the same shape"):
-        trainer(wider, tmp_path / "wider", Measured(1.0)).teach(tmp_path / "teacher.safetensors")
