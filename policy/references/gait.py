@@ -150,7 +150,7 @@ class Gait(Reference):
         self.activity = np.clip(self.activity + rate, 0.0, 1.0)
 
     def led(self, target: Array) -> Array:
-        """Joint targets `(..., n_joints)` rad for the gait as it is now, those that turn the feet ahead by `yaw_lead`."""
+        """Joint targets `(..., n_joints)` rad for the gait as it is now, those that turn feet ahead by `yaw_lead`."""
         if not self.settings.yaw_lead:
             return target
         rate = np.clip(self.frames(_NOW).joint_velocity[..., 0, :], -_FASTEST, _FASTEST)
