@@ -17,7 +17,7 @@ from servoid.stack.tasks.stories.act import PELVIS, Act
 
 CLEAR = 0.27  # m of a thing's middle from the ways that do not lead to it, and of things from each other
 IN_FRONT = 0.06  # m of the base from a seat's front edge as it rises from it
-IN_FRONT_OF_BAG = 0.18  # m of the base from its middle as it strikes
+IN_FRONT_OF_BAG = 0.15  # m of the base from its middle as it strikes
 _BEGINNINGS, _TRIES = 300, 40
 
 
@@ -117,12 +117,13 @@ def _free(objects: Sequence[SceneObject], ways: Sequence[tuple[Array, Array, int
     places = [np.array(thing.place) for thing in objects]
     if any(np.linalg.norm(a - b) < CLEAR for i, a in enumerate(places) for b in places[:i]):
         return False
-    return all(
-        _apart(place, begin, end) >= min(CLEAR, float(np.linalg.norm(begin - place)) - 0.01)
-        for begin, end, index in ways
-        for i, place in enumerate(places)
-        if i != index
-    )
+    for number, (begin, end, index) in enumerate(ways):
+        at = ways[number - 1][2] if number else -1  # the object that it begins at
+        for i, place in enumerate(places):
+            clear = min(CLEAR, float(np.linalg.norm(begin - place)) - 0.01) if i == at else CLEAR
+            if i != index and _apart(place, begin, end) < clear:
+                return False
+    return True
 
 
 def _apart(point: Array, begin: Array, end: Array) -> float:

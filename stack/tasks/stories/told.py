@@ -39,7 +39,7 @@ class StorySettings(Settings):
     seat_depth: Annotated[float, Setting("of a seat, from front to back", "m", above=0)] = 0.2
     seat_width: Annotated[float, Setting("of a seat", "m", above=0)] = 0.3
     bag_height: Annotated[float, Setting("of a bag", "m", above=0)] = 0.36
-    bag_width: Annotated[float, Setting("of a bag", "m", above=0)] = 0.1
+    bag_width: Annotated[float, Setting("of a bag", "m", above=0)] = 0.06
     bag_mass: Annotated[float, Setting("of a bag", "kg", above=0)] = 0.1
     stale: Annotated[float, Setting("age of what is seen from which on it is not gone by", "s", above=0)] = 0.5
 
