@@ -62,6 +62,13 @@ VERBS: dict[str, Verb] = {
             "blend": Verb("join two clips", "servoid.tools.motions.verbs.blend"),
         },
     ),
+    "dataset": Verb(
+        "look at a dataset, or make one of recorded runs",
+        verbs={
+            "show": Verb("show what a dataset holds", "servoid.tools.learn.dataset.show"),
+            "add": Verb("make a dataset of recorded runs, or add to one", "servoid.tools.learn.dataset.add"),
+        },
+    ),
     "skills": Verb("list skills, or explain one", "servoid.tools.commands.skills"),
     "robot": Verb(
         "describe a robot of your own",
@@ -72,7 +79,10 @@ VERBS: dict[str, Verb] = {
     ),
     "tune": Verb(
         "search for what suits a robot best",
-        verbs={"gait": Verb("search for the steps that a robot walks best by", "servoid.tools.robots.tune_gait")},
+        verbs={
+            "gait": Verb("search for the steps that a robot walks best by", "servoid.tools.robots.tune_gait"),
+            "kick": Verb("search for a harder kick that stays on its feet", "servoid.tools.robots.tune_kick"),
+        },
     ),
     "collect": Verb("record demonstrations as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
@@ -93,6 +103,9 @@ VERBS: dict[str, Verb] = {
     "bench": Verb(
         "measure speed, and how faults are handled",
         verbs={
+            "text-to-motion": Verb(
+                "measure how well a planner's motions go with sentences", "servoid.tools.bench.text_to_motion"
+            ),
             "sim": Verb("compare the training world with raw MuJoCo", "servoid.tools.bench.sim"),
             "policy": Verb("time the diffusion policy's plans", "servoid.tools.bench.policy"),
             "loop": Verb("measure how late the control loop is", "servoid.tools.bench.loop"),

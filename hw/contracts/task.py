@@ -51,6 +51,7 @@ class Episode:
     path: Array | None = None  # (n, 2) m to walk along, in the frame that the robot starts in
     start: Start | None = None  # how a simulated body begins, one row; None: standing at home
     seated: bool = False  # the task has the robot sit on a seat: it may be low, but only its feet touch the ground
+    told: tuple[str, ...] = ()  # skills that sentences ask for: the policy must know them
     low: bool = False  # the task has the robot sit, lie or touch the ground: only its tilt tells a fall then
 
 

@@ -75,7 +75,7 @@ class TakeMaker:
         ticks, commands = self._ticks(seconds), Commands(self._robot, count)
         asked = np.zeros((ticks, count, 3))
         rngs = list(self._rng.spawn(count))
-        commands.reset(np.arange(count))
+        commands.begin(np.arange(count))
         for tick in range(self._ticks(LEAD_SECONDS), ticks):
             commands.advance(rngs)
             asked[tick] = commands.velocity

@@ -71,6 +71,7 @@ class ToldSentences:
         flat = [text for side in sides for texts in side for text in texts]
         self.texts = tuple(dict.fromkeys(flat))
         self.tokens = torch.from_numpy(encoder.tokens(flat, words))
+        self._said = [texts[0] for texts in told.values()]
         counts = np.array([len(texts) for texts in told.values()])
         first = np.cumsum([0, *counts[:-1]])
         self._count = torch.from_numpy(counts)
@@ -82,6 +83,14 @@ class ToldSentences:
         share = torch.rand(len(label), generator=generator)
         pick = self._first[mirrored.long(), known] + (share * self._count[known]).long()
         return torch.where((label == UNTOLD)[:, None, None], torch.nan, self.tokens[pick])
+
+    def first(self, label: int) -> Tensor:
+        """The first phrasing of a label `(words, size)`,"""
+        return self.tokens[self._first[0, label]]
+
+    def said(self, label: int) -> str:
+        """and its words."""
+        return self._said[label]
 
 
 class PlanWindows:
@@ -143,17 +152,40 @@ class PlanWindows:
         """Windows of takes that are not trained on, the same ones each time."""
         return self._draw(self._validation, batch, torch.Generator().manual_seed(0))
 
+    @property
+    def labels(self) -> list[int]:
+        """Labels that windows are told, both of those trained on and of those held out."""
+        return sorted(k for k in self._validation if k != UNTOLD and k in self._training)
+
+    def labelled(self, batch: int, generator: torch.Generator, *, executed: bool) -> tuple[Batch, Tensor]:
+        """A training batch that is all told, none of it mirrored, and its labels `(batch,)`; `executed`: as it was."""
+        told = torch.tensor(self.labels)
+        label = told[torch.randint(len(told), (batch,), generator=generator)]
+        return self._of(self._training, label, generator, plain=True, executed=executed), label
+
+    def held_out_of(self, label: Tensor, generator: torch.Generator) -> Batch:
+        """Windows of labels `(batch,)` that are not trained on, none of them mirrored."""
+        return self._of(self._validation, label, generator, plain=True)
+
     def _draw(self, windows: Mapping[int, Rows], batch: int, generator: torch.Generator) -> Batch:
         told = [k for k in windows if k != UNTOLD]
         label = torch.tensor(told)[torch.randint(len(told), (batch,), generator=generator)]
         if UNTOLD in windows:
             label = torch.where(torch.rand(batch, generator=generator) < self._untold, UNTOLD, label)
+        return self._of(windows, label, generator)
+
+    def _of(
+        self, windows: Mapping[int, Rows], label: Tensor, generator: torch.Generator, *,
+        plain: bool = False, executed: bool = False,
+    ) -> Batch:  # fmt: skip
+        """Windows of labels `(batch,)`; `plain`: not mirrored; `executed`: throughout."""
+        batch = len(label)
         share, new = torch.rand(2, batch, generator=generator)
         rows = torch.stack([_one(windows[int(k)], s, n) for k, s, n in zip(label, share, new, strict=True)])
-        mirrored = torch.rand(batch, generator=generator) < 0.5
+        mirrored = torch.rand(batch, generator=generator) < (0.0 if plain else 0.5)
         meanwhile = torch.randint(min(MEANWHILE, self.shape.prefix - 1) + 1, (batch,), generator=generator)
-        at, executed = rows[:, None] + self._span, self._span < self.shape.prefix - meanwhile[:, None]
-        raw = torch.where(executed[..., None], self._frames[at], self._wanted[at])
+        at, before = rows[:, None] + self._span, self._span < self.shape.prefix - meanwhile[:, None]
+        raw = torch.where((before | executed)[..., None], self._frames[at], self._wanted[at])
         raw = torch.where(mirrored[:, None, None], self.kinematics.mirror(raw), raw)
         target = drawn(self.kinematics, raw[:, self.shape.prefix :], generator)
         return Batch(self.normaliser.encode(raw), self.sentences.of(label, mirrored, generator), target)
