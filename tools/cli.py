@@ -84,6 +84,7 @@ VERBS: dict[str, Verb] = {
             "kick": Verb("search for a harder kick that stays on its feet", "servoid.tools.robots.tune_kick"),
         },
     ),
+    "identify": Verb("measure what a robot's servos are like, on a gantry", "servoid.tools.identify"),
     "collect": Verb("record demonstrations as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
         "train a network",
@@ -115,6 +116,7 @@ VERBS: dict[str, Verb] = {
             ),
             "bus": Verb("time a control cycle on the servo bus", "servoid.tools.bench.bus"),
             "clients": Verb("check other people's clients against the virtual rig", "servoid.tools.bench.clients"),
+            "identify": Verb("identify virtual rigs with hidden servos", "servoid.tools.bench.identify"),
             "faults": Verb("inject every fault while the robot walks", "servoid.tools.faults.campaign"),
             "soak": Verb("walk for minutes over a line that loses packets", "servoid.tools.faults.soak"),
             "fuzz": Verb("feed random bytes to everything that reads bytes", "servoid.tools.faults.fuzz"),
@@ -123,6 +125,7 @@ VERBS: dict[str, Verb] = {
     "view": Verb("look at a recorded run in the browser", "servoid.tools.web.view"),
     "replay": Verb("repeat a recorded run and compare", "servoid.tools.commands.replay"),
     "export": Verb("write a recorded run as CSV or Parquet", "servoid.tools.commands.export"),
+    "onnx": Verb("write a diffusion policy for ONNX Runtime alone", "servoid.tools.commands.onnx_policy"),
     "plot": Verb("draw a recorded run", "servoid.tools.commands.plot"),
     "completion": Verb("print what completes commands in a shell", "servoid.tools.completion"),
 }
