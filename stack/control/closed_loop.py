@@ -28,9 +28,9 @@ from servoid.policy.diffusion.prefix.planning import Planning, check, history_ti
 from servoid.policy.features import raw_row
 from servoid.policy.references.plan import PlanReference, row_layout
 from servoid.stack.control.base import BasePolicy
-from servoid.stack.control.followers import Followers
 from servoid.stack.control.planning.plan_buffer import History, Pace, PlanBuffer
 from servoid.stack.control.planning.planner import Answer, InlinePlanner, Planner, ProcessPlanner
+from servoid.stack.control.tracker import Followers
 
 if TYPE_CHECKING:
     from servoid.policy.diffusion.prefix.runtime import PlannerRuntime

@@ -37,18 +37,18 @@ class Things:
 
 
 @dataclass(frozen=True)
-class Layout:
+class StoryLayout:
     objects: tuple[SceneObject, ...]
     things: tuple[int, ...]  # of each act: the number of its object, or -1
     points: Array  # (acts, 3) m: that of each act, NaN where it is about an object
 
 
-def laid_out(acts: Sequence[Act], what: Things, rng: np.random.Generator) -> Layout:
+def laid_out(acts: Sequence[Act], what: Things, rng: np.random.Generator) -> StoryLayout:
     """Draw where things are, in the frame that the robot starts in. Raises ConfigError where they find no room."""
     for _ in range(_BEGINNINGS):
         drawing = _Drawing(what, rng)
         if all(drawing.add(act) for act in acts):
-            return Layout(tuple(drawing.objects), tuple(drawing.things), np.array(drawing.points))
+            return StoryLayout(tuple(drawing.objects), tuple(drawing.things), np.array(drawing.points))
     raise ConfigError(f"no room for the things of {len(acts)} acts: plan fewer, or nearer or farther ones")
 
 

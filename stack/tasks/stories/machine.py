@@ -22,7 +22,7 @@ from servoid.stack.skills.skill import Skill
 from servoid.stack.tasks.base import BaseBehaviour
 from servoid.stack.tasks.stories.act import Act
 from servoid.stack.tasks.stories.condition import REST_SECONDS, Conditions, Moment, held_ticks, rests
-from servoid.stack.tasks.stories.told import StorySettings, Told
+from servoid.stack.tasks.stories.told import StoryEpisode, StorySettings
 
 AGAIN_SECONDS = 2.0  # after a skill that did not do it, before another try
 STAGE = 0.04  # m from there that will do
@@ -35,7 +35,12 @@ class Machine(BaseBehaviour):
     """The state machine of one story."""
 
     def __init__(
-        self, episode: Told, settings: StorySettings, conditions: Conditions, skills: Mapping[str, Skill], dt: float
+        self,
+        episode: StoryEpisode,
+        settings: StorySettings,
+        conditions: Conditions,
+        skills: Mapping[str, Skill],
+        dt: float,
     ) -> None:
         super().__init__(episode)
         self._settings, self._conditions, self._skills, self._dt = settings, conditions, skills, dt

@@ -18,7 +18,7 @@ from servoid.stack.tasks.stories.act import Act, drawn, load_acts
 from servoid.stack.tasks.stories.condition import Conditions, first, held_ticks, moments
 from servoid.stack.tasks.stories.layout import laid_out
 from servoid.stack.tasks.stories.machine import Machine
-from servoid.stack.tasks.stories.told import StorySettings, Told
+from servoid.stack.tasks.stories.told import StoryEpisode, StorySettings
 
 HIP = 0.85  # of the base's height at home: a seat above that is higher than the hip
 ARM = 1.25  # of it: no hand reaches higher than that
@@ -63,19 +63,19 @@ class Story(BaseTask):
             found.append(drawn(name, found[-1] if found else None, self.acts, rng))
         return tuple(found)
 
-    def scenario(self, rng: np.random.Generator) -> Told:
+    def scenario(self, rng: np.random.Generator) -> StoryEpisode:
         acts = self._drawn(rng)
         layout = laid_out(acts, self.settings.things, rng)
         scene = Scene(np.zeros((0, 3)), np.zeros((0, 4)), objects=layout.objects)
         sits = any(act.done.seated for act in acts)
-        return Told(
+        return StoryEpisode(
             scene if layout.objects else None, acts=acts, things=layout.things, points=layout.points, seated=sits
         )
 
-    def behaviour(self, episode: Told) -> BaseBehaviour:
+    def behaviour(self, episode: StoryEpisode) -> BaseBehaviour:
         return Machine(episode, self.settings, self.conditions, self.skills, self.dt)
 
-    def criteria(self, trace: Trace, episode: Told) -> list[Criterion]:
+    def criteria(self, trace: Trace, episode: StoryEpisode) -> list[Criterion]:
         """Never fallen, and all acts done."""
         done = self.done_at(trace, episode)
         missed = next((act.name for act, at in zip(episode.acts, done, strict=True) if at is None), "")
@@ -84,7 +84,7 @@ class Story(BaseTask):
             Criterion(f"acts done{f', but not {missed!r}' if missed else ''}", _count(done), least=len(episode.acts)),
         ]
 
-    def metrics(self, trace: Trace, episode: Told) -> dict[str, float]:
+    def metrics(self, trace: Trace, episode: StoryEpisode) -> dict[str, float]:
         done = self.done_at(trace, episode)
         found = {"acts_done": float(_count(done)), "acts_share": _count(done) / len(episode.acts)}
         if episode.acts[-1].sits and _count(done) >= len(done) - 1:
@@ -93,7 +93,7 @@ class Story(BaseTask):
             found["seconds_to_done"] = (done[-1] + 1) * trace.dt
         return found
 
-    def done_at(self, trace: Trace, episode: Told) -> list[int | None]:
+    def done_at(self, trace: Trace, episode: StoryEpisode) -> list[int | None]:
         """The tick at which each act was done, in their order; None from the first one on that was not."""
         found: list[int | None] = []
         begin = 0
@@ -110,7 +110,7 @@ class Story(BaseTask):
             begin = len(trace.yaw) if at is None else at + 1
         return found
 
-    def _thing(self, trace: Trace, episode: Told, number: int) -> Array:
+    def _thing(self, trace: Trace, episode: StoryEpisode, number: int) -> Array:
         index = episode.things[number]
         if index >= 0:
             lost = np.full((len(trace.yaw), 7), np.nan)

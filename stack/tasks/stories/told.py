@@ -53,7 +53,7 @@ class StorySettings(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Told(Episode):
+class StoryEpisode(Episode):
     acts: tuple[Act, ...]
     things: tuple[int, ...]  # of each act: the number of its object in the scene, -1: a point
     points: Array  # (acts, 3) m in the frame that the robot starts in

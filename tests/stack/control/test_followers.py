@@ -8,8 +8,7 @@ from servoid.hw.robot.description import load_robot
 from servoid.policy.references.gait import Gait
 from servoid.policy.references.plan import PlanReference, row_layout
 from servoid.stack.control.fleet import Fleet
-from servoid.stack.control.followers import OVER_SECONDS, Followers, walks
-from servoid.stack.control.tracker import Tracker
+from servoid.stack.control.tracker import OVER_SECONDS, Followers, Tracker, walks
 
 ROBOT = load_robot("op3")
 

@@ -19,14 +19,14 @@ from servoid.stack.tasks import load_task
 from servoid.stack.tasks.stories.layout import CLEAR
 from servoid.stack.tasks.stories.machine import Machine
 from servoid.stack.tasks.stories.story import Story
-from servoid.stack.tasks.stories.told import Told
+from servoid.stack.tasks.stories.told import StoryEpisode
 from servoid.tools.evaluate.judge import judge
 
 ROBOT = load_robot()
 STANDING = StillEstimator(ROBOT).update(observation(ROBOT, 0, ROBOT.home), ROBOT.home)
 
 
-def _story(**chosen: str) -> tuple[Story, Told, Machine]:
+def _story(**chosen: str) -> tuple[Story, StoryEpisode, Machine]:
     task = load_task("story", chosen, ROBOT.dt, ROBOT)
     assert isinstance(task, Story)
     episode = task.scenario(np.random.default_rng(0))
@@ -35,7 +35,7 @@ def _story(**chosen: str) -> tuple[Story, Told, Machine]:
     return task, episode, behaviour
 
 
-def _poses(episode: Told) -> Array:
+def _poses(episode: StoryEpisode) -> Array:
     return np.array([
         [*thing.place, thing.height, np.cos(thing.heading / 2), 0.0, 0.0, np.sin(thing.heading / 2)]
         for thing in episode.objects

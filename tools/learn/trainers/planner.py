@@ -139,7 +139,7 @@ def executed_by(tracker: str, takes: Sequence[Take], frames: Frames, seed: int, 
     Raises CheckpointError where the tracker knows no clips.
     """
     from servoid.stack.control.fleet import Fleet
-    from servoid.stack.control.followers import Followers
+    from servoid.stack.control.tracker import Followers
     from servoid.stack.estimation.odometry import load_odometry
     from servoid.tools.learn.executed import execute
 
