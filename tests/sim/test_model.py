@@ -144,6 +144,27 @@ def test_every_body_collides(model: mujoco.MjModel) -> None:
     assert colliding == set(range(model.nbody))
 
 
+@pytest.mark.parametrize(
+    ("pose", "met"),
+    [
+        ({}, set()),
+        ({"l_hip_pitch": -1.97}, {("l_thigh", "pelvis")}),
+        ({"r_hip_pitch": 1.97}, {("r_thigh", "pelvis")}),
+    ],
+    ids=["home", "left", "right"],
+)
+def test_thighs_meet_the_trunk_where_the_ranges_end(
+    model: mujoco.MjModel, pose: dict[str, float], met: set[tuple[str, str]]
+) -> None:
+    data, robot = mujoco.MjData(model), load_robot()
+    data.qpos[2] = 1.0  # clear of the floor
+    for name, value in zip(robot.names, robot.home, strict=True):
+        data.joint(name).qpos = pose.get(name, value)
+    mujoco.mj_forward(model, data)
+    meeting = {tuple(sorted(model.geom(int(g)).name for g in contact.geom)) for contact in data.contact}
+    assert meeting == {tuple(sorted(pair)) for pair in met}
+
+
 def test_leg_kinematics_equal_mujoco(model: mujoco.MjModel) -> None:
     robot = load_robot()
     legs, data = Legs(robot), mujoco.MjData(model)
