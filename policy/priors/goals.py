@@ -66,7 +66,7 @@ def _ball(instruction: Instruction, walking: Walking) -> Array:
     return np.concatenate([nearest[..., :2], nearest[..., 3:5] / walking.forward], -1)
 
 
-def _nothing(instruction: Instruction, walking: Walking) -> Array:
+def nothing(instruction: Instruction, walking: Walking) -> Array:
     """No numbers `(..., 0)`: what is asked is always the same."""
     return np.zeros((*np.shape(instruction.velocity)[:-1], 0))
 
@@ -78,6 +78,6 @@ GOALS: Mapping[str, SeenGoal] = {
         SeenGoal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering),
         SeenGoal("location", 2, Mirror.PLANAR, _location),
         SeenGoal("ball", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _ball),
-        SeenGoal("stand", 0, Mirror(np.zeros(0, int), np.zeros(0, np.float32)), _nothing, odometry=False),
+        SeenGoal("stand", 0, Mirror(np.zeros(0, int), np.zeros(0, np.float32)), nothing, odometry=False),
     )
 }

@@ -11,6 +11,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import Robot
 from servoid.policy.motion.library import Library
+from servoid.policy.rising import CLIPS
 from servoid.tools.learn.envs.starts import States, along, falling, lying
 
 KINDS = ("lying on the front", "lying on the back", "falling", "along a clip")
@@ -19,7 +20,6 @@ _ROLLOUTS = 16  # of each clip
 _FALLING = 0.3  # of those that are eased: they begin while the robot falls
 _LEARNED = 0.02  # of a kind's success, from one episode
 _ALWAYS = 0.3  # weight of what never fails, beside 1 of what always does
-CLIPS = ("get-up-front", "get-up-back")
 
 
 class Down:
@@ -45,6 +45,7 @@ class Down:
         self._first = np.cumsum([0, *(len(part.joints) for part in self._parts)])
         self._chances = np.full(len(KINDS), 0.5)  # of failure
         self._kind = np.zeros(0, int)
+        self.clip, self.time = np.zeros(0, int), np.zeros(0)  # that worlds were drawn along, -1: none; ticks into it
         self._progress = 0.0
 
     @property
@@ -76,6 +77,7 @@ class Down:
             self._kind[i] = kind
             rows[i] = rngs[i].integers(self._first[kind], self._first[kind + 1])
         picked = self.states.only(rows)
+        self.clip, self.time = picked.clip, picked.time
         return Start(
             joints=np.clip(picked.joints, self.robot.lower, self.robot.upper),
             position=picked.position,

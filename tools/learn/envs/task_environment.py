@@ -69,21 +69,23 @@ class TaskEnvironment:
         self.task, self.score, self.starts, self.settings, self.robot, self.n = task, score, starts, s, robot, n
         self.down = task.begins(s.eased, seed)
         self.fleet = Fleet(robot, n, odometry if task.seen.odometry else None, randomise=s.randomised, seed=seed)
-        self.observation = TaskObservation(robot, task.seen, (n,))
+        self.lead = task.lead(n)
+        self.observation = TaskObservation(robot, task.seen if self.lead is None else self.lead.goal, (n,))
         self.stride, self.reach = score.stride, score.reach
         self.dt = self.stride * robot.dt  # s between decisions
         joints, feet = Mirror.joints(robot), Mirror.feet(robot)
         extra = Mirror.VECTOR, feet, Mirror.PLANAR, Mirror.SCALAR, Mirror.SCALAR, Mirror.VECTOR
-        self.mirrors = {"action": joints, "actor": self.observation.mirror}
+        action = joints if self.lead is None else Mirror.join(joints, Mirror.SCALAR)
+        self.mirrors = {"action": action, "actor": self.observation.mirror}
         self.mirrors["critic"] = Mirror.join(self.observation.mirror, *extra)
-        self.action_size = len(robot.joints)
+        self.action_size = len(action.index)
         self.reward = Terms(s.rewards, REWARDS)
         self.terms: dict[str, float] = {}
         self.ticks = np.zeros(n, int)
         self.limit = round(s.episode_seconds / self.dt)
         self.weight = robot.weight or self.fleet.worlds.weight
         self.task_reward = np.zeros(n)  # of the last decision, as are joints [rad] and velocity over the ground [m/s]
-        self.joints, self.ground = np.zeros((n, self.action_size)), np.zeros((n, 2))
+        self.joints, self.ground = np.zeros((n, len(robot.joints))), np.zeros((n, 2))
         self.asked = np.zeros((n, task.size))
         self._next = np.zeros(n, int)
         self._cycle = round(gait_of(robot).cycle / self.dt)  # over which velocity is judged
@@ -130,6 +132,8 @@ class TaskEnvironment:
         else:
             start = Start(joints=np.tile(self.robot.home, (self.n, 1)), velocity=np.zeros((self.n, 3)))
         fleet.reset(where, start)
+        if self.lead is not None and self.down is not None:
+            self.lead.begin(where, fleet.truth.gravity, self.down.clip, self.down.time)
         self.observation.reset(where)
         self.score.reset(where)
         if windows is not None:
@@ -148,7 +152,10 @@ class TaskEnvironment:
             rng = self.fleet.rngs[i]
             self.asked[i] = self.task.draw(rng, truth.position[i, :2])
             self._next[i] = self.ticks[i] + round(rng.uniform(*self.task.every) / self.dt)
-        goal = self.task.seen.observe(self.task.instruct(self.asked, state), self.robot.walking)
+        if self.lead is not None:
+            goal = self.lead.seen
+        else:
+            goal = self.task.seen.observe(self.task.instruct(self.asked, state), self.robot.walking)
         actor = self.observation(state, self.fleet.applied, goal)
         forward = self.robot.walking.forward
         known = [
@@ -193,14 +200,17 @@ class TaskEnvironment:
         The prior judges the window up to the state that the decision is made in: what this one leads to, it says next.
         """
         manner = self.score(self.fleet.state)
-        target = self.robot.home + self.reach * action
+        joints = self.reach * action[:, : len(self.robot.joints)]
         fallen, shock, blocked = np.zeros(self.n, bool), np.zeros(self.n), np.zeros(self.n)
         if self.settings.hardest_push:
             self._push()
         for tick in range(self.stride):
             if tick:
                 self._sense()
+            target = joints + (self.robot.home if self.lead is None else self.lead.target)
             self.fleet.step(target)
+            if self.lead is not None:
+                self.lead.advance(action[:, -1], self.fleet.state.gravity, self.fleet.applied)
             truth = self.fleet.truth
             fallen |= truth.fallen
             shock = np.maximum(shock, truth.shock)

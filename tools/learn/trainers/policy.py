@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from servoid.tools.learn.envs.score_term import Rival
 
 _JUDGED = 32  # worlds
+_LED_SHARE = 0.05  # of what initial weights give, where a lead knows a way already
 _SHOWN = 512  # tries to get up that are imitated
 _CLIPS = Path("clips")  # in a dataset's place
 NO_PRIOR = "none"
@@ -197,6 +198,10 @@ class PolicyTrainer(PpoTrainer):
         source = f"closed-loop experience of task {env.task.name} {self._under}{told}"
         super().__init__(env, settings, out, source)
         self.critic_alone = settings.critic_alone
+        if env.lead is not None:
+            self.begin_small(_LED_SHARE)
+        if not env.task.falls:  # no fall ends them: they would all end at once
+            env.ticks[:] = np.random.default_rng(settings.seed).integers(0, env.limit, env.n)
         nominal = replace(
             settings, randomised=0.0, generated=0.0, starts=1, unlike=0.0, hardest_push=0.0, eased=(0.0, 0.0)
         )

@@ -16,6 +16,7 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.priors.goals import GOALS, SeenGoal
 
 if TYPE_CHECKING:
+    from servoid.policy.rising import Rising
     from servoid.tools.learn.envs.down import Down
 
 
@@ -71,6 +72,10 @@ class LearnedTask(ABC):
     def achievable(self) -> bool:
         """Whether its episodes are over once it is `achieved`."""
         return math.isfinite(self.hold)
+
+    def lead(self, n: int) -> Rising | None:
+        """What leads the policy in `n` worlds: its targets are around that, not around home, and it sets its pace."""
+        return None
 
     def achieved(self, state: TaskState) -> Array:
         """Where all is done that the task is about `(n,)` bool: never, of one that goes on."""

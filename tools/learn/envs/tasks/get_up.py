@@ -6,6 +6,8 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
+from servoid.policy.motion.library import Library
+from servoid.policy.rising import CLIPS, Rising
 from servoid.stack.safety.recovery import AT_HOME, STILL_BASE, STILL_JOINTS, UPRIGHT
 from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
@@ -47,3 +49,13 @@ class GetUp(LearnedTask):
         still &= np.linalg.norm(state.angular_velocity, axis=-1) < STILL_BASE
         home = np.abs(state.joints - self.robot.home).max(-1) < AT_HOME
         return still & home & (-state.gravity[:, 2] > np.cos(UPRIGHT))
+
+
+class GetUpByClips(GetUp):
+    """The same, led by the clips that get up: it begins with what they can do, and learns to be sure and quick."""
+
+    name = "get-up-by-clips"
+
+    def lead(self, n: int) -> Rising:
+        library = Library(self.robot)
+        return Rising(self.robot, [library[name] for name in CLIPS], (n,))
