@@ -33,6 +33,7 @@ class Rising:
         """`clips`: from lying on the front, and on the back."""
         longest = max(clip.ticks for clip in clips) + _HOMING
         self._home, self._rate, self._shape = robot.home, robot.rate, shape
+        self._lower, self._upper = robot.lower + robot.limits.margin, robot.upper - robot.limits.margin
         self._last = np.array([clip.ticks - 1 + _HOMING for clip in clips])
 
         def table(arrays: list[Array]) -> Array:
@@ -71,9 +72,10 @@ class Rising:
             [self.target - self._home, np.stack([share, 2.0 * self.side - 1.0, share >= 1.0], -1)], -1
         )
 
-    def advance(self, faster: Array, gravity: Array, applied: Array) -> None:
-        """Go on by a tick as fast as an action `faster` `(...,)` asks; `applied` `(..., n_joints)` rad was sent last."""
-        behind = np.abs(applied - self.target).max(-1)
+    def advance(self, faster: Array, gravity: Array, wanted: Array, applied: Array) -> None:
+        """Go on by a tick as fast as an action `faster` `(...,)` asks, after one in which joint targets `wanted` became
+        `applied` `(..., n_joints)` rad."""
+        behind = np.abs(applied - np.clip(wanted, self._lower, self._upper)).max(-1)
         free = np.clip((_WAITS - behind) / (_WAITS - _BEHIND), 0.0, 1.0)
         rate = np.clip(RATE * np.exp(FASTER * faster), SLOWEST, FASTEST)
         self.time = np.minimum(self.time + rate * free, self._last[self.side])

@@ -210,7 +210,7 @@ class TaskEnvironment:
             target = joints + (self.robot.home if self.lead is None else self.lead.target)
             self.fleet.step(target)
             if self.lead is not None:
-                self.lead.advance(action[:, -1], self.fleet.state.gravity, self.fleet.applied)
+                self.lead.advance(action[:, -1], self.fleet.state.gravity, target, self.fleet.applied)
             truth = self.fleet.truth
             fallen |= truth.fallen
             shock = np.maximum(shock, truth.shock)
