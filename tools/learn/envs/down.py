@@ -11,7 +11,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import Robot
 from servoid.policy.motion.library import Library
-from servoid.policy.rising import CLIPS
+from servoid.policy.rising.lead import CLIPS
 from servoid.tools.learn.envs.starts import States, along, falling, lying
 
 KINDS = ("lying on the front", "lying on the back", "falling", "along a clip")

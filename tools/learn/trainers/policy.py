@@ -24,6 +24,8 @@ from servoid.hw.config import ConfigError
 from servoid.policy import checkpoint
 from servoid.policy.mlp import Mlp
 from servoid.policy.priors.task_policy import KIND, save_task_policy
+from servoid.policy.rising.policy import KIND as RISING
+from servoid.policy.rising.policy import save_rising_policy
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
 from servoid.tools.learn.envs.task_judge import measure
 from servoid.tools.learn.envs.tasks import LearnedTask, load_learned_task
@@ -38,8 +40,6 @@ if TYPE_CHECKING:
 
 _JUDGED = 32  # worlds
 _LED_SHARE = 0.05  # of what initial weights give, where a lead knows a way already
-_SHOWN = 512  # tries to get up that are imitated
-_CLIPS = Path("clips")  # in a dataset's place
 NO_PRIOR = "none"
 _LICENCE = "Apache-2.0"  # of what learns from nothing but its own experience
 _DISCRIMINATOR = "discriminator.safetensors"  # beside the policy
@@ -65,10 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     run.add_argument("--init", type=Path, metavar="CHECKPOINT", help="start from this task policy")
     run.add_argument(
-        "--demonstrations",
-        type=Path,
-        metavar="DIR|clips",
-        help="start from a network that imitates this dataset; of get-up: clips, how the tracker gets up by them",
+        "--demonstrations", type=Path, metavar="DIR", help="start from a network that imitates this dataset"
     )
     run.add_argument(
         "--measure", action="store_true", help="train nothing: measure the policy that training would begin with"
@@ -198,6 +195,7 @@ class PolicyTrainer(PpoTrainer):
         source = f"closed-loop experience of task {env.task.name} {self._under}{told}"
         super().__init__(env, settings, out, source)
         self.critic_alone = settings.critic_alone
+        self._kind = KIND if env.down is None else RISING  # of its checkpoint: what gets up acts while no task does
         if env.lead is not None:
             self.begin_small(_LED_SHARE)
         if not env.task.falls:  # no fall ends them: they would all end at once
@@ -233,7 +231,7 @@ class PolicyTrainer(PpoTrainer):
         return f"servoid rollout {self.env.task.run} --policy {self.best_path} --episodes 50"
 
     def adopt(self, path: Path) -> None:
-        network, _ = Mlp.load(path, KIND, self.env.robot, self.env.observations["actor"].shape[1])
+        network, _ = Mlp.load(path, self._kind, self.env.robot, self.env.observations["actor"].shape[1])
         hidden = list(network.sizes[1:-1])
         if hidden != list(self.settings.hidden):
             raise checkpoint.CheckpointError(
@@ -245,22 +243,16 @@ class PolicyTrainer(PpoTrainer):
         """Begin with a network that does what the dataset in `folder` shows. Raises DatasetError."""
         from servoid.policy.recording import read_recording
         from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
-        from servoid.tools.learn.envs.shown import shown
         from servoid.tools.learn.trainers.trainer import source_of
 
         env, seed = self.env, self.settings.seed
-        if env.down is not None:
-            seen, targets = shown(env.robot, env.task.seen, env.stride, env.down, _SHOWN, seed)
-            source = f"{len(seen)} decisions of the tracker that gets up by clips"
-        else:
-            recording = read_recording(folder, env.robot)
-            rng = np.random.default_rng(seed)
-            seen, targets = demonstrated(recording, env.robot, env.task.seen, env.stride, rng)
-            source = source_of(folder, recording)
+        recording = read_recording(folder, env.robot)
+        rng = np.random.default_rng(seed)
+        seen, targets = demonstrated(recording, env.robot, env.task.seen, env.stride, rng)
         actions = (targets - env.robot.home) / env.reach
         mirrors = Mirrors(env.mirrors["actor"], env.mirrors["action"])
         self.begin_with(cloned(seen, actions, mirrors, self.settings.hidden, self.settings.imitation_steps, seed))
-        self.begun_with = {"demonstrations": source}
+        self.begun_with = {"demonstrations": source_of(folder, recording)}
 
     def state(self) -> dict[str, Any]:
         return {**super().state(), "score": self.env.score.state()}
@@ -278,6 +270,7 @@ class PolicyTrainer(PpoTrainer):
             "stride": env.stride,
             "reach": [round(float(x), 6) for x in env.reach],
             "prior": self._prior,
+            "led": env.lead is not None,
             "style": self._style,
         }
         about: dict[str, Any] = {
@@ -290,4 +283,5 @@ class PolicyTrainer(PpoTrainer):
             from servoid.policy.priors.adversarial.discriminator import save_discriminator
 
             save_discriminator(path.with_name(_DISCRIMINATOR), self.rival.discriminator, env.score.prior, about)
-        save_task_policy(path, self.actor(), env.robot, config, about)
+        save = save_rising_policy if self._kind == RISING else save_task_policy
+        save(path, self.actor(), env.robot, config, about)

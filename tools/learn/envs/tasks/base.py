@@ -16,7 +16,7 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.priors.goals import GOALS, SeenGoal
 
 if TYPE_CHECKING:
-    from servoid.policy.rising import Rising
+    from servoid.policy.rising.lead import Rising
     from servoid.tools.learn.envs.down import Down
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.policy.motion.library import Library
-from servoid.policy.rising import CLIPS, Rising
+from servoid.policy.rising.lead import CLIPS, Rising
 from servoid.stack.safety.recovery import AT_HOME, STILL_BASE, STILL_JOINTS, UPRIGHT
 from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
