@@ -68,5 +68,8 @@ class RisingPolicy:
 def save_rising_policy(
     path: Path, network: Mlp, robot: Robot, config: Mapping[str, Any], about: Mapping[str, Any]
 ) -> None:
-    """Write a policy; `config` names its goal, stride and reach [rad by joint], and whether it is `led`. Raises CheckpointError."""
+    """Write a policy; `config` names its goal, stride and reach [rad by joint], and whether it is `led`.
+
+    Raises CheckpointError.
+    """
     network.save(path, checkpoint.header(KIND, robot, config=config, **about))
