@@ -7,6 +7,7 @@ side, where the robot does not lie or stand as the clip does: it rolled over, or
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,19 +19,31 @@ from servoid.policy.motion.clip import Clip
 from servoid.policy.priors.goals import SeenGoal, nothing
 
 CLIPS = ("get-up-front", "get-up-back")
-RATE, FASTER = 1.4, 0.5  # of the clip's own speed, for an action of zero; and exponent for one of one
-SLOWEST, FASTEST = 0.3, 3.0
+SLOWEST, FASTEST = 0.3, 3.0  # of a clip's own speed
 _HOMING = 20  # ticks from a clip's end to home
-_BEHIND, _WAITS = 0.3, 0.8  # rad that a joint's goal may be behind the clip until it slows down, and waits
 _ASTRAY = 1.0  # squared error of gravity, seen from the base: 60 degrees
 _PATIENCE = 0.3  # s of that until the clip begins anew
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast the lead goes. A policy that was trained with one needs it."""
+
+    rate: float = 1.4  # of a clip's own speed, for an action of zero
+    exponent: float = 1.0  # of e, by which an action of one is faster
+    behind: float = 0.6  # rad that a joint's goal may be behind what is wanted until the lead slows down,
+    waits: float = 1.4  # and until it waits
+
+
+PACE = Pace()
 
 
 class Rising:
     """Of one robot, or worlds of any leading `shape`."""
 
-    def __init__(self, robot: Robot, clips: Sequence[Clip], shape: tuple[int, ...] = ()) -> None:
+    def __init__(self, robot: Robot, clips: Sequence[Clip], shape: tuple[int, ...] = (), pace: Pace = PACE) -> None:
         """`clips`: from lying on the front, and on the back."""
+        self.pace = pace
         longest = max(clip.ticks for clip in clips) + _HOMING
         self._home, self._rate, self._shape = robot.home, robot.rate, shape
         self._lower, self._upper = robot.lower + robot.limits.margin, robot.upper - robot.limits.margin
@@ -75,9 +88,10 @@ class Rising:
     def advance(self, faster: Array, gravity: Array, wanted: Array, applied: Array) -> None:
         """Go on by a tick as fast as an action `faster` `(...,)` asks, after one in which joint targets `wanted` became
         `applied` `(..., n_joints)` rad."""
+        pace = self.pace
         behind = np.abs(applied - np.clip(wanted, self._lower, self._upper)).max(-1)
-        free = np.clip((_WAITS - behind) / (_WAITS - _BEHIND), 0.0, 1.0)
-        rate = np.clip(RATE * np.exp(FASTER * faster), SLOWEST, FASTEST)
+        free = np.clip((pace.waits - behind) / (pace.waits - pace.behind), 0.0, 1.0)
+        rate = np.clip(pace.rate * np.exp(pace.exponent * faster), SLOWEST, FASTEST)
         self.time = np.minimum(self.time + rate * free, self._last[self.side])
         off = ((gravity - self._at(self._gravity)) ** 2).sum(-1) > _ASTRAY
         self._astray = np.where(off, self._astray + 1, 0)

@@ -15,34 +15,37 @@ from servoid.policy.rising.lead import CLIPS
 from servoid.tools.learn.envs.starts import States, along, falling, lying
 
 KINDS = ("lying on the front", "lying on the back", "falling", "along a clip")
-_DROPPED, _PUSHED = 512, 128  # bodies whose states are kept
-_ROLLOUTS = 16  # of each clip
-_FALLING = 0.3  # of those that are eased: they begin while the robot falls
+_DROPPED, _PUSHED, _ROLLED_OUT = 2, 8, 64  # one body for so many starts: that is dropped, pushed, or follows a clip
+_FALLING = 0.3  # of those that do not begin lying: they begin while the robot falls
 _LEARNED = 0.02  # of a kind's success, from one episode
-_ALWAYS = 0.3  # weight of what never fails, beside 1 of what always does
+_ALWAYS = 0.3  # weight of a side that never fails, beside 1 of one that always does
 
 
 class Down:
-    """Draws the states that episodes begin in, and learns which of them are hard."""
+    """Draws the states that episodes begin in, and learns on which side it is hard."""
 
-    def __init__(self, robot: Robot, eased: tuple[float, float], seed: int) -> None:
+    def __init__(self, robot: Robot, eased: tuple[float, float], starts: int, seed: int) -> None:
         """`eased`: the share that does not begin lying, at the start of a training and from half of it on.
 
-        Drops, pushes and rolls out bodies first, which takes seconds. A robot without clips begins lying alone."""
+        Drops, pushes and rolls out bodies first, for some `starts` states, which takes seconds. Without clips of the
+        robot none begins along one. Raises ConfigError where no body comes to lie.
+        """
         self.robot, self._eased = robot, eased
-        dropped = lying(robot, _DROPPED, seed)
-        front = dropped.front
-        parts = [dropped.only(front), dropped.only(~front), falling(robot, _PUSHED, seed)]
+        dropped = lying(robot, max(starts // _DROPPED, 1), seed)
+        if not len(dropped.joints):
+            raise ConfigError(f"--starts {starts}: none of the bodies that were dropped lies still; give more")
+        parts = [dropped.only(dropped.front), dropped.only(~dropped.front)]
+        parts.append(falling(robot, max(starts // _PUSHED, 1), seed))
         try:
             library = Library(robot)
             clips = [library[name] for name in CLIPS]
         except ConfigError:
             clips = []
         if clips:
-            parts.append(along(robot, clips, _ROLLOUTS, seed))
-        self._parts = [part for part in parts if len(part.joints)]
-        self.states = States.joined(self._parts)
-        self._first = np.cumsum([0, *(len(part.joints) for part in self._parts)])
+            parts.append(along(robot, clips, max(starts // _ROLLED_OUT, 1), seed))
+        self._counts = np.array([len(part.joints) for part in parts])
+        self.states = States.joined(parts)
+        self._first = np.cumsum(self._counts) - self._counts
         self._chances = np.full(len(KINDS), 0.5)  # of failure
         self._kind = np.zeros(0, int)
         self.clip, self.time = np.zeros(0, int), np.zeros(0)  # that worlds were drawn along, -1: none; ticks into it
@@ -54,13 +57,14 @@ class Down:
         return {f"success/{kind}": 1.0 - float(chance) for kind, chance in zip(KINDS, self._chances, strict=True)}
 
     def schedule(self, progress: float) -> None:
+        """Draw as at `progress` of the training, 0 to 1."""
         self._progress = progress
 
-    def learn(self, where: Array, succeeded: Array) -> None:
-        """Episodes are over in the worlds `where` `(n,)`, and came to stand or not `(n,)`."""
+    def learn(self, where: Array, achieved: Array) -> None:
+        """Episodes are over in the worlds `where` `(n,)`, and the robot came to stand or not `(n,)`."""
         for i in np.flatnonzero(where).tolist():
             kind = self._kind[i]
-            self._chances[kind] += _LEARNED * (float(not succeeded[i]) - self._chances[kind])
+            self._chances[kind] += _LEARNED * (float(not achieved[i]) - self._chances[kind])
 
     def draw(self, rngs: Sequence[np.random.Generator], where: Array) -> Start:
         """Starts of the worlds `where` `(n,)` bool; a row for each world."""
@@ -69,13 +73,12 @@ class Down:
         eased = float(np.interp(self._progress, [0.0, 0.5], self._eased))
         hard = _ALWAYS + (1.0 - _ALWAYS) * self._chances[:2]
         shares = np.array([*(hard / hard.sum() * (1.0 - eased)), _FALLING * eased, (1.0 - _FALLING) * eased])
-        shares = np.cumsum(shares[: len(self._parts)])
-        shares /= shares[-1]
+        shares = shares[: len(self._counts)] * (self._counts > 0)
         rows = np.zeros(len(where), int)
         for i in np.flatnonzero(where).tolist():
-            kind = min(int(np.searchsorted(shares, rngs[i].random())), len(self._parts) - 1)
+            kind = int(rngs[i].choice(len(shares), p=shares / shares.sum()))
             self._kind[i] = kind
-            rows[i] = rngs[i].integers(self._first[kind], self._first[kind + 1])
+            rows[i] = self._first[kind] + rngs[i].integers(self._counts[kind])
         picked = self.states.only(rows)
         self.clip, self.time = picked.clip, picked.time
         return Start(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from servoid.tools.learn.envs.tasks import LearnedTask, TaskState
 from servoid.tools.learn.prior_settings import EpisodeSettings
 from servoid.tools.learn.terms import Terms
 
-_FULL_PUSH = 0.5  # of the training, over which pushes grow
+_FULL_PUSH, _FULL_PACE = 0.5, 0.6  # of the training, over which pushes, and the pace of a lead, grow
 _FULL, _STILL = 0.25, 0.2  # rad of error and rad/s at which a servo pushes with nearly all it has, and does not move
 _HARD = 40.0  # m/s2 of a knock that counts: four times gravity
 
@@ -67,7 +67,7 @@ class TaskEnvironment:
         """Call `reset` first. Episodes begin as the task says, or else as `starts`, or without them standing."""
         robot = task.robot
         self.task, self.score, self.starts, self.settings, self.robot, self.n = task, score, starts, s, robot, n
-        self.down = task.begins(s.eased, seed)
+        self.down = task.begins(s, seed)
         self.fleet = Fleet(robot, n, odometry if task.seen.odometry else None, randomise=s.randomised, seed=seed)
         self.lead = task.lead(n)
         self.observation = TaskObservation(robot, task.seen if self.lead is None else self.lead.goal, (n,))
@@ -108,8 +108,11 @@ class TaskEnvironment:
         return {**self.score.measures, **({} if self.down is None else self.down.measures)}
 
     def schedule(self, progress: float) -> None:
-        """The prior's reward grows sharper, pushes harder; start states are renewed now and then."""
+        """The prior's reward grows sharper, pushes harder, a lead faster; start states are renewed now and then."""
         self.score.anneal(progress)
+        if self.lead is not None:
+            rate = float(np.interp(progress, [0.0, _FULL_PACE], self.settings.lead_rate))
+            self.lead.pace = replace(self.lead.pace, rate=rate)
         if self.down is not None:
             self.down.schedule(progress)
         if self.starts is not None and int(progress * self.settings.renewals) > int(

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from servoid.policy.priors.score_matching.model import Prior, Style
     from servoid.tools.learn.envs.score_term import Rival
 
-_JUDGED = 32  # worlds
+_JUDGED, _JUDGED_STARTS = 32, 256  # worlds; states that they begin in, where a task has its own
 _LED_SHARE = 0.05  # of what initial weights give, where a lead knows a way already
 NO_PRIOR = "none"
 _LICENCE = "Apache-2.0"  # of what learns from nothing but its own experience
@@ -201,7 +201,13 @@ class PolicyTrainer(PpoTrainer):
         if not env.task.falls:  # no fall ends them: they would all end at once
             env.ticks[:] = np.random.default_rng(settings.seed).integers(0, env.limit, env.n)
         nominal = replace(
-            settings, randomised=0.0, generated=0.0, starts=1, unlike=0.0, hardest_push=0.0, eased=(0.0, 0.0)
+            settings,
+            randomised=0.0,
+            generated=0.0,
+            starts=min(settings.starts, _JUDGED_STARTS),
+            unlike=0.0,
+            hardest_push=0.0,
+            eased=(0.0, 0.0),
         )
         judged = environment(env.task, env.score.prior, style, nominal, _JUDGED, settings.seed + 1)
         self._judged = judged
@@ -215,6 +221,7 @@ class PolicyTrainer(PpoTrainer):
     def measured(self) -> dict[str, float]:
         """What the newest actor does, from standing, on the nominal robot: see `measure`."""
         actor = self.actor()
+        self._judged.schedule(self.env.progress)
         return measure(self._judged, lambda seen: actor(seen["actor"]))
 
     def learn(self) -> dict[str, float]:
@@ -270,7 +277,7 @@ class PolicyTrainer(PpoTrainer):
             "stride": env.stride,
             "reach": [round(float(x), 6) for x in env.reach],
             "prior": self._prior,
-            "led": env.lead is not None,
+            "lead": None if env.lead is None else asdict(env.lead.pace),
             "style": self._style,
         }
         about: dict[str, Any] = {

@@ -18,6 +18,7 @@ from servoid.policy.priors.goals import GOALS, SeenGoal
 if TYPE_CHECKING:
     from servoid.policy.rising.lead import Rising
     from servoid.tools.learn.envs.down import Down
+    from servoid.tools.learn.prior_settings import EpisodeSettings
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,8 @@ class LearnedTask(ABC):
     def reward(self, asked: Array, state: TaskState) -> Array:
         """How well it does what is asked `(n,)`, 0 to 1."""
 
-    def begins(self, eased: tuple[float, float], seed: int) -> Down | None:
-        """Where episodes begin, `eased` (see `EpisodeSettings`); None: as the prior has it, or without one standing."""
+    def begins(self, settings: EpisodeSettings, seed: int) -> Down | None:
+        """Where episodes begin; None: as the prior has it, or without one standing."""
         return None
 
     @property

@@ -11,6 +11,7 @@ from servoid.policy.rising.lead import CLIPS, Rising
 from servoid.stack.safety.recovery import AT_HOME, UPRIGHT
 from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
+from servoid.tools.learn.prior_settings import EpisodeSettings
 
 _LYING = 0.25  # of the standing height: where a base that lies is
 _TALL = 0.85  # of the standing height: it stands on straight legs
@@ -28,8 +29,8 @@ class GetUp(LearnedTask):
     falls = False
     hold = 1.0
 
-    def begins(self, eased: tuple[float, float], seed: int) -> Down:
-        return Down(self.robot, eased, seed)
+    def begins(self, settings: EpisodeSettings, seed: int) -> Down:
+        return Down(self.robot, settings.eased, settings.starts, seed)
 
     def draw(self, rng: np.random.Generator, position: Array) -> Array:
         return np.zeros(0)
