@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from servoid.hw.config import ConfigError
+from servoid.hw.config import YAML_LOADER, ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 
@@ -148,7 +148,7 @@ def _read(path: Path, tensors: bool) -> tuple[dict[str, Any], dict[str, Array]]:
     if text is None:
         raise CheckpointError(f"{path}: a safetensors file without the header of this project; it comes from elsewhere")
     try:
-        head = yaml.safe_load(text)
+        head = yaml.load(text, Loader=YAML_LOADER)
     except yaml.YAMLError as error:
         raise CheckpointError(f"{path}: the header is not valid YAML ({error})") from error
     missing = [key for key in REQUIRED if not isinstance(head, dict) or key not in head]

@@ -46,6 +46,7 @@ MANY = {("stack/estimation/odometry.py", "push")}  # an array for each group of 
 # Where an object is asked what it has, since it is not ours: by file, what it is asked for.
 ASKED = {
     ("hw/clock.py", "prctl"),  # the C library's: Linux alone has it
+    ("hw/config.py", "CSafeLoader"),  # PyYAML has it where it was built with libyaml
     ("hw/config.py", "__name__"),  # a type hint's
     ("hw/setting.py", "__metadata__"),  # a type hint's
     ("hw/dynamixel/transport/port.py", "errno"),  # pyserial's errors

@@ -62,6 +62,13 @@ VERBS: dict[str, Verb] = {
             "blend": Verb("join two clips", "servoid.tools.motions.verbs.blend"),
         },
     ),
+    "dataset": Verb(
+        "look at a dataset, or make one of recorded runs",
+        verbs={
+            "show": Verb("show what a dataset holds", "servoid.tools.learn.dataset.show"),
+            "add": Verb("make a dataset of recorded runs, or add to one", "servoid.tools.learn.dataset.add"),
+        },
+    ),
     "skills": Verb("list skills, or explain one", "servoid.tools.commands.skills"),
     "robot": Verb(
         "describe a robot of your own",

@@ -23,8 +23,8 @@ class Halt(IntEnum):
 class Intent:
     """What a person wants now: nothing of it reaches a motor but through task, policy and guard.
 
-    Of way, goal and text the one that was asked last counts; `way` is zero for the others. `age` is how long ago the
-    person was last heard: 0 for a device of this machine, which is there or says that it is not.
+    Of way, goal, text and skill the one that was asked last counts; `way` is zero for the others. `age` is how long ago
+    the person was last heard: 0 for a device of this machine, which is there or says that it is not.
     """
 
     sequence: int = 0  # of the message that changed it last; devices that send none leave it at 0
@@ -32,6 +32,8 @@ class Intent:
     way: Array = field(default_factory=lambda: np.zeros(3))  # (3,) in -1..1: forward, to the left, turning left
     goal: Array | None = None  # (2,) m to go to, odometry frame
     text: str | None = None  # a sentence that says what to do
+    skill: str | None = None  # name of a skill to perform,
+    skills: int = 0  # and how many were asked for so far: the same one may be wanted again
     ends: bool = False  # the task is to end
     halt: Halt = Halt.NO
 

@@ -22,7 +22,7 @@ from servoid.stack.estimation.odometry import OdometryFeatures
 
 _GRAVITY = 9.81  # m/s2
 _CORNER_SOFTNESS = 0.003  # m of height over which corners share the contact
-_FOOT_SOFTNESS = 0.001  # m of height over which feet share the load
+FOOT_SOFTNESS = 0.001  # m of height over which feet share the load
 
 
 class Estimator:
@@ -108,7 +108,7 @@ class Estimator:
         linear, _ = self._legs.velocity(point, origins, axes, leg_rate)
         foot_velocity = -(linear + cross(rate[..., None, :], point))  # of the base, were this foot fixed
         ground = lowest.min(-1, keepdims=True)
-        contact = np.exp(-(lowest - ground) / _FOOT_SOFTNESS)
+        contact = np.exp(-(lowest - ground) / FOOT_SOFTNESS)
         contact /= contact.sum(-1, keepdims=True)
 
         to_heading = _heading_frame(up)

@@ -91,7 +91,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     ),
     "/intent": _schema(
         {"tick": _INTEGER, "sequence": _INTEGER, "age": _NUMBER, "text": _TEXT, "ends": {"type": "boolean"}}
-        | {"halt": _INTEGER}
+        | {"halt": _INTEGER, "skill": _TEXT, "skills": _INTEGER}
         | _arrays({"way": "forward, left, turning left, -1..1", "goal": "m, odometry frame"})
     ),
     "/plan": _schema(
@@ -193,7 +193,7 @@ def event_message(event: Event) -> dict[str, Any]:
 
 def intent_message(intent: Intent) -> dict[str, Any]:
     """An intent as JSON. One from nobody, whose age is infinite, has no age."""
-    message = {
+    message: dict[str, Any] = {
         "sequence": intent.sequence,
         "age": intent.age if math.isfinite(intent.age) else None,
         "way": pack(intent.way, EXACT),
@@ -202,6 +202,8 @@ def intent_message(intent: Intent) -> dict[str, Any]:
     }
     if intent.goal is not None:
         message["goal"] = pack(intent.goal, EXACT)
+    if intent.skill is not None:
+        message |= {"skill": intent.skill, "skills": intent.skills}
     return message if intent.text is None else message | {"text": intent.text}
 
 
@@ -213,6 +215,8 @@ def read_intent(message: dict[str, Any]) -> Intent:
         way=unpack(message["way"]),
         goal=unpack(message["goal"]) if "goal" in message else None,
         text=message.get("text"),
+        skill=message.get("skill"),
+        skills=message.get("skills", 0),
         ends=message["ends"],
         halt=Halt(message["halt"]),
     )

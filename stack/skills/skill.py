@@ -89,6 +89,12 @@ def load_skills(robot: Robot, folder: Path = CONFIGS / "skills") -> dict[str, Sk
     return found
 
 
+def has_skills(robot: Robot, folder: Path = CONFIGS / "skills") -> bool:
+    """Whether the shipped library has the motions of all skills for a robot."""
+    fitting = Library(robot).fitting
+    return all(load_marked(path, Skill)[0].clip in fitting for path in folder.glob("*.yaml"))
+
+
 def chosen(name: str, skills: Mapping[str, Skill]) -> Skill:
     """The skill of that name. Raises ConfigError with the nearest one."""
     if name not in skills:

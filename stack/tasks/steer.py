@@ -1,8 +1,8 @@
-"""Do as a person steers: with a gamepad, by keys, or on the operator's page, which takes goals and sentences too."""
+"""Do as a person steers: with a gamepad or keys; on the operator's page by goals, sentences and skills, too."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -15,10 +15,14 @@ from servoid.hw.contracts.operator import CommandSource, Intent
 from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.geometry import to_heading
+from servoid.hw.robot.description import Robot, shipped_robot
 from servoid.hw.setting import Setting
 from servoid.policy.text.captions import twist_of
+from servoid.policy.text.encoder import load_encoder
 from servoid.stack.control.operator import Controls, open_steering
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
+from servoid.stack.skills.skill import Skill, has_skills, load_skills
+from servoid.stack.skills.words import SkillWords
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 from servoid.stack.tasks.terms import metrics as measures
 from servoid.stack.tasks.text import understood
@@ -50,6 +54,12 @@ class Steer(BaseTask):
     settings_type = SteerSettings
     steered = True
 
+    def __init__(self, settings: SteerSettings, dt: float, robot: Robot | None = None) -> None:
+        super().__init__(settings, dt, robot)
+        body = robot or shipped_robot()
+        self._skills = load_skills(body) if has_skills(body) else {}
+        self.performs = bool(self._skills)
+
     def open_source(self) -> CommandSource:
         """Find the device. Raises ConfigError where there is none."""
         s = self.settings
@@ -57,7 +67,7 @@ class Steer(BaseTask):
         return open_steering(s.device, controls)
 
     def steered_behaviour(self, episode: Episode, wanted: Callable[[], Intent]) -> BaseBehaviour:
-        return Steered(episode, wanted, self.settings, self.top)
+        return Steered(episode, wanted, self.settings, self.top, self._skills)
 
     def criteria(self, trace: Trace, episode: Episode) -> list[Criterion]:
         return [
@@ -75,15 +85,25 @@ class Steer(BaseTask):
 class Steered(BaseBehaviour):
     """Goes by what is wanted now. Velocities are rounded to float32, as the flight log holds them.
 
-    A sentence that names no motion asks the robot to stand.
+    A sentence that names neither a motion nor one of the `skills` asks the robot to stand.
     """
 
-    def __init__(self, episode: Episode, wanted: Callable[[], Intent], settings: SteerSettings, top: Array) -> None:
+    def __init__(
+        self,
+        episode: Episode,
+        wanted: Callable[[], Intent],
+        settings: SteerSettings,
+        top: Array,
+        skills: Mapping[str, Skill],
+    ) -> None:
         """`top` `(3,)` are the speeds that sentences speak of."""
         super().__init__(episode)
+        self._skills, self._asked = skills, 0
+        # Loaded now: a tick has no time for it.
+        self._words = SkillWords(load_encoder(), skills) if skills else None
         self._wanted, self._settings, self._top = wanted, settings, top
         self._ends = self._arrived = False
-        self._understood: dict[str, Array] = {}  # velocities of sentences
+        self._understood: dict[str, Array | str] = {}  # velocities of sentences, and names of skills
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
         wish = self._wanted()
@@ -91,9 +111,14 @@ class Steered(BaseBehaviour):
         if wish.goal is not None:
             return self._go(to_heading(wish.goal, state))
         self._arrived = False
+        if wish.skill is not None:
+            again, self._asked = wish.skills != self._asked, wish.skills
+            return self._perform(None if again else wish.skill)  # a tick without it: the same may be wanted once more
         if wish.text is not None:
-            velocity = self._meant(wish.text)
-            return Instruction(velocity, text=wish.text if velocity.any() else None)
+            meant = self._meant(wish.text)
+            if isinstance(meant, str):
+                return self._perform(meant)
+            return Instruction(meant, text=wish.text if meant.any() else None)
         s = self._settings
         forward, left, turn = wish.way
         velocity = np.array(
@@ -111,14 +136,24 @@ class Steered(BaseBehaviour):
         self._arrived = distance <= (s.leave if self._arrived else s.arrive)
         return Instruction(np.zeros(3) if self._arrived else go_to_point(ahead, s.approach), goal=ahead)
 
-    def _meant(self, text: str) -> Array:
-        """The velocity `(3,)` that a sentence means, looked up once."""
+    def _perform(self, skill: str | None) -> Instruction:
+        return Instruction(np.zeros(3), skill=skill if skill in self._skills else None)
+
+    def _meant(self, text: str) -> Array | str:
+        """The velocity `(3,)` that a sentence means, or the skill, looked up once."""
         if text not in self._understood:
             try:
-                self._understood[text] = twist_of(understood("sentence", text), self._top)
+                self._understood[text] = self._look_up(text)
             except ConfigError:
                 self._understood[text] = np.zeros(3)
         return self._understood[text]
+
+    def _look_up(self, text: str) -> Array | str:
+        """Raises ConfigError where it is in no known words."""
+        if self._words is None:
+            return twist_of(understood("sentence", text), self._top)
+        found = self._words.understand(text)
+        return found if isinstance(found, str) else twist_of(found, self._top)
 
 
 class SteeredAgain(BaseBehaviour):

@@ -17,10 +17,12 @@ from typing import TYPE_CHECKING
 from servoid.hw.config import ConfigError, nearest
 from servoid.hw.contracts.body import Array, BackendError
 from servoid.hw.robot.description import Robot, load_robot
+from servoid.tools.bringup.desk.terminal import Desk
 from servoid.tools.bringup.line import Line, add_line_arguments, is_virtual, open_line
+from servoid.tools.bringup.session import at_desk
 from servoid.tools.common import exit_codes
-from servoid.tools.common.output import Report, reporting
-from servoid.tools.common.prompt import confirm
+from servoid.tools.common.output import Report
+from servoid.tools.web.launch import add_view_arguments
 
 if TYPE_CHECKING:
     from servoid.hw.dynamixel.calibration import Calibration, JointCalibration
@@ -37,6 +39,7 @@ _OTHER_SECONDS = 4.0  # for which another joint may be off before it is taken fo
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser)
+    add_view_arguments(parser)
     parser.add_argument(
         "--pose", choices=("zero", "home"), default="zero", help="reference pose: all joints at 0 (default), or home"
     )
@@ -62,42 +65,46 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    with reporting(args.json) as report:
-        from servoid.hw.dynamixel.calibration import apply, calibration_path, check_writable
+    return at_desk(args, "calibrate", work)
 
-        robot = load_robot(args.robot)
-        if geared := [joint.name for joint in robot.joints if joint.gear != 1.0]:
-            raise ConfigError(
-                f"{', '.join(geared)}: behind a gear, a servo's angle does not say which turn the joint is in: measure "
-                "their zeros yourself, and write them into the robot's file"
-            )
-        virtual = is_virtual(args)
-        path = args.out or (None if virtual else calibration_path(robot))
-        chosen = _chosen(args.joint, robot)
-        earlier = _earlier(path, robot, chosen, args.keep_directions)
-        if path is not None:
-            check_writable(path)
-        reference = _reference(args.pose, robot)
-        factory_state = None
-        if virtual:
-            from servoid.sim.rig.servo.factory_state import FactoryState
 
-            factory_state = FactoryState(assembly="random")
-        with open_line(args, robot, factory_state=factory_state, seed=args.seed) as line:
-            zeros, directions = _measure(line, robot, reference, chosen, earlier, args, report)
-        result = _calibration(robot, zeros, directions, chosen, earlier, args.pose)
-        _show(robot, result, report)
-        apply(robot, result, "what was measured")  # refuses what no servo could be driven with
-        if path is None:
-            report.line("not kept: a virtual rig of its own is gone now; --out FILE keeps it")
-        else:
-            if not args.yes:
-                kept_text = ", and the earlier one kept beside it" if path.exists() else ""
-                confirm(f"{path} will be written{kept_text}: whatever drives {robot.name} will use it")
-            kept = keep(result, path)
-            report.line(f"written to {path}" + (f"; the earlier one is {kept}" if kept else ""))
-            report.line("next: servoid bringup check --fix, which sets the servos' own limits to match")
-        report.result({"path": path, **asdict(result)})
+def work(args: argparse.Namespace, desk: Desk) -> int:
+    """Do it, together with the person at the desk."""
+    from servoid.hw.dynamixel.calibration import apply, calibration_path, check_writable
+
+    report, robot = desk.report, load_robot(args.robot)
+    if geared := [joint.name for joint in robot.joints if joint.gear != 1.0]:
+        raise ConfigError(
+            f"{', '.join(geared)}: behind a gear, a servo's angle does not say which turn the joint is in: measure "
+            "their zeros yourself, and write them into the robot's file"
+        )
+    virtual = is_virtual(args)
+    path = args.out or (None if virtual else calibration_path(robot))
+    chosen = _chosen(args.joint, robot)
+    earlier = _earlier(path, robot, chosen, args.keep_directions)
+    if path is not None:
+        check_writable(path)
+    reference = _reference(args.pose, robot)
+    factory_state = None
+    if virtual:
+        from servoid.sim.rig.servo.factory_state import FactoryState
+
+        factory_state = FactoryState(assembly="random")
+    with open_line(args, robot, factory_state=factory_state, seed=args.seed) as line:
+        zeros, directions = _measure(line, robot, reference, chosen, earlier, args, desk)
+    result = _calibration(robot, zeros, directions, chosen, earlier, args.pose)
+    _show(robot, result, report)
+    apply(robot, result, "what was measured")  # refuses what no servo could be driven with
+    if path is None:
+        report.line("not kept: a virtual rig of its own is gone now; --out FILE keeps it")
+    else:
+        if not args.yes:
+            kept_text = ", and the earlier one kept beside it" if path.exists() else ""
+            desk.confirm(f"{path} will be written{kept_text}: whatever drives {robot.name} will use it")
+        kept = keep(result, path)
+        report.line(f"written to {path}" + (f"; the earlier one is {kept}" if kept else ""))
+        report.line("next: servoid bringup check --fix, which sets the servos' own limits to match")
+    report.result({"path": path, **asdict(result)})
     return exit_codes.DONE
 
 
@@ -108,7 +115,7 @@ def _measure(
     chosen: list[int],
     earlier: Mapping[str, JointCalibration],
     args: argparse.Namespace,
-    report: Report,
+    desk: Desk,
 ) -> tuple[Array, Array]:
     """Zeros [rad] and directions `(n_joints,)`."""
     import numpy as np
@@ -126,16 +133,22 @@ def _measure(
     line.bus.return_delay = LONGEST_RETURN_DELAY  # until the servos' own is known
     found = find_servos(line.bus, robot)
     refuse(found)
-    encoders = Encoders(line.bus, line.clock, robot, found)
-    hands: Hands = Person(report) if line.control is None else VirtualHands(line.control, robot, report)
+    # Shown by the robot's file until the reference pose is known.
+    directions = np.array([earlier.get(joint.name, joint).direction for joint in robot.joints])
+    zeros = np.array([earlier.get(joint.name, joint).zero for joint in robot.joints])
+    encoders = Encoders(
+        line.bus, line.clock, robot, found, lambda angles: desk.show_limp(zeros + directions * angles, reference)
+    )
+    hands: Hands = Person(desk) if line.control is None else VirtualHands(line.control, robot, desk.report)
     angles = dict(zip(robot.names, reference.tolist(), strict=True))
     where = "every joint at 0" if args.pose == "zero" else "its home pose, standing"
     hands.pose(angles, f"{robot.name} is limp. Put it into its reference pose, {where}, and hold it still")
     at_reference = encoders.still(PATIENCE)
-    directions = np.array([earlier.get(joint.name, joint).direction for joint in robot.joints])
+    zeros = short(reference - directions * at_reference)
     if not args.keep_directions:
         for i, sign in directions_of(encoders, hands, robot, reference, chosen).items():
             directions[i] = sign
+            zeros = short(reference - directions * at_reference)
     return short(reference - directions * at_reference), directions
 
 

@@ -16,10 +16,12 @@ from servoid.hw.config import ConfigError, nearest
 from servoid.hw.contracts.backend import Backend
 from servoid.hw.contracts.body import Array, BackendError, Sensors
 from servoid.hw.robot.description import Robot
+from servoid.tools.bringup.desk.terminal import Desk
 from servoid.tools.bringup.line import add_line_arguments, assembled, is_virtual
+from servoid.tools.bringup.session import at_desk
 from servoid.tools.common import exit_codes
-from servoid.tools.common.output import Report, Screen, reporting
-from servoid.tools.common.prompt import confirm
+from servoid.tools.common.output import Report, Screen
+from servoid.tools.web.launch import add_view_arguments
 
 if TYPE_CHECKING:
     from servoid.stack.log.tick import TickRecord
@@ -32,37 +34,42 @@ _SHOW_EVERY = 5  # ticks
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("joint", metavar="JOINT", help="joint to move")
     add_line_arguments(parser)
+    add_view_arguments(parser)
     parser.add_argument("--by", type=float, metavar="RAD", help="angle to move by, and back, instead of using keys")
     parser.add_argument("--start", action="store_true", help="switch torque on without asking")
 
 
 def main(args: argparse.Namespace) -> int:
-    with reporting(args.json) as report:
-        from servoid.stack.runtime.backends import make_backend
-        from servoid.tools.bringup.jogging import SPAN
+    return at_desk(args, "jog", work)
 
-        robot = assembled(args, report)
-        if args.joint not in robot.names:
-            raise ConfigError(f"{robot.name} has no joint '{args.joint}'; {nearest(args.joint, robot.names)}")
-        if args.by is not None and not 0.0 < abs(args.by) <= SPAN:
-            raise ConfigError(f"--by {args.by:g}: must be between -{SPAN:g} and {SPAN:g} rad, and not 0")
-        if args.by is None and not sys.stdin.isatty():
-            raise ConfigError("keys need a terminal: without one, use --by RAD")
-        name = "virtual" if is_virtual(args) else "dynamixel"
-        port = None if name == "virtual" else args.port
-        body = make_backend(name, robot, seed=0, randomise=False, port=port)
-        with ExitStack() as stack:
-            stack.callback(body.close)
-            sensors, motors = body.connect()
-            if name == "virtual":
-                body.rig.control.hold()  # type: ignore[attr-defined]  # on a stand, however it is bent
-            result = _jog(body, sensors, motors, robot, args, report)
-        report.result(result)
+
+def work(args: argparse.Namespace, desk: Desk) -> int:
+    """Do it, by the wishes of the person at the desk."""
+    from servoid.stack.runtime.backends import make_backend
+    from servoid.tools.bringup.desk.jogging import SPAN
+
+    robot = assembled(args, desk.report)
+    if args.joint not in robot.names:
+        raise ConfigError(f"{robot.name} has no joint '{args.joint}'; {nearest(args.joint, robot.names)}")
+    if args.by is not None and not 0.0 < abs(args.by) <= SPAN:
+        raise ConfigError(f"--by {args.by:g}: must be between -{SPAN:g} and {SPAN:g} rad, and not 0")
+    if args.by is None:
+        desk.check_keys()
+    name = "virtual" if is_virtual(args) else "dynamixel"
+    port = None if name == "virtual" else args.port
+    body = make_backend(name, robot, seed=0, randomise=False, port=port)
+    with ExitStack() as stack:
+        stack.callback(body.close)
+        sensors, motors = body.connect()
+        if name == "virtual":
+            body.rig.control.hold()  # type: ignore[attr-defined]  # on a stand, however it is bent
+        result = _jog(body, sensors, motors, robot, args, desk)
+    desk.report.result(result)
     return {"task": exit_codes.DONE, "interrupt": exit_codes.INTERRUPTED}.get(result["cause"], exit_codes.STOPPED)
 
 
 def _jog(
-    body: Backend, sensors: Sensors, motors: Any, robot: Robot, args: argparse.Namespace, report: Report
+    body: Backend, sensors: Sensors, motors: Any, robot: Robot, args: argparse.Namespace, desk: Desk
 ) -> dict[str, Any]:
     import numpy as np
 
@@ -71,9 +78,9 @@ def _jog(
     from servoid.stack.runtime.interrupt import Interrupt, Stops
     from servoid.stack.runtime.loop import ControlledRobot, Loop
     from servoid.stack.safety.guard import Guard
-    from servoid.tools.bringup.jogging import SPEED, JogSupervisor, Keys, There, reach, restrict
+    from servoid.tools.bringup.desk.jogging import SPEED, JogSupervisor, There, reach, restrict
 
-    i = robot.names.index(args.joint)
+    report, i = desk.report, robot.names.index(args.joint)
     clock = body.clock
     if not isinstance(clock, WallClock) and args.by is None:
         clock = RealTime(clock)
@@ -81,7 +88,7 @@ def _jog(
     low, high = reach(restrict(robot, here, i), i)
     _announce(report, robot, i, here, (low, high), args)
     if not args.start:
-        confirm("Support the robot", "give --start to switch torque on without being asked")
+        desk.confirm("Support the robot", "give --start to switch torque on without being asked")
     here = _pose(sensors, clock, robot)  # it may have been moved meanwhile
     restricted = restrict(robot, here, i)
     low, high = reach(restricted, i)
@@ -91,13 +98,15 @@ def _jog(
         )
     with ExitStack() as stack:
         interrupt = stack.enter_context(Interrupt())
-        source = There(args.by, robot.dt) if args.by is not None else stack.enter_context(Keys())
+        source = There(args.by, robot.dt) if args.by is not None else stack.enter_context(desk.keys())
         guard = Guard(restricted, motors)
         shown = _Shown(guard, i, args.joint, here, sys.stderr)
         supervisor = JogSupervisor(restricted, guard, i, source)
         schedule = Schedule(clock, robot.rate)
         controlled = ControlledRobot(restricted, sensors, Estimator(robot), guard)
-        loop = Loop(controlled, supervisor, schedule, interrupt, Stops(interrupt), (shown,))
+        operator = desk.operator
+        stops = Stops(interrupt, asked=(lambda: None) if operator is None else operator.stop)
+        loop = Loop(controlled, supervisor, schedule, interrupt, stops, (shown, *desk.listeners), operator)
         try:
             loop.run()
         finally:
@@ -140,7 +149,7 @@ def _announce(
     import numpy as np
 
     from servoid.tools.bringup.calibration.turning import describe_turns
-    from servoid.tools.bringup.jogging import SPEED
+    from servoid.tools.bringup.desk.jogging import SPEED
 
     joint = robot.joints[i]
     report.line(

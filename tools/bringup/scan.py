@@ -14,9 +14,12 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.robot.checks import MAX_ID
 from servoid.hw.robot.description import Robot, load_robot
+from servoid.tools.bringup.desk.terminal import Desk
 from servoid.tools.bringup.line import add_line_arguments, open_line
+from servoid.tools.bringup.session import at_desk
 from servoid.tools.common import exit_codes
-from servoid.tools.common.output import Report, reporting
+from servoid.tools.common.output import Report
+from servoid.tools.web.launch import add_view_arguments
 
 if TYPE_CHECKING:
     from servoid.hw.dynamixel.servos.bus_scan import Census, Device
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser)
+    add_view_arguments(parser)
     parser.add_argument(
         "--baud",
         type=int,
@@ -36,46 +40,51 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    with reporting(args.json) as report:
-        from servoid.hw.dynamixel.servos.bus_scan import BAUDS, census
+    return at_desk(args, "scan", work)
 
-        robot = load_robot(args.robot)
-        for baud in args.baud:
-            check_baud(baud)
-        bauds = args.baud or _first(robot.bus.baud, BAUDS)
-        with open_line(args, robot) as line:
-            report.line(powered(line.bus, robot, bauds))
-            found = census(line.bus, bauds, report.line)
-        if not found.devices and not found.problems:
-            raise BackendError(
-                f"{args.port}: no answer at {', '.join(map(str, bauds))} bit/s: is the supply on, is the adapter "
-                "on the servos' connector, and do both have the same ground?"
-            )
-        if found.skipped:
-            report.line(f"this adapter cannot be set to {', '.join(map(str, found.skipped))} bit/s: nobody asked there")
-        missing = absent(found, robot)
-        problems = found.problems + [text for each in found.devices for text in misfits(each, found, robot)]
-        if not found.servos and not problems:
-            problems.append(
-                "the board answers, but no servo does: is the cable from the board to the servos plugged in, and is "
-                "the supply on?"
-            )
-        _show(found, robot, problems, report)
-        stiff = [named(device, robot) for device in found.servos if device.get("torque_enable")]
-        if stiff:
-            report.line(f"torque is on at {', '.join(stiff)}: servoid bringup off turns it off")
-        if missing:
-            report.line(f"not on the bus at {robot.bus.baud} bit/s: {', '.join(missing)}")
-        report.result(
-            {
-                "port": args.port,
-                "bauds": list(bauds),
-                "devices": [described(device, robot) for device in found.devices],
-                "missing": missing,
-                "torque": stiff,
-                "problems": problems,
-            }
+
+def work(args: argparse.Namespace, desk: Desk) -> int:
+    """Do it, and tell the person at the desk."""
+    report = desk.report
+    from servoid.hw.dynamixel.servos.bus_scan import BAUDS, census
+
+    robot = load_robot(args.robot)
+    for baud in args.baud:
+        check_baud(baud)
+    bauds = args.baud or _first(robot.bus.baud, BAUDS)
+    with open_line(args, robot) as line:
+        report.line(powered(line.bus, robot, bauds))
+        found = census(line.bus, bauds, desk.progress)
+    if not found.devices and not found.problems:
+        raise BackendError(
+            f"{args.port}: no answer at {', '.join(map(str, bauds))} bit/s: is the supply on, is the adapter "
+            "on the servos' connector, and do both have the same ground?"
         )
+    if found.skipped:
+        report.line(f"this adapter cannot be set to {', '.join(map(str, found.skipped))} bit/s: nobody asked there")
+    missing = absent(found, robot)
+    problems = found.problems + [text for each in found.devices for text in misfits(each, found, robot)]
+    if not found.servos and not problems:
+        problems.append(
+            "the board answers, but no servo does: is the cable from the board to the servos plugged in, and is "
+            "the supply on?"
+        )
+    _show(found, robot, problems, report)
+    stiff = [named(device, robot) for device in found.servos if device.get("torque_enable")]
+    if stiff:
+        report.line(f"torque is on at {', '.join(stiff)}: servoid bringup off turns it off")
+    if missing:
+        report.line(f"not on the bus at {robot.bus.baud} bit/s: {', '.join(missing)}")
+    report.result(
+        {
+            "port": args.port,
+            "bauds": list(bauds),
+            "devices": [described(device, robot) for device in found.devices],
+            "missing": missing,
+            "torque": stiff,
+            "problems": problems,
+        }
+    )
     return exit_codes.HARDWARE if problems else exit_codes.DONE
 
 

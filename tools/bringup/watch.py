@@ -9,16 +9,19 @@ import argparse
 import dataclasses
 import io
 import shutil
-import sys
 from collections import deque
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.robot.description import Robot
+from servoid.tools.bringup.desk.terminal import Desk
 from servoid.tools.bringup.line import Line, add_line_arguments, assembled, is_virtual, open_line
+from servoid.tools.bringup.session import at_desk
 from servoid.tools.common import exit_codes
-from servoid.tools.common.output import Report, reporting
+from servoid.tools.common.output import Report
 from servoid.tools.common.parser import positive
+from servoid.tools.web.launch import add_view_arguments
 
 if TYPE_CHECKING:
     from servoid.hw.contracts.body import Observation
@@ -33,26 +36,31 @@ _SILENT = 1.0  # s after which a servo is said to be silent
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser)
+    add_view_arguments(parser)
     parser.add_argument("--seconds", type=positive, metavar="S", help="how long to watch (default: until Ctrl-C)")
 
 
 def main(args: argparse.Namespace) -> int:
-    with reporting(args.json) as report:
-        robot = assembled(args, report)
-        with open_line(args, robot, patient=False) as line, ExitStack() as stack:
-            imu = None
-            if robot.imu.kind not in ("opencr", "none") and not is_virtual(args):  # a virtual rig has it on its board
-                from servoid.hw.imu.serial_imu import SerialImu
+    return at_desk(args, "watch", work)
 
-                imu = SerialImu(robot.imu, robot.rate, clock=line.clock)
-                stack.callback(imu.close)
-            watched = Watched(line, robot, imu)
-            live = sys.stdout.isatty() and not args.json
-            with suppress(KeyboardInterrupt):  # the usual way to end it
-                watched.run(args.seconds, report if live else None)
-            if not live:
-                watched.show(report)
-            report.result(watched.summary())
+
+def work(args: argparse.Namespace, desk: Desk) -> int:
+    """Do it, and show the person at the desk."""
+    report, robot = desk.report, assembled(args, desk.report)
+    with open_line(args, robot, patient=False) as line, ExitStack() as stack:
+        imu = None
+        if robot.imu.kind not in ("opencr", "none") and not is_virtual(args):  # a virtual rig has it on its board
+            from servoid.hw.imu.serial_imu import SerialImu
+
+            imu = SerialImu(robot.imu, robot.rate, clock=line.clock)
+            stack.callback(imu.close)
+        watched = Watched(line, robot, imu)
+        redraw = desk.redraws(watched.show)
+        with suppress(KeyboardInterrupt):  # the usual way to end it
+            watched.run(args.seconds, redraw, desk.show_read)
+        if redraw is None:
+            watched.show(report)
+        report.result(watched.summary())
     return exit_codes.DONE
 
 
@@ -86,8 +94,13 @@ class Watched:
         self._newest: Observation | None = None
         self._drawn = 0
 
-    def run(self, seconds: float | None, report: Report | None) -> None:
-        """Read for so long, or until KeyboardInterrupt; with a report, show a table now and then."""
+    def run(
+        self,
+        seconds: float | None,
+        redraw: Callable[[], None] | None,
+        seen: Callable[[Observation], None] = lambda observation: None,
+    ) -> None:
+        """Read for so long, or until KeyboardInterrupt. `redraw` is called now and then, `seen` after each read."""
         import numpy as np
 
         from servoid.stack.runtime.clock import Schedule
@@ -101,10 +114,11 @@ class Watched:
             self._reads += 1
             self._hottest = np.fmax(self._hottest, observation.temperature).tolist()
             self._lowest = np.fmin(self._lowest, observation.voltage).tolist()
-            if report is not None and self._reads % every == 0:
-                self.show(report, redraw=True)
+            seen(observation)
+            if redraw is not None and self._reads % every == 0:
+                redraw()
 
-    def show(self, report: Report, *, redraw: bool = False) -> None:
+    def show(self, report: Report, redraw: bool = False) -> None:
         """The table as it is now; `redraw` over the one before."""
         if self._newest is None:
             return

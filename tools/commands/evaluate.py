@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from servoid.hw.config import ConfigError, available
+from servoid.tools.common.cluster import add_ray_argument
 from servoid.tools.common.exit_codes import exit_code, explain
 from servoid.tools.common.folder_lock import locked
 from servoid.tools.common.output import Report, add_json_argument, reporting
@@ -47,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (default: runs/EVALUATION)")
     parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: one per core)")
+    add_ray_argument(parser)
     parser.add_argument(
         "--episodes", type=int, metavar="N", help="episodes of each row (default: the row's own, mostly 100)"
     )
@@ -104,6 +106,7 @@ def options_of(args: argparse.Namespace, evaluation: Evaluation) -> Options:
         episodes=args.episodes or (QUICK_EPISODES if args.quick else None),
         seconds=args.seconds,
         workers=args.workers,
+        ray=args.ray,
         minutes=QUICK_MINUTES if args.quick and args.minutes is None else args.minutes,
         quick=args.quick,
         fresh=args.fresh,

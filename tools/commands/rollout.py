@@ -5,23 +5,25 @@ and any episode can be repeated with `servoid run TASK --seed S`. Several polici
 `--policy expert,gait`) run the same episodes; each one's difference from the first is printed with its 95 % interval,
 paired by seed.
 
-With --out, every finished episode is kept as a line of JSON, and the same command continues where it stopped. After
-Ctrl-C, or an episode that fails with an error, the figures of the finished episodes are printed.
+With --out, every finished episode is kept as a line of JSON, and the same command continues where it stopped. With
+--ray, episodes run on the machines of a Ray cluster, with the same results; those of a machine that dies run on
+another. After Ctrl-C, or an episode that fails with an error, the figures of the finished episodes are printed.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
+from servoid.tools.common.cluster import add_ray_argument, workplace
 from servoid.tools.common.compare import difference_table, differences, summarise, table
 from servoid.tools.common.exit_codes import exit_code, explain
 from servoid.tools.common.folder_lock import locked
@@ -37,6 +39,7 @@ from servoid.tools.common.parser import (
 )
 from servoid.tools.common.worker_pool import each
 from servoid.tools.evaluate.cache import EpisodeCache, depends_on, key
+from servoid.tools.evaluate.code_hash import everything_of
 from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult
 from servoid.tools.evaluate.judge import judge
 from servoid.tools.evaluate.progress import EpisodeBar, Forecast
@@ -54,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--episodes", type=int, default=50, metavar="N", help="episodes of each policy (default: %(default)s)"
     )
     parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: one per core)")
+    add_ray_argument(parser)
     parser.add_argument("--backend", default="sim", metavar="NAME", help="sim or virtual (default: %(default)s)")
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: %(default)s)")
     parser.add_argument(
@@ -85,7 +89,7 @@ def main(args: argparse.Namespace, work: Work | None = None) -> int:
         with nullcontext() if args.out is None else locked(args.out):
             plan = [_prepare(args, name) for name in names]
             try:
-                _run_all(plan, args, work or _do)
+                _run_all(plan, args, work or _do, report.line)
             except (Exception, KeyboardInterrupt) as error:
                 if not any(one.rows for one in plan):
                     raise
@@ -178,7 +182,7 @@ def _file_name(policy: str) -> str:
     return f"{stem}-{key({'policy': policy})[:6]}"
 
 
-def _run_all(plan: Sequence[_Policy], args: argparse.Namespace, work: Work) -> None:
+def _run_all(plan: Sequence[_Policy], args: argparse.Namespace, work: Work, say: Callable[[str], None]) -> None:
     """Do all episodes that are lacking, on `--workers` processes; bad settings are refused before any.
 
     Raises what the first episode raises that cannot be done; the others are given up then.
@@ -192,27 +196,34 @@ def _run_all(plan: Sequence[_Policy], args: argparse.Namespace, work: Work) -> N
         for number, one in enumerate(plan)
         if i not in one.rows
     ]
-    workers = max(min(args.workers or os.cpu_count() or 1, len(jobs)), 1)
-    if workers > 1 or len(plan) > 1:
-        for number in {job.experiment: job for job in jobs}.values():
-            episode_check(number.settings)
+    if not jobs:
+        return
     limit = args.seconds or load_settings(args.task, settings(args)).seconds
     left = [sum(job.experiment == number for job in jobs) for number in range(len(plan))]
-    bar = EpisodeBar(Forecast([limit] * len(plan), left), workers, None)
-    try:
-        for done in each(work, jobs, workers):
-            one, i = plan[done.job.experiment], done.job.episode
-            if one.cache is not None:
-                if _made_of(one.settings) != one.made_of:
-                    raise ConfigError(
-                        f"policy '{one.settings.policy}', the robot, the code or a file in configs/ changed while "
-                        "episodes ran: what was done before is kept"
-                    )
-                one.cache.add(i, done.record)
-            one.rows[i] = done.record
-            bar.done(done.job.experiment, done.wall_seconds)
-    finally:
-        bar.close()
+    with workplace(args.ray, partial(everything_of, [one.settings for one in plan]), say) as place:
+        workers = min(args.workers or place.size, len(jobs))
+        if workers > 1 or len(plan) > 1:
+            for number in {job.experiment: job for job in jobs}.values():
+                episode_check(number.settings)
+        bar = EpisodeBar(Forecast([limit] * len(plan), left), workers, None)
+        try:
+            for done in each(work, jobs, workers, place=place):
+                _keep(plan[done.job.experiment], done)
+                bar.done(done.job.experiment, done.wall_seconds)
+        finally:
+            bar.close()
+
+
+def _keep(one: _Policy, done: EpisodeResult) -> None:
+    """Raises ConfigError where what the episodes depend on has changed meanwhile."""
+    if one.cache is not None:
+        if _made_of(one.settings) != one.made_of:
+            raise ConfigError(
+                f"policy '{one.settings.policy}', the robot, the code or a file in configs/ changed while "
+                "episodes ran: what was done before is kept"
+            )
+        one.cache.add(done.job.episode, done.record)
+    one.rows[done.job.episode] = done.record
 
 
 def _do(job: EpisodeJob) -> EpisodeResult:

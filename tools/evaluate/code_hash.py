@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from servoid.stack.runtime.run import RunSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("hw", "sim", "policy", "stack")  # checkpoints among them are hashed where they are used
@@ -46,6 +49,36 @@ def read_anew(robot: str) -> tuple[Any, ...]:
     from servoid.stack.log.provenance import fingerprint
 
     return digest(ROOT), fingerprint(load_robot(robot))
+
+
+def installed() -> dict[str, Any]:
+    """By names, what must be the same on each machine that takes part in a piece of work: versions of packages, and the
+    code, that of the tools too."""
+    from servoid.stack.log.provenance import versions
+
+    total = hashlib.sha256(digest(ROOT).encode())
+    for path in sorted((ROOT / "tools").rglob("*.py")):
+        total.update(f"{path.relative_to(ROOT).as_posix()} ".encode() + path.read_bytes())
+    return {f"version of {name}": version for name, version in versions().items()} | {"code": total.hexdigest()}
+
+
+def everything_of(runs: Sequence[RunSettings]) -> dict[str, Any]:
+    """The same, and what `runs` read: robots, policies with checkpoints, files of tasks. Raises ConfigError."""
+    from servoid.hw.robot.description import load_robot
+    from servoid.stack.control.policies import policy_fingerprint
+    from servoid.stack.log.provenance import files, fingerprint
+    from servoid.stack.tasks import load_settings, source
+
+    result = installed()
+    for run in runs:
+        robot = load_robot(run.robot)
+        task = files(load_settings(run.task, dict(run.set), robot)), source(run.task)
+        result |= {
+            f"robot {run.robot}": fingerprint(robot),
+            f"policy {run.policy}": policy_fingerprint(run.policy, robot),
+            f"files of task {run.task}": task,
+        }
+    return result
 
 
 def _files(root: Path) -> Iterator[Path]:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
 from servoid.hw.seeds import evaluation_seed
+from servoid.tools.common.cluster import workplace
 from servoid.tools.common.exit_codes import explain
-from servoid.tools.common.worker_pool import each
+from servoid.tools.common.worker_pool import Place, each
 from servoid.tools.evaluate.cache import EpisodeCache, key
-from servoid.tools.evaluate.code_hash import read_anew
+from servoid.tools.evaluate.code_hash import everything_of, read_anew
 from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult, do_episode
 from servoid.tools.evaluate.policies import Policies, dependencies
 from servoid.tools.evaluate.progress import EpisodeBar, Forecast
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from servoid.stack.runtime.run import RunSettings
 
 Work = Callable[[EpisodeJob], EpisodeResult]
-Pool = Callable[[Work, Iterable[EpisodeJob], int, float | None], Iterator[EpisodeResult]]
+Pool = Callable[[Work, Iterable[EpisodeJob], int, float | None, Place[Any]], Iterator[EpisodeResult]]
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Options:
     episodes: int | None = None
     seconds: float | None = None  # at most so long an episode: for a try, since figures mean little then
     workers: int = 0
+    ray: str | None = None  # address of a cluster to do it on
     minutes: float | None = None  # then stop, and go on another time; 0: do nothing, and tell what was done
     quick: bool = False  # cut the longest episodes
     fresh: bool = False  # do again what was done
@@ -94,32 +96,35 @@ def evaluate(
     ahead = "" if options.minutes == 0 else f", {len(jobs)} are to be done"
     say(f"{len(rows)} rows, {len(prepared)} experiments: {cached} episodes are there{ahead}")
     deadline = None if options.minutes is None else begun + 60.0 * options.minutes
-    # With no time at all there is nothing to start processes for.
-    workers = 1 if options.minutes == 0 else max(min(options.workers or os.cpu_count() or 1, len(jobs)), 1)
+    idle = options.minutes == 0 or not jobs  # then there is nothing to start processes for
     left = [sum(job.experiment == number for job in jobs) for number in range(len(prepared))]
-    bar = EpisodeBar(Forecast([one.limit for one in prepared], left), workers, deadline)
+    inspect = partial(everything_of, [one.settings for one in prepared])
     interrupted = False
-    try:
-        for result in pool(work, _jobs(prepared, options.seed), workers, deadline):
-            one = prepared[result.job.experiment]
-            if result.refused is not None:
-                one.refused = result.refused
-                bar.refused(result.job.experiment)
-                continue
-            if (
-                _made_of(policies, one.experiment, one.settings.policy) != one.policy
-                or read_anew(options.robot) != read
-            ):
-                raise ConfigError(
-                    f"the policy of {', '.join(one.rows)}, the robot, the code or a file in configs/ changed while"
-                    " episodes ran: finished ones are kept; run the same command again once the files no longer change"
-                )
-            one.cache.add(result.job.episode, {**result.record, "commit": commit})
-            bar.done(result.job.experiment, result.wall_seconds)
-    except KeyboardInterrupt:
-        interrupted = True
-    finally:
-        bar.close()
+    with workplace(None if idle else options.ray, inspect, say) as place:
+        workers = 1 if idle else min(options.workers or place.size, len(jobs))
+        bar = EpisodeBar(Forecast([one.limit for one in prepared], left), workers, deadline)
+        try:
+            for result in pool(work, _jobs(prepared, options.seed), workers, deadline, place):
+                one = prepared[result.job.experiment]
+                if result.refused is not None:
+                    one.refused = result.refused
+                    bar.refused(result.job.experiment)
+                    continue
+                if (
+                    _made_of(policies, one.experiment, one.settings.policy) != one.policy
+                    or read_anew(options.robot) != read
+                ):
+                    raise ConfigError(
+                        f"the policy of {', '.join(one.rows)}, the robot, the code or a file in configs/ changed while"
+                        " episodes ran: finished ones are kept; run the same command again once the files no longer"
+                        " change"
+                    )
+                one.cache.add(result.job.episode, {**result.record, "commit": commit})
+                bar.done(result.job.experiment, result.wall_seconds)
+        except KeyboardInterrupt:
+            interrupted = True
+        finally:
+            bar.close()
     for one in prepared:
         measured.update(dict.fromkeys(one.rows, Measured(one.records(), refused=one.refused)))
     if interrupted:

@@ -1,8 +1,8 @@
 """Control a robot from a page in the browser: start and stop tasks, steer, and see what it does.
 
 Prints the page's address and runs until Ctrl-C. Whoever is in control there starts tasks; the robot comes to rest when
-nobody is heard for 0.3 s and is lowered after 2 s. Each run writes a flight log. The page is never the only stop: keep
-a hand on the robot's own, or on Ctrl-C here.
+nobody is heard for 0.3 s and is lowered after 2 s. Each run writes a flight log, unless the page says otherwise. The
+page is never the only stop: keep a hand on the robot's own, or on Ctrl-C here.
 """
 
 from __future__ import annotations
@@ -93,10 +93,10 @@ def run_task(report: Report, args: argparse.Namespace, link: PageLink, request: 
             robot=args.robot,
             policy=args.policy,
             seed=seed,
-            gain=args.gain,
+            gain=args.gain * request.gain,
             set=request.set,
             start=True,  # somebody at the page has just said so
-            record=free_name(request.task, args.logs),
+            record=free_name(request.task, args.logs) if request.on else None,
             realtime=True,
             port=args.port,
             recover=args.recover,
@@ -110,6 +110,7 @@ def run_task(report: Report, args: argparse.Namespace, link: PageLink, request: 
             raise
         report.line(f"{request.task}: stopped before it began")
         return
-    report.line(f"{request.task}: {result.outcome} after {result.seconds:.1f} s, log {result.log}")
+    kept = "not recorded" if result.log is None else f"log {result.log}"
+    report.line(f"{request.task}: {result.outcome} after {result.seconds:.1f} s, {kept}")
     if result.interrupted and not link.read().halt:
         raise KeyboardInterrupt

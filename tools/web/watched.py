@@ -6,10 +6,12 @@ from dataclasses import replace
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.task import Assignment
+from servoid.hw.robot.description import load_robot
 from servoid.stack.log.tick import Listener, TickRecord
 from servoid.stack.runtime.operator import Operator
 from servoid.stack.runtime.result import Result
 from servoid.stack.runtime.run import Confirm, RunSettings, prepare, run
+from servoid.stack.skills.skill import load_skills
 from servoid.stack.tasks import find
 from servoid.tools.common.exit_codes import explain
 from servoid.tools.web.line.link import PageLink
@@ -66,17 +68,19 @@ def check_steered(settings: RunSettings) -> bool:
 
 
 def _info(settings: RunSettings, assignment: Assignment, simulated: bool) -> RunInfo:
-    episode = assignment.episode
+    episode, task = assignment.episode, assignment.task
+    skills = load_skills(load_robot(settings.robot)) if task.steered and task.performs else {}
     scene = episode.scene
     return RunInfo(
         robot=settings.robot,
-        title=assignment.task.name,
+        title=task.name,
         backend=settings.backend,
         policy=settings.policy,
         simulated=simulated,
         goal=episode.goal,
         reach=episode.reach,
         path=episode.path,
+        skills=tuple(skills),
         pillars=None if scene is None else len(scene.pillars),
     )
 

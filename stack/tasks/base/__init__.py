@@ -119,7 +119,7 @@ class BaseTask:
     description: str = ""  # in a line
     settings_type: ClassVar[type[Settings]] = Settings
     steered: ClassVar[bool] = False  # by a person, who needs real time
-    performs: ClassVar[bool] = False  # skills that are asked for
+    performs: bool = False  # skills that are asked for
     counts_undone: ClassVar[tuple[str, ...]] = ()  # metrics that hold of a run that never began, too
     guided_by_velocity_alone: ClassVar[bool] = False  # whether no other term of the cost is about its instructions
 

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
@@ -72,6 +73,7 @@ class PerformSkills(BaseTask):
         """Raises ConfigError for a skill that there is not, or a sentence that asks for none."""
         super().__init__(settings, dt, robot)
         self._robot = robot or shipped_robot()
+        self._clips: dict[str, Array] = {}
         for name in _listed(settings.name, ","):
             if name != ANY:
                 chosen(name, self.skills)
@@ -84,6 +86,12 @@ class PerformSkills(BaseTask):
     @cached_property
     def words(self) -> SkillWords:
         return SkillWords(load_encoder(), self.skills)
+
+    def _goals(self, skill: Skill) -> Array:
+        """Joint positions `(ticks, n_joints)` rad of a skill's clip."""
+        if skill.name not in self._clips:
+            self._clips[skill.name] = clip_of(skill, self._robot).joints
+        return self._clips[skill.name]
 
     def _skill_of(self, text: str) -> str:
         found = self.words.understand(text)
@@ -192,7 +200,7 @@ class PerformSkills(BaseTask):
         last = self.skills.get(episode.skills[-1])
         if last is None or trace.joints is None or not episode.performs:
             return float("nan")
-        goals = clip_of(last, self._robot).joints
+        goals = self._goals(last)
         first = episode.begins[-1]
         until = min(episode.ends, len(trace.joints)) - len(goals) + 1
         errors = [

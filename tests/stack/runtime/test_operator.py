@@ -121,3 +121,34 @@ def test_a_sentence_that_means_nothing_moves_nothing() -> None:
     asked = [record.proposal.instruction for record in ticks if record.proposal.instruction is not None]
     assert not any(instruction.velocity.any() for instruction in asked)
     assert result.outcome == "succeeded"
+
+
+@pytest.mark.slow
+def test_a_skill_is_performed_each_time_that_it_is_asked_for_and_an_unknown_one_never(tmp_path: Path) -> None:
+    def wants(tick: int) -> Intent:
+        if tick < BEGIN:
+            return Intent()
+        if tick < BEGIN + 50:
+            return Intent(skill="rm -rf", skills=1)  # a page may say anything
+        return Intent(skill="nod", skills=2) if tick < BEGIN + 275 else Intent(skill="nod", skills=3)
+
+    log = tmp_path / "run.mcap"
+    result, _ = watched("steer", wants, log, seconds=12.0)
+    told = [event.text for event in result.events if event.kind == "skill"]
+    assert told == ["'nod' begins", "'nod' is over"] * 2, result.events
+    assert result.outcome == "timed_out" or result.success
+    assert replay.replay(read_log(log))[1] is None
+
+
+def test_a_sentence_may_ask_for_a_skill_and_walking_leaves_it() -> None:
+    said = {0: Intent(text="nod"), 50: Intent(text="walk forward"), 100: Intent(way=FORWARD)}
+
+    def wants(tick: int) -> Intent:
+        return said[max((at for at in said if at <= tick - BEGIN), default=0)]
+
+    _, ticks = watched("steer", wants, seconds=6.0)
+    asked = {record.tick - BEGIN: record.proposal.instruction for record in ticks if record.proposal.instruction}
+    assert asked[20].skill == "nod"
+    assert asked[60].skill is None
+    assert asked[60].velocity[0] > 0.05
+    assert asked[110].velocity[0] == 0.25

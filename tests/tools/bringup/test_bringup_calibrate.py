@@ -32,6 +32,7 @@ from servoid.tools.bringup.calibrate import MOVED, check_range, directions_of, t
 from servoid.tools.bringup.calibration.encoders import Encoders
 from servoid.tools.bringup.calibration.hands import Person
 from servoid.tools.bringup.calibration.turning import describe_turns
+from servoid.tools.bringup.desk.terminal import Desk
 from servoid.tools.common.output import Report
 
 ROBOT = load_robot()
@@ -189,7 +190,7 @@ def test_a_person_is_told_the_angles_of_a_pose_that_is_not_all_zero(
 ) -> None:
     """Nobody could put a robot into a pose of which the name is all that is said."""
     monkeypatch.setattr("sys.stdin", io.StringIO("\n\n"))
-    hands = Person(Report(False, sys.stdout))
+    hands = Person(Desk(Report(False, sys.stdout)))
     hands.pose(dict(zip(ROBOT.names, ROBOT.home.tolist(), strict=True)), "the home pose")
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert rows[0] == ["joint", "rad", "degrees"]

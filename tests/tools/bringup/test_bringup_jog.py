@@ -21,7 +21,7 @@ from servoid.sim.rig.in_process import InProcessLine
 from servoid.sim.rig.process.control import RigProcess
 from servoid.sim.rig.rig import Rig
 from servoid.tools.bringup import watch
-from servoid.tools.bringup.jogging import IDLE_SECONDS, KEY_SECONDS, SPAN, SPEED, There, Wish, reach, restrict
+from servoid.tools.bringup.desk.jogging import IDLE_SECONDS, KEY_SECONDS, SPAN, SPEED, There, Wish, reach, restrict
 from servoid.tools.bringup.line import Line
 from servoid.tools.cli import main
 
@@ -178,7 +178,7 @@ def test_there_and_back_ends_where_it_began(rate: int, missed: int, by: float) -
         wish = source.wish(tick / rate, angle)
         if wish is Wish.END:
             break
-        angle += wish.value * way
+        angle += wish.rate * way
         path.append(angle)
     assert wish is Wish.END
     farthest = max(path, key=lambda angle: abs(angle - 0.5))
@@ -196,7 +196,7 @@ def test_there_and_back_ends_where_the_guard_lets_the_joint_go_no_further(by: fl
         wish = source.wish(tick / 50, angle)
         if wish is Wish.END:
             break
-        angle = min(max(angle + wish.value * SPEED / 50, -SPAN), SPAN)
+        angle = min(max(angle + wish.rate * SPEED / 50, -SPAN), SPAN)
         farthest = max(farthest, angle, key=abs)
     assert wish is Wish.END
     assert abs(farthest) == pytest.approx(SPAN, abs=SPEED / 50)
@@ -212,7 +212,7 @@ def test_a_motion_there_and_back_has_an_end_whatever_the_joint_does() -> None:
 
 def test_a_burst_of_keys_moves_no_further_than_one_and_idleness_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """Thirty repeats that a slow line held up and delivered at once must not become a second of motion."""
-    from servoid.tools.bringup import jogging
+    from servoid.tools.bringup.desk import jogging
 
     master, slave = os.openpty()
     monkeypatch.setattr("sys.stdin", os.fdopen(slave, "r", closefd=False))

@@ -25,8 +25,9 @@ from servoid.stack.control.gait import GaitPolicy
 from servoid.tools import cli
 from servoid.tools.learn.collect.disturbances import Disturbances, DisturbanceSettings, joint_noise
 from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
-from servoid.tools.learn.collect.lerobot import DatasetWriter, Feature, Schema
 from servoid.tools.learn.collect.skills import SKILLS, skills_of
+from servoid.tools.learn.dataset.lerobot import DatasetWriter
+from servoid.tools.learn.dataset.schema import Feature, Schema
 
 TICKS = 250  # 5 s
 COMMAND = "collect --policy gait --plain-odometry --worlds 8 --frames 1500 --seconds 5 --threads 1 --json --out"
@@ -363,7 +364,7 @@ def _interrupt(*_: object, **__: object) -> None:
 
 
 def test_files_are_split_by_size_and_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("servoid.tools.learn.collect.lerobot.FILE_MEGABYTES", 0.1)
+    monkeypatch.setattr("servoid.tools.learn.dataset.lerobot.FILE_MEGABYTES", 0.1)
     out = tmp_path / "d"
     write(out, 6)
     episodes = pq.read_table(out / "meta" / "episodes" / "chunk-000" / "file-000.parquet").to_pylist()

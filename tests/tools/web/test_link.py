@@ -14,6 +14,7 @@ from servoid.hw.contracts.operator import Halt
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, prepare, run
 from servoid.stack.safety.event import Event
+from servoid.tools.web.line.panel import Panel, Paragraph
 from servoid.tools.web.line.snapshot import RunInfo
 
 INFO = RunInfo("op3", "walk", "sim", "gait", simulated=True)
@@ -141,3 +142,27 @@ def test_rubbish_from_the_page_is_no_wish(line: Line) -> None:
         line.page.send(data)
     assert line.link.read().halt is Halt.NO
     assert line.link.alive
+
+
+def test_what_is_asked_for_on_a_panel_arrives_in_its_order_and_the_newest_panel_is_shown(line: Line) -> None:
+    line.ask("do", what="save", value="wave")
+    line.ask("do", what="play", value="")
+    assert [request.what for request in line.link.take_actions()] == ["save", "play"]
+    assert line.link.take_actions() == []
+    for number in range(20_000):  # more than fits any line
+        line.link.show(Panel(f"number {number}", ()))
+    line.told()
+    line.link.show(Panel("the last", (Paragraph("here"),)))
+    assert line.told()[-1] == (
+        "panel", {"kind": "panel", "title": "the last", "items": [{"is": "paragraph", "text": "here"}]},
+    )  # fmt: skip
+
+
+def test_a_skill_of_the_page_is_wanted_until_something_else_is(line: Line) -> None:
+    line.ask("skill", text="wave")
+    line.ask("beat", way=(0.0, 0.0, 0.0))
+    assert (line.link.read().skill, line.link.read().skills) == ("wave", 1)
+    line.ask("skill", text="wave")
+    assert line.link.read().skills == 2
+    line.ask("beat", way=(1.0, 0.0, 0.0))
+    assert line.link.read().skill is None

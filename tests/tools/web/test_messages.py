@@ -19,6 +19,9 @@ EXAMPLES = {
     "set": {"vx": "0.1"},
     "on": True,
     "at": 2.5,
+    "gain": 0.6,
+    "what": "slide l_knee",
+    "value": "0.25",
 }
 
 

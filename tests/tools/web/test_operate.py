@@ -24,7 +24,7 @@ def arguments(folder: Path) -> argparse.Namespace:
 
 def test_a_task_is_run_as_the_page_asks_and_the_page_is_told_how_it_ended(tmp_path: Path) -> None:
     line, said = Line(), io.StringIO()
-    request = PageRequest("start", 1, 0.0, task="stand", set={"seconds": "1"})
+    request = PageRequest("start", 1, 0.0, task="stand", set={"seconds": "1"}, on=True, gain=0.9)
     operate.run_task(Report(False, said), arguments(tmp_path), line.link, request, seed=0)
     assert "stand: succeeded after 1.0 s" in said.getvalue()
     told = line.told()

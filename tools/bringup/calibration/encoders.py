@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -20,8 +20,16 @@ PERIOD_NS = 30_000_000
 class Encoders:
     """Servo angles `(n_joints,)` rad from the centre tick, in -pi..pi. Differences are the short way round."""
 
-    def __init__(self, bus: Bus, clock: Clock, robot: Robot, found: Sequence[Found]) -> None:
-        self.names, self._bus, self._clock = robot.names, bus, clock
+    def __init__(
+        self,
+        bus: Bus,
+        clock: Clock,
+        robot: Robot,
+        found: Sequence[Found],
+        seen: Callable[[Array], None] = lambda angles: None,
+    ) -> None:
+        """`seen` is told each sample."""
+        self.names, self._bus, self._clock, self._seen = robot.names, bus, clock, seen
         self._group = GroupRead.of("present_position", {servo.joint.id: servo.table for servo in found})
         self._items = [s.table.item("present_position") for s in found]
         self._center = np.array([servo.center_tick for servo in robot.servos])
@@ -34,7 +42,9 @@ class Encoders:
             self._bus.sync_read(self._group)
             if all(self._group.fresh):
                 ticks = [item.decode(data or b"") for item, data in zip(self._items, self._group.data, strict=True)]
-                return short((np.array(ticks) - self._center) * self._tick)
+                angles = short((np.array(ticks) - self._center) * self._tick)
+                self._seen(angles)
+                return angles
         silent = self.names[self._group.fresh.index(False)]
         raise BackendError(f"{silent} does not answer any more: check its cable and its power, then begin again")
 

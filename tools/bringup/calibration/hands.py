@@ -8,8 +8,8 @@ from typing import Protocol
 
 from servoid.hw.robot.description import Robot
 from servoid.sim.rig.process.control import Control
+from servoid.tools.bringup.desk.terminal import Desk
 from servoid.tools.common.output import Report
-from servoid.tools.common.prompt import confirm
 
 TURN = 0.35  # rad that the virtual rig's hands turn a joint by
 
@@ -33,14 +33,14 @@ class Hands(Protocol):
 class Person:
     """Reads what to do, and does it. Turning is seen by itself, as both hands are on the robot."""
 
-    def __init__(self, report: Report) -> None:
-        self._report = report
+    def __init__(self, desk: Desk) -> None:
+        self._desk, self._report = desk, desk.report
 
     def pose(self, angles: Mapping[str, float], text: str) -> None:
         if any(angles.values()):
             rows = [(name, f"{angle:+.3f}", f"{math.degrees(angle):+.0f}") for name, angle in angles.items()]
             self._report.table(("joint", "rad", "degrees"), rows)
-        confirm(text, "calibrate at a terminal, with the robot in your hands")
+        self._desk.confirm(text, "calibrate at a terminal, with the robot in your hands")
 
     def turn(self, joint: str, sign: int, text: str) -> None:
         self._report.line(text)

@@ -20,8 +20,8 @@ def prepare(path: Path, size: str) -> tuple[int, int]:
     Raises ConfigError naming what is in the way, or what is missing.
     """
     _check_new(path)
-    chosen = _size(size)
-    _choose_drawing()
+    chosen = film_size(size, "--video-size")
+    choose_filming("--video")
     return chosen
 
 
@@ -39,28 +39,28 @@ def _check_new(path: Path) -> None:
         raise ConfigError(f"--video {path}: cannot be written ({error.strerror}): give another name") from None
 
 
-def _size(text: str) -> tuple[int, int]:
-    """Width and height of `1280x720`. Raises ConfigError."""
+def film_size(text: str, option: str) -> tuple[int, int]:
+    """Width and height of `1280x720`. Raises ConfigError naming the option."""
     width, _, height = text.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
-        raise ConfigError(f"--video-size {text}: give width and height, such as 1280x720")
+        raise ConfigError(f"{option} {text}: give width and height, such as 1280x720")
     size = int(width), int(height)
     if min(size) < 120 or max(size) > 4096 or any(side % 2 for side in size):
-        raise ConfigError(f"--video-size {text}: give even numbers from 120 to 4096")
+        raise ConfigError(f"{option} {text}: give even numbers from 120 to 4096")
     return size
 
 
-def _choose_drawing() -> None:
-    """Find packages and a way to draw a film. Raises ConfigError naming what is missing."""
+def choose_filming(what: str) -> None:
+    """Find packages and a way to draw a film. Raises ConfigError naming what is missing for `what`."""
     if any(find_spec(name) is None for name in ("av", "matplotlib", "PIL")):
-        raise ConfigError("--video: this needs the 'video' extra: pip install 'servoid[video]'")
+        raise ConfigError(f"{what}: this needs the 'video' extra: pip install 'servoid[video]'")
     import av
 
     try:
         av.Codec("libx264", "w")
     except av.error.FFmpegError:
-        raise ConfigError("--video: the installed 'av' cannot write H.264: pip install --force-reinstall av") from None
-    choose_drawing("--video")
+        raise ConfigError(f"{what}: the installed 'av' cannot write H.264: pip install --force-reinstall av") from None
+    choose_drawing(what)
 
 
 def choose_drawing(what: str) -> None:

@@ -46,7 +46,7 @@ def make_video(
     if not log.messages["/state"]:
         raise VideoError("the log holds no state")
     rows, captions = _rows(log), FilmCaptions(log)
-    frames, (width, height) = _frames(log, rows), size
+    frames, (width, height) = shown_frames(log, rows), size
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with av.open(str(path), "w") as container:
@@ -72,7 +72,8 @@ def _rows(log: FlightLog) -> Array:
     return np.flatnonzero(ticks >= (first[0] if len(first) else 0))[::step]
 
 
-def _frames(log: FlightLog, rows: Array) -> list[Frame]:
+def shown_frames(log: FlightLog, rows: Array) -> list[Frame]:
+    """What a film shows of these rows of the log's states."""
     from servoid.sim.marks import Frame
 
     ticks, first, plans = log.ticks("/state"), flightpath.task_ticks(log), flightpath.plans(log)

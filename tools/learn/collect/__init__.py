@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
     from servoid.tools.learn.collect.disturbances import DisturbanceSettings
     from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
-    from servoid.tools.learn.collect.lerobot import Feature
+    from servoid.tools.learn.dataset.schema import Feature
 
 LICENCE = "Apache-2.0"
 MIRRORING = "applied when read (servoid.policy.diffusion.dataset): each window also serves with left and right swapped"
@@ -118,8 +118,9 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
     from servoid.stack.estimation.odometry import load_odometry
     from servoid.tools.learn.collect.disturbances import DisturbanceSettings
     from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
-    from servoid.tools.learn.collect.lerobot import DatasetWriter, Schema
     from servoid.tools.learn.collect.skills import SKILLS
+    from servoid.tools.learn.dataset.lerobot import DatasetWriter
+    from servoid.tools.learn.dataset.schema import Schema
 
     begin = time.perf_counter()
     robot = load_robot(args.robot)
@@ -158,7 +159,7 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
 def _features(robot: Robot) -> dict[str, Feature]:
     """The dataset's columns and the names of their numbers."""
     from servoid.policy.features import recorded_names
-    from servoid.tools.learn.collect.lerobot import Feature
+    from servoid.tools.learn.dataset.schema import Feature
 
     notes = {
         "observation.state": {"mirroring": MIRRORING},

@@ -1,8 +1,9 @@
-"""Make clips from a file: an action file of ROBOTIS (.bin), or a flight log of this project (.mcap).
+"""Make clips from an action file of ROBOTIS (.bin), a flight log of this project (.mcap) or a LeRobot dataset.
 
 From an action file it plays the chain of pages that starts with --page, as the firmware does, in physics, which gives
 the motion of the base; or it makes all clips of a --recipe, a YAML file that lists pages, names and captions. From a
-flight log it takes the goals that were sent and the motion of the base that the robot estimated.
+flight log it takes the goals that were sent and the motion of the base that the robot estimated. From a dataset it
+takes the actions of an --episode, and the motion of the base, or where there is none that of physics.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import Robot, load_robot
+from servoid.policy.checkpoint import difference
 from servoid.policy.motion.clip import POSES, Clip
 from servoid.tools.common.exit_codes import DONE
 from servoid.tools.common.output import add_json_argument, reporting
@@ -24,13 +26,16 @@ from servoid.tools.motions.verbs.options import add_out_arguments, out_library
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, metavar="FILE", help="action file (.bin) or flight log (.mcap)")
+    parser.add_argument(
+        "file", type=Path, metavar="FILE", help="action file (.bin), flight log (.mcap) or dataset (folder)"
+    )
     parser.add_argument(
         "--recipe", metavar="NAME|FILE", help="clips to make of an action file, such as op3-action-file"
     )
     one = parser.add_argument_group("one clip, instead of a recipe")
     one.add_argument("--name", help="name of the clip")
     one.add_argument("--page", type=int, metavar="N", help="first page of an action file")
+    one.add_argument("--episode", type=int, metavar="N", help="episode of a dataset (default: the only one)")
     one.add_argument(
         "--caption", action="append", default=[], metavar="TEXT", help="what the clip shows; may be repeated"
     )
@@ -47,13 +52,25 @@ def main(args: argparse.Namespace) -> int:
     """Raises ConfigError."""
     with reporting(args.json) as report:
         robot = load_robot(args.robot)
-        if args.file.suffix not in (".bin", ".mcap"):
-            raise ConfigError(f"{args.file}: not an action file (.bin) or a flight log (.mcap)")
+        if args.file.suffix not in (".bin", ".mcap") and not args.file.is_dir():
+            raise ConfigError(
+                f"{args.file}: not an action file (.bin), a flight log (.mcap) or the folder of a dataset"
+            )
+        for option, fits in (("page", args.file.suffix == ".bin"), ("episode", args.file.is_dir())):
+            if vars(args)[option] is not None and not fits:
+                raise ConfigError(f"--{option} {vars(args)[option]}: {args.file} has none: drop it")
         recipe = _recipe(args)
         library = out_library(args, robot)
         clips: Iterable[Clip]
         if args.file.suffix == ".bin":
             clips = make_clips(args.file, recipe, robot)
+        elif args.file.is_dir():
+            from servoid.tools.motions.episodes import clip_of_episode
+
+            wanted = recipe.clips[0]
+            source = f"dataset {args.file.resolve().name}, episode {args.episode or 0}"
+            about = wanted.about(source, recipe.licence)
+            clips = [clip_of_episode(args.file, args.episode, robot, wanted.name, about)]
         else:
             clips = [_from_log(args.file, recipe.clips[0], recipe.licence, robot)]
         made = []
@@ -74,7 +91,7 @@ def _recipe(args: argparse.Namespace) -> Recipe:
         if args.name is not None or args.page is not None:
             raise ConfigError("--recipe names its clips itself: drop --name and --page")
         if args.file.suffix != ".bin":
-            raise ConfigError(f"--recipe {args.recipe}: is for action files; for a flight log use --name")
+            raise ConfigError(f"--recipe {args.recipe}: is for action files: use --name instead")
         return load_recipe(args.recipe)
     for option in ("name", "caption", "licence"):
         if not vars(args)[option]:
@@ -94,9 +111,12 @@ def _from_log(file: Path, wanted: PageClip, licence: str, robot: Robot) -> Clip:
     if len(ticks) < 2:
         raise ConfigError(f"{file}: holds no motion, because its task never started")
     states, commands = (np.isin(log.ticks(channel), ticks) for channel in ("/state", "/command"))
+    theirs = tuple(joint["name"] for joint in log.header["robot"]["joints"])
+    if theirs != robot.names:
+        raise ConfigError(f"{file}: is of another robot than {robot.name}: {difference(theirs, robot.names)}")
+    if (rate := log.header["robot"]["rate"]) != robot.rate:
+        raise ConfigError(f"{file}: was recorded at {rate} ticks a second, and {robot.name} runs at {robot.rate}")
     goals = log.column("/command", "position")[commands]
-    if goals.shape[1] != len(robot.joints):
-        raise ConfigError(f"{file}: has {goals.shape[1]} joints, and {robot.name} {len(robot.joints)}")
     place, turn, contact = (
         log.column("/state", field)[states].astype(float) for field in ("displacement", "orientation", "contact")
     )

@@ -130,6 +130,8 @@ class PageProcess:
             self._scene.begin(value)
             self._phase, self._plan, self._insists = Phase.LIMP, None, value.insists
             self._server.renew()
+        elif kind == "panel":
+            self._server.panel = json.dumps(value or {"kind": "panel"}, allow_nan=False)
         elif kind == "end":
             self._telemetry.end(*value)
             self._phase = self._halted = None

@@ -24,7 +24,7 @@ from servoid.tools.web.browser.meshes import meshes
 from servoid.tools.web.line.snapshot import BodyPose, RunInfo, Snapshot
 
 WORLD = "/world"
-TRUTH_COLOUR, TRUTH_OPACITY = (60, 110, 220), 0.35
+TRUTH_COLOUR, BESIDE_COLOUR, OPACITY = (60, 110, 220), (225, 130, 30), 0.35
 CONTACT_COLOUR = (40, 170, 90)
 FOLLOW = 0.15  # share of the way to the robot that the picture goes each frame
 CELL = 0.5  # m of the floor's grid
@@ -75,6 +75,7 @@ class Scene3D:
         self._robot_parts = self._add_robot("robot", None)
         self._truth = server.scene.add_frame(f"{WORLD}/truth", show_axes=False, visible=False)
         self._truth_parts = self._add_robot("truth", TRUTH_COLOUR)
+        self._beside: Any = None  # drawn once something is to be compared with
         self._contacts = [self._add_contact(name) for name in robot.feet]
         up = np.array([0.0, 0.0, robot.standing_height])
         self._put(self._robot_parts, BodyPose(up, np.array([1.0, 0.0, 0.0, 0.0]), robot.home))
@@ -106,6 +107,7 @@ class Scene3D:
                 self._put(self._truth_parts, snapshot.truth)
             if self._truth.visible != shown:
                 self._truth.visible = shown
+            self._show_beside(snapshot.beside)
             self._show_marks(snapshot)
 
     def close(self) -> None:
@@ -122,7 +124,7 @@ class Scene3D:
                 mesh.vertices.astype(np.float32),
                 mesh.faces.astype(np.uint32),
                 color=mesh.colour if colour is None else colour,
-                opacity=mesh.opacity if colour is None else TRUTH_OPACITY,
+                opacity=mesh.opacity if colour is None else OPACITY,
                 flat_shading=True,
                 cast_shadow=colour is None,
             )
@@ -139,6 +141,15 @@ class Scene3D:
         positions, orientations = self._figure.pose(pose.place, pose.orientation, pose.joints)
         for part, position, orientation in zip(parts, positions, orientations, strict=True):
             part.position, part.wxyz = position, orientation
+
+    def _show_beside(self, pose: BodyPose | None) -> None:
+        if pose is not None and self._beside is None:
+            self._beside = self._server.scene.add_frame(f"{WORLD}/beside", show_axes=False)
+            self._beside_parts = self._add_robot("beside", BESIDE_COLOUR)
+        if pose is not None:
+            self._put(self._beside_parts, pose)
+        if self._beside is not None and self._beside.visible != (pose is not None):
+            self._beside.visible = pose is not None
 
     def _show_contact(self, contact: Array | None) -> None:
         for number, mark in enumerate(self._contacts):

@@ -29,6 +29,7 @@ FILES = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/page.js": ("page.js", "text/javascript; charset=utf-8"),
     "/draw.js": ("draw.js", "text/javascript; charset=utf-8"),
+    "/panel.js": ("panel.js", "text/javascript; charset=utf-8"),
     "/page.css": ("page.css", "text/css; charset=utf-8"),
 }
 FRAME_SECONDS = 0.05  # between two frames of numbers
@@ -44,6 +45,7 @@ class PageServer:
         self._frame, self._version = "", 0  # the newest frame, and how many there were
         self._begun = 0  # how many runs have begun or ended
         self.tasks: list[dict[str, str]] = []  # that can be started from here
+        self.panel = ""  # the newest one, as JSON; none where the program has none
         self.gone: str | None = None  # why no more comes
 
     async def listen(self, path: Path) -> Server:
@@ -104,7 +106,7 @@ class PageServer:
 
     async def _tell(self, who: int, connection: ServerConnection) -> None:
         """Send a browser what is new, as quickly as it takes it."""
-        begun, shown, event, stands = -1, 0, 0, ""
+        begun, shown, event, stands, panel = -1, 0, 0, "", ""
         while True:
             if begun != self._begun:
                 begun = self._begun
@@ -116,6 +118,9 @@ class PageServer:
             if shown != self._version:
                 shown = self._version
                 await connection.send(self._frame)
+            if panel != self.panel:
+                panel = self.panel
+                await connection.send(panel)
             if stands != (now := self._standing(who)):
                 stands = now
                 await connection.send(now)

@@ -107,6 +107,7 @@ class Telemetry:
                 "path": _numbers(info.path),
                 "length": info.length,
                 "steers": info.steers,
+                "skills": info.skills,
             },
             "outcome": self.outcome,
         }

@@ -12,6 +12,7 @@ import math
 import pickle
 import socket
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -22,12 +23,14 @@ from servoid.hw.contracts.world import Truth
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.event import Event
 from servoid.tools.web.line.messages import HALTS, LONGEST, OPEN, PageRequest, parse_request
+from servoid.tools.web.line.panel import Panel
 from servoid.tools.web.line.snapshot import RunInfo, Snapshot, Snapshots
 
 ROOM = 1 << 20  # bytes on the way to the page: some hundred ticks
 MOST = 64  # requests that are read in one tick: a page that floods waits its turn
 TAKEN = {"start", "seek", "play"}  # kinds of wishes that are no part of what is wanted of a run
 KEPT = 1000  # events that wait for a page which takes nothing
+MOST_ACTIONS = 256  # that wait for a program which takes none
 
 
 class PageLink:
@@ -45,11 +48,13 @@ class PageLink:
         self._snapshots = Snapshots()
         self._waiting: list[Event] = []
         self._untold: list[bytes] = []  # what must arrive, in its order
+        self._panel: bytes | None = None  # the newest one, where it was not taken yet
         self._truth: Truth | None = None
         self._shows_truth = False
         self._intent = Intent()
         self._heard_ns: int | None = None
         self._wishes: dict[str, PageRequest] = {}  # the newest of each kind that `take` hands out
+        self._actions: deque[PageRequest] = deque(maxlen=MOST_ACTIONS)
 
     @property
     def alive(self) -> bool:
@@ -70,6 +75,12 @@ class PageLink:
         """It has ended: how, in a word and in a sentence."""
         self._truth = None
         self._tell("end", (outcome, text))
+
+    def show(self, panel: Panel | None) -> None:
+        """Put a panel on the page, in the place of the one before; None: none."""
+        values = None if panel is None else panel.plain()
+        self._panel = pickle.dumps(("panel", values), pickle.HIGHEST_PROTOCOL)
+        self._flush()
 
     def __call__(self, record: TickRecord) -> None:
         """Publish a tick."""
@@ -107,6 +118,13 @@ class PageLink:
             self._intent = Intent(request.sequence)
         return request
 
+    def take_actions(self) -> list[PageRequest]:
+        """What was asked for on the panel since the last look, in its order: requests of kind "do"."""
+        self._receive()
+        taken = list(self._actions)
+        self._actions.clear()
+        return taken
+
     def close(self) -> None:
         """Hang up: the page says that its program has ended, and ends."""
         if self._stream is not None:
@@ -121,7 +139,9 @@ class PageLink:
         """Send what must arrive; whether all of it was taken."""
         while self._untold and self._send(self._untold[0]):
             del self._untold[0]
-        return not self._untold
+        if not self._untold and self._panel is not None and self._send(self._panel):
+            self._panel = None
+        return not self._untold and self._panel is None
 
     def _send(self, message: bytes) -> bool:
         """Whether the page's end of the line took a message; it may be full, or gone."""
@@ -166,6 +186,8 @@ class PageLink:
             self._shows_truth = request.on
         elif request.kind in TAKEN:
             self._wishes[request.kind] = request
+        elif request.kind == "do":
+            self._actions.append(request)
         elif request.kind not in OPEN:
             self._heard_ns = self._clock()
             wish = _after(wish, request)
@@ -182,12 +204,15 @@ def _after(wish: Intent, request: PageRequest) -> Intent:
     if request.kind == "beat":
         way = np.array(request.way)
         if way.any():  # sticks that are let go leave a goal standing
-            return replace(wish, way=way, goal=None, text=None)
+            return replace(wish, way=way, goal=None, text=None, skill=None)
         return replace(wish, way=way)
+    still = replace(wish, way=np.zeros(3), goal=None, text=None, skill=None)
     if request.kind == "goal":
-        return replace(wish, way=np.zeros(3), goal=np.array(request.place), text=None)
+        return replace(still, goal=np.array(request.place))
     if request.kind == "text":
-        return replace(wish, way=np.zeros(3), goal=None, text=request.text)
+        return replace(still, text=request.text)
+    if request.kind == "skill":
+        return replace(still, skill=request.text, skills=wish.skills + 1)
     if request.kind == "rest":
-        return replace(wish, way=np.zeros(3), goal=None, text=None)
+        return still
     return replace(wish, ends=True) if request.kind == "end" else wish

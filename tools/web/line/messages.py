@@ -26,7 +26,9 @@ KINDS: dict[str, dict[str, str]] = {
     "text": {"text": "text"},  # do that
     "rest": {},  # stand still
     "end": {},  # end the task
-    "start": {"task": "name", "set": "settings"},  # begin a task
+    "skill": {"text": "text"},  # perform the skill of that name
+    "start": {"task": "name", "set": "settings", "gain": "gain", "on": "switch"},  # begin a task; on: keep a log
+    "do": {"what": "name", "value": "string"},  # what an item of the panel asks for
     "stop": {},  # come to rest, be lowered, torque off
     "off": {},  # torque off at once
     "seek": {"at": "seconds"},  # of a log: go to a moment
@@ -51,6 +53,9 @@ class PageRequest:
     set: dict[str, str] = field(default_factory=dict)
     on: bool = False
     at: float = 0.0  # s
+    gain: float = 1.0  # of the servos, for a soft start
+    what: str = ""
+    value: str = ""
 
     def encode(self) -> bytes:
         """As `parse_request` reads it."""
@@ -125,6 +130,12 @@ def _settings(value: Any) -> dict[str, str]:
     return {_filled(name): _string(text) for name, text in value.items()}
 
 
+def _gain(value: Any) -> float:
+    if (gain := _number(value, 1.0)) <= 0.0:
+        raise ValueError("a gain that is not above 0")
+    return gain
+
+
 def _switch(value: Any) -> bool:
     if not isinstance(value, bool):
         raise ValueError("neither true nor false")
@@ -139,6 +150,8 @@ _READ = {
     "place": lambda value: _numbers(value, 2, FARTHEST),
     "text": _filled,
     "name": _filled,
+    "string": _string,
+    "gain": _gain,
     "settings": _settings,
     "switch": _switch,
 }

@@ -34,6 +34,7 @@ class RunInfo:
     insists: bool = True  # whether a wish to stop that is not heeded is sent as the signal of Ctrl-C
     length: float | None = None  # s of a log that is looked back into; None: a run
     events: tuple[Event, ...] = ()  # that are known from the beginning: of a log
+    skills: tuple[str, ...] = ()  # that can be asked for
     pillars: int | None = None  # how many of the obstacles stand, the first ones; the others roll. None: all stand
 
 
@@ -76,6 +77,7 @@ class Snapshot:
     robots: Array | None = None  # (n, 3): x, y m and heading rad
     plan: Array | None = None  # (n, 2) m: where the robot means to go, where a plan was adopted at this tick
     truth: BodyPose | None = None
+    beside: BodyPose | None = None  # another pose to be compared with: of a reference, or of another run
     events: tuple[Event, ...] = field(default=())
 
 

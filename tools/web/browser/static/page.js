@@ -2,6 +2,7 @@
 // sequence number, this browser's time and, where there is one, the token.
 
 import { Plot, drawMap, COLOURS } from "./draw.js";
+import { PanelView } from "./panel.js";
 
 const byId = (id) => document.getElementById(id);
 const token = location.pathname.split("/")[1] || null;
@@ -11,6 +12,8 @@ const HISTORY = 20; // s
 const DEAD = 0.1; // of a stick's way
 
 let socket = null, sequence = 0, hello = null, frame = null, holder = "nobody", gone = null, lost = false;
+const panel = new PanelView(byId("panel"), (what, value) => send("do", { what, value: String(value) }));
+let panelled = false;
 let frames = [], chosen = new Set(), map = null;
 const held = new Set(); // keys
 const pads = { walk: [0, 0], turn: [0, 0] };
@@ -52,6 +55,10 @@ function hear(message) {
     offer(message.tasks);
     stand();
     banner();
+  } else if (message.kind === "panel") {
+    panelled = Boolean(message.items);
+    panel.show(panelled ? message : null);
+    arrange();
   } else if (message.kind === "refused") {
     byId("answer").textContent = `Refused: ${message.text}.`;
   }
@@ -69,7 +76,7 @@ function way() {
   const key = (plus, minus) => (plus.some((k) => held.has(k)) ? speed : 0) - (minus.some((k) => held.has(k)) ? speed : 0);
   const sticks = gamepad();
   const parts = [
-    key(["w", "arrowup"], ["s", "arrowdown"]) - pads.walk[1] + sticks[0],
+    key(["w", "arrowup"], ["s", "arrowdown"]) - pads.walk[1] + sticks[0] + panel.pushed(),
     key(["q"], ["e"]) - pads.walk[0] + sticks[1],
     key(["a", "arrowleft"], ["d", "arrowright"]) - pads.turn[0] + sticks[2],
   ];
@@ -158,7 +165,7 @@ byId("start").onsubmit = (event) => {
   event.preventDefault();
   const words = byId("settings").value.split(/\s+/).filter(Boolean);
   const set = Object.fromEntries(words.map((word) => [word.split("=")[0], word.split("=").slice(1).join("=")]));
-  send("start", { task: byId("task").value, set });
+  send("start", { task: byId("task").value, set, gain: Number(byId("gain").value), on: byId("record").checked });
 };
 byId("task").onchange = describe;
 
@@ -177,11 +184,22 @@ function begin() {
   byId("run").textContent = run ? [run.title, run.policy, run.backend].filter(Boolean).join(", ") : "";
   if (!hello.history.length && !run?.length) byId("events").replaceChildren();
   byId("timeline").hidden = !run?.length;
-  document.body.classList.toggle("looking-back", Boolean(run?.length));
-  document.body.classList.toggle("looking-on", run?.steers === false);
+  arrange();
+  byId("skills").replaceChildren(...(run?.skills ?? []).map((text) => {
+    const button = Object.assign(document.createElement("button"), { textContent: text.replaceAll("-", " "), type: "button" });
+    button.onclick = () => send("skill", { text });
+    return button;
+  }));
   if (run?.length) byId("moment").max = run.length;
   if (byId("joints").tBodies[0].rows.length !== hello.joints.length) makeTable();
   banner();
+}
+
+function arrange() {
+  const run = hello?.run;
+  document.body.classList.toggle("looking-back", Boolean(run?.length));
+  document.body.classList.toggle("looking-on", run?.steers === false && !panelled);
+  document.body.classList.toggle("panelled", panelled);
 }
 
 function makeTable() {
@@ -244,6 +262,7 @@ function stand() {
   byId("control").textContent = mine ? "Give up control" : holder === "other" ? "Somebody else is in control" : "Take control";
   byId("control").classList.toggle("held", mine);
   for (const id of ["rest", "end"]) byId(id).disabled = !mine;
+  for (const id of ["skills", "panel"]) byId(id).disabled = !mine;
   for (const form of ["say", "start"]) byId(form).querySelector("button").disabled = !mine;
   if (mine) byId("answer").textContent = "";
 }

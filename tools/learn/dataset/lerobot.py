@@ -1,23 +1,26 @@
-"""Writes LeRobot v3.0 datasets without cameras: many episodes a parquet file, found again through tables of metadata.
+"""Writes LeRobot v3.0 datasets: many episodes a parquet file, found again through tables of metadata.
 
     meta/info.json                             schema, counts, path templates
-    meta/stats.json                            minimum, maximum, mean, deviation and count of every feature
+    meta/stats.json                            minimum, maximum, mean, deviation, count and quantiles of each feature
     meta/tasks.parquet                         texts and their numbers
     meta/episodes/chunk-000/file-000.parquet   one row an episode: length, tasks, where it lies, its own statistics
     data/chunk-000/file-000.parquet            one row a frame, one row group an episode
+    videos/CAMERA/chunk-000/file-000.mp4       the film of an episode
 
-A dataset appears under its name when it is whole: until then it grows in a `.part` folder beside it. Rows go to disk
-as episodes come, and hold nothing of the day or the machine: the same episodes make the same files.
+A dataset appears under its name when it is whole: until then it grows in a `.part` folder beside it; one that is
+appended to is linked there. Rows go to disk as episodes come, and hold nothing of the day or the machine:
+the same episodes make the same files.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -26,59 +29,37 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
+from servoid.tools.learn.dataset.reader import VERSION, Dataset, read_dataset
+from servoid.tools.learn.dataset.schema import INDEX, DatasetFilm, Schema, check_same_kind, info_features
+from servoid.tools.learn.dataset.statistics import KEYS, Statistics, statistics, together
 
-VERSION = "v3.0"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 FILES_A_CHUNK = 1000
 FILE_MEGABYTES = 100
-_VIDEO_FILE_MEGABYTES = 200  # no video is written, but the format's own tools look for the key
-
-# Columns that the format asks for beside the features; all scalars.
-_INDEX = {
-    "timestamp": "float32",  # s from the start of the episode
-    "frame_index": "int64",
-    "episode_index": "int64",
-    "index": "int64",  # over the whole dataset
-    "task_index": "int64",
-}
-_STATISTICS = ("min", "max", "mean", "std", "count")
+_VIDEO_FILE_MEGABYTES = 200  # the format's own tools look for the key; here each episode has a file
 
 
-@dataclass(frozen=True)
-class Feature:
-    """A float32 vector recorded every frame: the names of its numbers, and notes for the reader."""
-
-    names: tuple[str, ...]
-    info: Mapping[str, str] | None = None
-
-
-@dataclass(frozen=True)
-class Schema:
-    """What a dataset holds."""
-
-    robot_type: str
-    fps: int  # rows a second
-    features: Mapping[str, Feature]  # by column name
-    tasks: tuple[str, ...]  # the texts that `task_index` numbers
-
-
-def check_target(out: Path, force: bool) -> None:
+def check_target(out: Path, force: bool, append: bool = False) -> None:
     """Refuse a folder that may not be written. Raises ConfigError.
 
-    `force` allows to replace a dataset; a folder with anything else in it is never replaced.
+    `force` allows to replace a dataset, `append` to add to one; a folder with anything else in it is never replaced.
     """
     if out.name in ("", ".."):
         raise ConfigError(f"{out}: not a name for a dataset; name a folder to create, such as runs/walks")
     if out.is_dir() and any(out.iterdir()):
         if not (out / "meta" / "info.json").is_file():
             raise ConfigError(f"{out}: holds something other than a dataset; choose another folder")
-        if not force:
-            raise ConfigError(f"{out}: already holds a dataset; choose another folder, or replace it with --force")
+        if not force and not append:
+            raise ConfigError(
+                f"{out}: already holds a dataset; choose another folder, add to it with --append, or replace it with "
+                "--force"
+            )
     elif out.exists() and not out.is_dir():
         raise ConfigError(f"{out}: is a file; name a folder to create")
     part = _part(out)
-    if part.exists() and not (part.is_dir() and {p.name for p in part.iterdir()} <= {"data", "meta"}):
+    if part.exists() and not (part.is_dir() and {p.name for p in part.iterdir()} <= {"data", "meta", "videos"}):
         raise ConfigError(f"{part}: is where the unfinished dataset would go; move it, or choose another folder")
 
 
@@ -92,8 +73,9 @@ class DatasetWriter:
     Every method raises ConfigError when the disk does not take what is written.
     """
 
-    def __init__(self, out: Path, schema: Schema, force: bool = False) -> None:
-        check_target(out, force)
+    def __init__(self, out: Path, schema: Schema, force: bool = False, append: bool = False) -> None:
+        """`append` adds to the dataset in `out`, where there is one. Raises ConfigError where that is another kind."""
+        check_target(out, force, append)
         self.out, self._part, self.schema = out, _part(out), schema
         self.episodes = 0
         self.frames = 0
@@ -101,10 +83,30 @@ class DatasetWriter:
         self._file_bytes = math.inf  # in it; a new one is due
         self._writer: Any = None
         self._rows: list[dict[str, Any]] = []  # of meta/episodes
-        self._total: dict[str, dict[str, Array]] = {}
+        self._numbers = list(range(len(schema.tasks)))  # that the schema's tasks have here
+        before = read_dataset(out) if append and out.is_dir() and any(out.iterdir()) else None
+        if before is not None:
+            check_same_kind(before, info_features(schema), schema)
         with self._writing():
             shutil.rmtree(self._part, ignore_errors=True)  # of a run that was killed
             (self._part / "meta").mkdir(parents=True)
+            if before is not None:
+                self._go_on_from(before)
+
+    def _go_on_from(self, before: Dataset) -> None:
+        for path in sorted((*before.files, *self.out.glob("videos/*/chunk-*/file-*.mp4"))):
+            linked = self._part / path.relative_to(self.out)
+            linked.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                os.link(path, linked)
+            except OSError:  # a file system without links
+                shutil.copy2(path, linked)
+        tasks = list(dict.fromkeys((*before.tasks, *self.schema.tasks)))
+        self._numbers = [tasks.index(text) for text in self.schema.tasks]
+        self.schema = replace(self.schema, tasks=tuple(tasks))
+        self._rows = before.episodes
+        self.episodes, self.frames = len(before.episodes), int(before.info["total_frames"])
+        self._file = max(row["data/chunk_index"] * FILES_A_CHUNK + row["data/file_index"] for row in before.episodes)
 
     def __enter__(self) -> DatasetWriter:
         return self
@@ -113,8 +115,11 @@ class DatasetWriter:
         if error is not None:
             self._abandon()
 
-    def add(self, columns: Mapping[str, Array], task_index: Array) -> None:
-        """Append an episode: a `(frames, size)` array for each feature, and the number of each frame's task."""
+    def add(
+        self, columns: Mapping[str, Array], task_index: Array, films: Mapping[str, DatasetFilm] | None = None
+    ) -> None:
+        """Append an episode: a `(frames, size)` array for each feature, the number of each frame's task, and a film of
+        as many frames for each camera."""
         frames = len(task_index)
         for name, feature in self.schema.features.items():
             if columns[name].shape != (frames, len(feature.names)):
@@ -124,13 +129,9 @@ class DatasetWriter:
         whole["frame_index"] = np.arange(frames)
         whole["episode_index"] = np.full(frames, self.episodes)
         whole["index"] = self.frames + np.arange(frames)
-        whole["task_index"] = np.asarray(task_index, np.int64)
+        whole["task_index"] = np.asarray(self._numbers, np.int64)[np.asarray(task_index, np.int64)]
         with self._writing():
             self._write_rows(whole)
-        statistics = {name: _statistics(values) for name, values in whole.items()}
-        self._total = {
-            name: _merge(self._total[name], part) if name in self._total else part for name, part in statistics.items()
-        }
         chunk, file = divmod(self._file, FILES_A_CHUNK)
         order = list(dict.fromkeys(whole["task_index"].tolist()))
         row: dict[str, Any] = {
@@ -142,12 +143,30 @@ class DatasetWriter:
             "dataset_from_index": self.frames,
             "dataset_to_index": self.frames + frames,
         }
-        for name, part in statistics.items():
-            row |= {f"stats/{name}/{key}": part[key].tolist() for key in _STATISTICS}
+        found = {name: statistics(values) for name, values in whole.items()}
+        for name in self.schema.cameras:
+            film = (films or {})[name]
+            row |= self._take(film, name, frames)
+            found[name] = film.statistics
+        for name, part in found.items():
+            row |= {f"stats/{name}/{key}": part[key].tolist() for key in KEYS}
         row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
         self._rows.append(row)
         self.episodes += 1
         self.frames += frames
+
+    def _take(self, film: DatasetFilm, camera: str, frames: int) -> dict[str, Any]:
+        chunk, file = divmod(self.episodes, FILES_A_CHUNK)
+        path = self._part / VIDEO_PATH.format(video_key=camera, chunk_index=chunk, file_index=file)
+        with self._writing():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(film.path, path)
+        return {
+            f"videos/{camera}/chunk_index": chunk,
+            f"videos/{camera}/file_index": file,
+            f"videos/{camera}/from_timestamp": 0.0,
+            f"videos/{camera}/to_timestamp": frames / self.schema.fps,
+        }
 
     def finish(self, extra: Mapping[str, str] | None = None) -> None:
         """Write the metadata, with the text files `extra` beside it in meta/, and give the dataset its name."""
@@ -181,23 +200,27 @@ class DatasetWriter:
         import pyarrow.parquet as pq
 
         meta = self._part / "meta"
-        (meta / "info.json").write_text(json.dumps(self._info(), indent=4) + "\n")
-        statistics = {name: {key: total[key].tolist() for key in _STATISTICS} for name, total in self._total.items()}
-        (meta / "stats.json").write_text(json.dumps(statistics, indent=4) + "\n")
+        info = self._info()
+        (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n")
         pq.write_table(_tasks_table(self.schema.tasks), meta / "tasks.parquet")
+        total = self._statistics(Dataset(self._part, info, self.schema.tasks, self._rows))
+        plain = {name: {key: part[key].tolist() for key in KEYS} for name, part in total.items()}
+        (meta / "stats.json").write_text(json.dumps(plain, indent=4) + "\n")
         path = self._part / EPISODES_PATH.format(chunk_index=0, file_index=0)
         path.parent.mkdir(parents=True)
         pq.write_table(pa.Table.from_pylist(self._rows), path)
         for name, text in extra.items():
             (meta / name).write_text(text, encoding="utf-8")
 
+    def _statistics(self, written: Dataset) -> dict[str, Statistics]:
+        """Of all frames, read again a column at a time: quantiles of a whole do not follow from those of its parts."""
+        found = {name: statistics(written.columns([name])[name]) for name in (*self.schema.features, *INDEX)}
+        for name in self.schema.cameras:
+            parts = [{key: np.asarray(row[f"stats/{name}/{key}"]) for key in KEYS} for row in self._rows]
+            found[name] = together(parts)
+        return found
+
     def _info(self) -> dict[str, Any]:
-        features: dict[str, Any] = {}
-        for name, feature in self.schema.features.items():
-            features[name] = {"dtype": "float32", "shape": [len(feature.names)], "names": list(feature.names)}
-            if feature.info:
-                features[name]["info"] = dict(feature.info)
-        features |= {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in _INDEX.items()}
         return {
             "codebase_version": VERSION,
             "robot_type": self.schema.robot_type,
@@ -210,8 +233,8 @@ class DatasetWriter:
             "fps": self.schema.fps,
             "splits": {"train": f"0:{self.episodes}"},
             "data_path": DATA_PATH,
-            "video_path": None,
-            "features": features,
+            "video_path": VIDEO_PATH if self.schema.cameras else None,
+            "features": info_features(self.schema),
         }
 
     def _publish(self) -> None:
@@ -280,30 +303,3 @@ def _tasks_table(tasks: Sequence[str]) -> Any:
     }
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
-
-
-def _statistics(values: Array) -> dict[str, Array]:
-    """Of `(frames, size)` or `(frames,)`: each `(size,)` or `(1,)`, and the count `(1,)`."""
-    rows = values.reshape(len(values), -1)
-    return {
-        "min": rows.min(0),
-        "max": rows.max(0),
-        "mean": rows.mean(0, dtype=np.float64),
-        "std": rows.std(0, dtype=np.float64),
-        "count": np.array([len(rows)]),
-    }
-
-
-def _merge(a: Mapping[str, Array], b: Mapping[str, Array]) -> dict[str, Array]:
-    """Statistics of two sets of frames together (the parallel form of the variance)."""
-    count = a["count"] + b["count"]
-    step = b["mean"] - a["mean"]
-    mean = a["mean"] + step * b["count"] / count
-    spread = a["std"] ** 2 * a["count"] + b["std"] ** 2 * b["count"] + step**2 * a["count"] * b["count"] / count
-    return {
-        "min": np.minimum(a["min"], b["min"]),
-        "max": np.maximum(a["max"], b["max"]),
-        "mean": mean,
-        "std": np.sqrt(spread / count),
-        "count": count,
-    }

@@ -13,9 +13,8 @@ import select
 import sys
 import termios
 import tty
-from dataclasses import replace
-from enum import Enum
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol
 
 from servoid.hw.contracts.body import Array, Observation
 from servoid.hw.contracts.control import State
@@ -34,13 +33,20 @@ PAUSE_SECONDS = 1.0  # at the far end of a motion that was asked for on the comm
 SPARE_SECONDS = 2.0  # that such a motion may take beyond its way and the pause
 
 
-class Wish(Enum):
-    """What the person wants now."""
+@dataclass(frozen=True)
+class Wish:
+    """What the person wants now: to move at a share of SPEED, -1..1, or to end."""
 
-    HOLD = 0
-    UP = 1
-    DOWN = -1
-    END = 2
+    rate: float = 0.0
+    ends: bool = False
+
+    HOLD: ClassVar[Wish]
+    UP: ClassVar[Wish]
+    DOWN: ClassVar[Wish]
+    END: ClassVar[Wish]
+
+
+Wish.HOLD, Wish.UP, Wish.DOWN, Wish.END = Wish(), Wish(1.0), Wish(-1.0), Wish(ends=True)
 
 
 class Source(Protocol):
@@ -100,12 +106,12 @@ class JogSupervisor:
             self._began = self._last = tick
         wish = self._source.wish((tick - self._began) * self._robot.dt, float(self._guard.applied[self._i]))
         ticks, self._last = tick - self._last, tick
-        if wish is Wish.END:
+        if wish.ends:
             self._guard.stop("task", "done")
             return Proposal()
         target = self._guard.applied.copy()
-        if wish is not Wish.HOLD:
-            target[self._i] += wish.value * SPEED * self._robot.dt * max(1, ticks)
+        if wish.rate:
+            target[self._i] += wish.rate * SPEED * self._robot.dt * max(1, ticks)
         return Proposal(target)
 
 
