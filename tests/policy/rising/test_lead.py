@@ -47,7 +47,7 @@ def test_it_waits_for_joints_that_are_on_their_way() -> None:
     lead = Rising(ROBOT, PAIR)
     lead.begin(np.ones((), bool), FRONT)
     late = lead.target.copy()
-    late[3] += 1.0
+    late[3] += 1.5
     lead.advance(np.zeros(()), FRONT, lead.target, late)
     assert float(lead.time) == 0.0
     beyond = ROBOT.upper + 5.0  # what is asked out of range is never reached, and not waited for
