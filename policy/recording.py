@@ -20,6 +20,8 @@ from servoid.policy.checkpoint import difference
 from servoid.policy.features import recorded_names
 
 COLUMNS = ("observation.state", "action", "action_applied", "command", "episode_index", "frame_index")
+CLOCK = "clock"  # column of a recording of skills: s since the one that is told began
+SKILLS_NOTE = "skills"  # beside it: their names, in the order of their tasks' numbers, which follow those of walking
 
 
 class DatasetError(ConfigError):
@@ -36,6 +38,15 @@ class Recording:
     command: Array  # (rows, 3) m/s forward, m/s left, rad/s that were asked
     episode: Array  # (rows,) int
     info: dict[str, Any]  # meta/info.json
+    told: Array | None = None  # (rows,) int, number of the task; None: walks alone, told by their commands
+    clock: Array | None = None  # (rows,) s since the skill began that is told, 0 of a walk
+
+    @property
+    def skills(self) -> tuple[str, ...]:
+        """Names of the skills that are performed: those of tasks that follow the motions of walking."""
+        if self.told is None:
+            return ()
+        return tuple(self.info["features"][CLOCK]["info"][SKILLS_NOTE].split(", "))
 
     @cached_property
     def spans(self) -> Array:
@@ -69,13 +80,16 @@ def read_recording(folder: Path, robot: Robot) -> Recording:
                 "record another one with `servoid collect`"
             )
     sizes = {name: len(ours) for name, ours in names.items()}
-    parts: dict[str, list[Array]] = {name: [] for name in COLUMNS}
+    columns_read: tuple[str, ...] = COLUMNS
+    if skills := CLOCK in info.get("features", {}):
+        sizes[CLOCK], columns_read = 1, (*COLUMNS, CLOCK, "task_index")
+    parts: dict[str, list[Array]] = {name: [] for name in columns_read}
     for file in files:
         try:
             table = pq.read_table(file)
         except (pa.ArrowInvalid, OSError) as error:
             raise DatasetError(f"{file}: not a parquet file, or a truncated one ({error})") from error
-        for name in COLUMNS:
+        for name in columns_read:
             if name not in table.column_names:
                 raise DatasetError(f"{file}: no column '{name}'; it has {', '.join(table.column_names)}")
             column = table.column(name).combine_chunks()
@@ -106,4 +120,6 @@ def read_recording(folder: Path, robot: Robot) -> Recording:
         command=columns["command"],
         episode=columns["episode_index"],
         info=info,
+        told=columns["task_index"] if skills else None,
+        clock=columns[CLOCK][:, 0] if skills else None,
     )

@@ -79,7 +79,10 @@ VERBS: dict[str, Verb] = {
     ),
     "tune": Verb(
         "search for what suits a robot best",
-        verbs={"gait": Verb("search for the steps that a robot walks best by", "servoid.tools.robots.tune_gait")},
+        verbs={
+            "gait": Verb("search for the steps that a robot walks best by", "servoid.tools.robots.tune_gait"),
+            "kick": Verb("search for a harder kick that stays on its feet", "servoid.tools.robots.tune_kick"),
+        },
     ),
     "collect": Verb("record demonstrations as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(

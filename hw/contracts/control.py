@@ -96,6 +96,8 @@ class Instruction:
     velocity: Array  # (..., 3) m/s forward, m/s left, rad/s: base, heading frame
     goal: Array | None = None  # (..., 2) m in the heading frame, from the base
     text: str | None = None  # a sentence that says what to do; None: go by the velocity; empty: by neither
+    texts: tuple[str, ...] | None = None  # one for each world, instead of `text`
+    since: Array | None = None  # (...,) s since the skill began that `text` tells; None: it tells none
     path: Array | None = None  # (n, 2) m in the heading frame: where to be at the next n ticks
     obstacles: Array | None = None  # (n, 5) in the heading frame: x, y, radius m, velocity m/s; to be kept clear of
     keyframes: Keyframes | None = None

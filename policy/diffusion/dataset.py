@@ -16,32 +16,32 @@ from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.features import Emphasis, Normaliser, raw_mirror, to_tokens
 from servoid.policy.latent.actions import LatentActions
 from servoid.policy.recording import DatasetError, Recording
-from servoid.policy.text.captions import MOTIONS, mirrored, motion_of
 from servoid.policy.text.encoder import load_encoder
+from servoid.policy.text.told import Told, clock_code
+
+HELD_OUT = 0.02  # share of the episodes, evenly spread and at least one, that is kept for validation
 
 
 class Captions:
-    """Encoded phrasings of each tick's command: what the windows are told."""
+    """Encoded phrasings of what each tick is told, and how long it has lasted."""
 
-    def __init__(self, command: Array, encoder: str, top: Array) -> None:
-        """`command` is `(rows, 3)`, `top` `(3,)` the robot's top speeds."""
-        self._motion = torch.from_numpy(motion_of(command, top))
-        self._mirrored = torch.from_numpy(mirrored(np.arange(len(MOTIONS))))
-        self._count = torch.tensor([len(motion.phrasings) for motion in MOTIONS])
+    def __init__(self, told: Told, encoder: str, waves: int = 0) -> None:
+        """`waves` of the clock: none without one."""
+        self._label, self._mirrored = torch.from_numpy(told.label), torch.from_numpy(told.mirrored)
+        self._count = torch.tensor([len(phrasings) for phrasings in told.phrasings])
         reader, longest = load_encoder(encoder), int(self._count.max())
-        self.size = reader.size
-        self._text = torch.zeros(len(MOTIONS), longest, reader.size)
-        for i, motion in enumerate(MOTIONS):
-            self._text[i, : len(motion.phrasings)] = torch.from_numpy(reader.encode(motion.phrasings))
+        self.size = reader.size + 2 * waves
+        self._text = torch.zeros(len(told.phrasings), longest, reader.size)
+        for i, phrasings in enumerate(told.phrasings):
+            self._text[i, : len(phrasings)] = torch.from_numpy(reader.encode(phrasings))
+        self._clock = torch.from_numpy(clock_code(told.clock, waves))
 
     def of(self, rows: Tensor, mirrored: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Encoded captions `(batch, size)` of `rows` `(batch,)`: a phrasing drawn, or the first without `generator`."""
-        motion = self._motion[rows]
-        motion = torch.where(mirrored, self._mirrored[motion], motion)
-        if generator is None:
-            return self._text[motion, 0]
-        share = torch.rand(len(rows), generator=generator)
-        return self._text[motion, (share * self._count[motion]).long()]
+        label = self._label[rows]
+        label = torch.where(mirrored, self._mirrored[label], label)
+        share = torch.zeros(len(rows)) if generator is None else torch.rand(len(rows), generator=generator)
+        return torch.cat([self._text[label, (share * self._count[label]).long()], self._clock[rows]], 1)
 
 
 class Windows:
@@ -52,12 +52,12 @@ class Windows:
         recording: Recording,
         robot: Robot,
         config: DenoiserConfig,
-        held_out: float = 0.02,
+        told: Told | None = None,
         emphasis: float = 0.0,
         seed: int = 0,
         latents: LatentActions | None = None,
     ) -> None:
-        """A share `held_out` of the episodes, evenly spread and at least one, is kept for validation.
+        """What rows were `told`; None: the motion of walking that was commanded.
 
         `emphasis` of global states, drawn from `seed`: see `features.Emphasis`; 0 for none. With `latents` actions are
         the posterior means of what was demonstrated, each given the state of its tick, instead of joint targets.
@@ -74,12 +74,13 @@ class Windows:
                 f"{len(long)} of {len(spans)} episodes are longer than the {first + last + 1} ticks of a window, "
                 "and two are needed; record longer ones"
             )
-        every = max(2, round(1 / held_out))
+        every = max(2, round(1 / HELD_OUT))
         kept = np.arange(len(long)) % every == 0
         # A window shows what one command does: one that changes on the way leads anywhere, and a robot that stands, and
         # may start at any tick to come, puts it off for ever. Starts and stops are where a command is new.
+        told = told or Told.walks(recording.command, robot.walking.scale)
         change = np.r_[True, np.any(np.diff(recording.command, axis=0) != 0.0, axis=1)]
-        segment = np.cumsum(change)
+        segment = np.cumsum(change | told.changes)
         self.validation = self._presents(long[kept], first, last, segment)
         self.training = self._presents(long[~kept], first, last, segment)
         if not len(self.training) or not len(self.validation):
@@ -89,7 +90,8 @@ class Windows:
             self._both_sides(recording.raw, targets, Mirror.joints(robot))
             for targets in (recording.action, recording.applied)
         )
-        self.captions = Captions(recording.command, config.text, robot.walking.scale) if config.text else None
+        self.captions = Captions(told, config.text, config.clock) if config.text else None
+        self._has_image = torch.from_numpy((told.mirrored >= 0)[told.label])
         states, actions = self._fit()
         if emphasis:
             states = Emphasis.of(states, self.n_joints, emphasis, seed)
@@ -113,7 +115,7 @@ class Windows:
         generator = torch.Generator().manual_seed(0)
         count = min(samples, len(self.training))
         pick = self.training[torch.randint(len(self.training), (count,), generator=generator)]
-        drawn = [self._gather(pick, torch.full((len(pick),), mirrored)) for mirrored in (False, True)]
+        drawn = [self._gather(pick, self._has_image[pick] & mirrored) for mirrored in (False, True)]
         states, actions = (torch.cat([part[i] for part in drawn]).flatten(0, 1).numpy() for i in (0, 1))
         return Normaliser.fit(states), Normaliser.fit(actions)
 
@@ -131,13 +133,13 @@ class Windows:
         return to_tokens(raw, raw[:, past], self.n_joints), actions
 
     def draw(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor | None]:
-        """A normalised training batch, each window mirrored with probability one half.
+        """A normalised training batch, each window that has a mirror image mirrored with probability one half.
 
         Shapes `(batch, state tokens, state size)`, `(batch, action tokens, action size)`, `(batch, text size)`;
         without an encoder the last is None.
         """
         present = self.training[torch.randint(len(self.training), (batch,), generator=generator)]
-        mirrored = torch.rand(batch, generator=generator) < 0.5
+        mirrored = (torch.rand(batch, generator=generator) < 0.5) & self._has_image[present]
         text = self.captions.of(present, mirrored, generator) if self.captions else None
         return *self._encode(self._gather(present, mirrored)), text
 
@@ -145,7 +147,7 @@ class Windows:
         """Up to `count` normalised validation windows, the same every time."""
         pick = torch.linspace(0, len(self.validation) - 1, min(count, len(self.validation))).long()
         present = self.validation[pick]
-        mirrored = torch.arange(len(present)) % 2 == 1
+        mirrored = (torch.arange(len(present)) % 2 == 1) & self._has_image[present]
         text = self.captions.of(present, mirrored) if self.captions else None
         return *self._encode(self._gather(present, mirrored)), text
 

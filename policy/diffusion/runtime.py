@@ -32,6 +32,7 @@ from servoid.policy.features import Trajectory, joints_seen, raw_layout, to_raw,
 from servoid.policy.text.captions import MOTIONS, caption, motion_of
 from servoid.policy.text.encoder import load_encoder
 from servoid.policy.text.nearest_phrase import Phrasebook
+from servoid.policy.text.told import clock_code
 
 # (trajectory, instruction) -> cost (batch,), as tasks define it
 Cost = Callable[[Trajectory, Instruction], Any]
@@ -71,6 +72,8 @@ class Runtime:
         self._encoder = load_encoder(config.text) if config.text and settings.text_weight else None
         self._phrasebook = Phrasebook(self._encoder) if self._encoder and settings.text_nearest else None
         self._read: dict[str, Tensor] = {}  # instructions that were encoded
+        # Phrasings of skills are told as they are; who tells them has chosen one that the model knows.
+        self._skills = {text for texts in model.header.get("skills", {}).values() for text in texts}
         self._used = tuple(torch.from_numpy(mask) for mask in settings.used(config))
         self._state_mask = torch.from_numpy(config.state_ticks <= 0) & self._used[0]
 
@@ -241,16 +244,23 @@ class Runtime:
         if self._encoder is None or instruction.text == "":
             return None
         velocity = instruction.velocity
-        if instruction.text is not None:
+        if instruction.texts is not None:
+            sentences = list(instruction.texts)
+        elif instruction.text is not None:
             sentences = [instruction.text] * batch
         elif velocity.ndim == 1:
             sentences = [caption(velocity, self._top)] * batch
         else:
             sentences = [MOTIONS[i].phrasings[0] for i in motion_of(velocity, self._top)]
         for sentence in set(sentences) - self._read.keys():
-            phrasing = self._phrasebook.familiar(sentence) if self._phrasebook else sentence
+            book = None if sentence in self._skills else self._phrasebook
+            phrasing = book.familiar(sentence) if book else sentence
             self._read[sentence] = torch.from_numpy(self._encoder.encode([phrasing])[0])
-        return torch.stack([self._read[sentence] for sentence in sentences])
+        codes = torch.stack([self._read[sentence] for sentence in sentences])
+        if not (waves := self.model.config.clock):
+            return codes
+        since = np.zeros(batch) if instruction.since is None else np.broadcast_to(instruction.since, batch)
+        return torch.cat([codes, torch.from_numpy(clock_code(since, waves))], 1)
 
     def _guidance(self, instruction: Instruction) -> Guidance | None:
         if (cost := self.cost) is None:

@@ -12,7 +12,7 @@ from servoid.hw.contracts.control import Reference, ReferenceFrames
 from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import Clip, smooth
 from servoid.policy.references.clip import ClipReference
-from servoid.policy.references.gait import Gait
+from servoid.policy.references.gait import Gait, GaitSettings
 
 _BLEND_SECONDS = 0.5  # from a clip's end, which stands at home or nearly, to the gait
 
@@ -20,9 +20,12 @@ _BLEND_SECONDS = 0.5  # from a clip's end, which stands at home or nearly, to th
 class GaitOrClip(Reference):
     """Two references of leading dimensions `shape`: `gait`, to be commanded, and `clip`. It begins with the gait."""
 
-    def __init__(self, robot: Robot, clips: Sequence[Clip], shape: tuple[int, ...] = ()) -> None:
-        """Raises ConfigError without a clip, or where one leaves the joint ranges."""
-        self.gait, self.clip = Gait(robot, shape), ClipReference(robot, clips, shape)
+    def __init__(
+        self, robot: Robot, clips: Sequence[Clip], shape: tuple[int, ...] = (), settings: GaitSettings | None = None
+    ) -> None:
+        """`settings` are the gait's, by default the robot's own. Raises ConfigError without a clip, or where one leaves
+        the joint ranges."""
+        self.gait, self.clip = Gait(robot, shape, settings), ClipReference(robot, clips, shape)
         self.on_clip = np.zeros(shape, bool)
         self._offset = np.zeros((*shape, len(robot.joints)))  # of the pose that the gait was entered in
         self._since = np.zeros(shape)

@@ -47,6 +47,8 @@ class GaitSettings:
     acceleration: tuple[float, float, float]  # a second
     ankle_pitch_gain: float
     ankle_roll_gain: float
+    turning_gain: float = 1.0  # soles slip as they turn: how much further than asked steps turn
+    lift_loss: float = 0.0  # m that steps are lower at the faster speed of `even_swing`: knees are too slow for both
 
 
 @cache
@@ -75,6 +77,7 @@ def gait_of(robot: Robot) -> GaitSettings:
         foot_apart=float(beside.mean()),
         lean=stance.lean,
         lift=shipped.lift * size,
+        lift_loss=shipped.lift_loss * size,
         sway=shipped.sway * size,
         arm_swing=shipped.arm_swing / time,
         backward_lean=shipped.backward_lean / time,
@@ -194,12 +197,14 @@ class Gait(Reference):
         u = np.clip((local - start) / swing_share, 0.0, 1.0)  # 0..1 through the swing
         swinging = (u > 0) & (u < 1)
         stance = (local - start - swing_share) % 1.0 / (1.0 - swing_share)  # 0..1 through the stance
+        swift = np.interp(velocity[..., 0], s.even_swing, [0.0, 1.0])[..., None]
         even = np.interp(velocity[..., 0], s.even_swing, [1.0, _SMOOTH])[..., None]
         travel = np.where(swinging, -0.5 + u - even * np.sin(2 * np.pi * u) / (2 * np.pi), 0.5 - stance)  # back..front
         lift = np.where(swinging, np.sin(np.pi * u) ** 2, 0.0) * activity[..., None]
 
         period = (1.0 - swing_share) * s.cycle  # that a foot stands
-        vx, vy, wz = velocity[..., None, 0], s.sideways_gain * velocity[..., None, 1], velocity[..., None, 2]
+        vx, vy = velocity[..., None, 0], s.sideways_gain * velocity[..., None, 1]
+        wz = s.turning_gain * velocity[..., None, 2]
         backward = np.minimum(vx, 0.0)
         vx = vx + (s.backward_gain - 1.0) * backward
         yaw = wz * period * travel
@@ -207,7 +212,7 @@ class Gait(Reference):
         x = x0 + s.backward_shift * backward + (vx - wz * y0) * period * travel
         y = y0 + (vy + wz * x0) * period * travel
         y = y + (s.sway * activity * np.sin(2 * np.pi * phase))[..., None]  # away from the foot that steps
-        z = self._inverse.hip[:, 2] - s.height + s.lift * lift
+        z = self._inverse.hip[:, 2] - s.height + (s.lift - s.lift_loss * swift) * lift
         lean = self._lean(velocity[..., None, 0])
         cos, sin = np.cos(lean), np.sin(lean)
         ankle = np.stack([cos * x - sin * z, y, sin * x + cos * z], -1)  # seen from the leaning base

@@ -28,7 +28,7 @@ class TrackerObservation:
     """
 
     def __init__(self, robot: Robot, shape: tuple[int, ...] = (), *, clips: bool = False) -> None:
-        self._home, self._walking, self._clips = robot.home, robot.walking, clips
+        self._home, self._walking, self.clips = robot.home, robot.walking, clips
         self.ahead = FURTHER if clips else AHEAD  # ticks that `frames` are to be asked for
         n, feet = len(robot.joints), len(robot.feet)
         self._past = np.zeros((*shape, _HISTORY, n + 3))
@@ -63,7 +63,7 @@ class TrackerObservation:
         rise = 2.5 / m.height  # heights are seen from that of walking, speeds as shares of the fastest
         reference = (
             []
-            if not self._clips
+            if not self.clips
             else [
                 -up_vector(frames.root_orientation).reshape(*lead, -1),
                 0.1 * frames.joint_velocity[..., 0, :],

@@ -76,6 +76,13 @@ def yaw_rate(s: Step) -> Array:
     return _near(error, 0.6 * s.walking.turning, 0.2 * s.walking.turning)
 
 
+def turning(s: Step) -> Array:
+    """Share of the reference's yaw rate that is reached: it pulls where `yaw_rate` is flat."""
+    asked = s.reference_yaw_rate
+    turns = np.abs(asked) > 0.06 * s.walking.turning
+    return np.where(turns, np.clip(s.yaw_rate / np.where(turns, asked, 1.0), 0.0, 1.0), 1.0)
+
+
 def pose(s: Step) -> Array:
     """Joints near the reference's."""
     return _kernel(((s.joints - s.reference_joints) ** 2).mean(-1), 0.25)
@@ -181,8 +188,8 @@ def fall(s: Step) -> Array:
 TERMS: Mapping[str, Callable[[Step], Array]] = {
     term.__name__: term
     for term in (
-        velocity, progress, yaw_rate, pose, joints, orientation, base_height, travel, contact, clearance, upright,
-        height, sway_rate, slip, level_feet, impact, target_rate, target_acceleration, residual, residual_rate,
+        velocity, progress, yaw_rate, turning, pose, joints, orientation, base_height, travel, contact, clearance,
+        upright, height, sway_rate, slip, level_feet, impact, target_rate, target_acceleration, residual, residual_rate,
         residual_acceleration, effort, fall,
     )
 }  # fmt: skip

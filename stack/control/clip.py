@@ -10,6 +10,7 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import Clip
 from servoid.policy.references.clip import ClipReference
 from servoid.policy.references.either import GaitOrClip
+from servoid.stack.control.balance import Balance, Feedback
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.control.tracker import Tracker
 
@@ -21,12 +22,14 @@ _NOW = np.array([0])
 class ClipPolicy(BasePolicy):
     """Plays a clip once, from the pose that the robot is in, and stays in its last pose; of one robot or of `shape`.
 
-    Nothing is balanced: what the robot does between its feet and the ground is left to the clip. Raises ConfigError for
-    a clip that leaves the joint ranges.
+    Only what `balance` says answers a base that tilts; without, what the robot does between its feet and the ground is
+    left to the clip. Raises ConfigError for a clip that leaves the joint ranges.
     """
 
-    def __init__(self, robot: Robot, clip: Clip, shape: tuple[int, ...] = ()) -> None:
+    def __init__(self, robot: Robot, clip: Clip, shape: tuple[int, ...] = (), balance: Balance | None = None) -> None:
         self._reference = ClipReference(robot, [clip], shape)
+        self._gains = None if balance is None else balance.gains
+        self._feedback = Feedback(robot)
         self._entering = np.ones(shape, bool)
 
     def reset(self, where: Array | None, seeds: Array) -> None:
@@ -40,7 +43,9 @@ class ClipPolicy(BasePolicy):
             self._entering = np.zeros_like(self._entering)
         target = self._reference.frames(_NOW).position[..., 0, :]
         self._reference.advance()
-        return target
+        if self._gains is None:
+            return target
+        return self._feedback(target, state.gravity, state.angular_velocity, self._gains)
 
     @property
     def ended(self) -> bool:

@@ -7,17 +7,17 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.robot.description import Robot
-from servoid.policy.references.gait import Gait, GyroFeedback
+from servoid.policy.references.gait import Gait, GaitSettings, GyroFeedback
 from servoid.stack.control.base import BasePolicy
 
 _NOW = np.array([0])
 
 
 class GaitPolicy(BasePolicy):
-    """Walks one robot, or worlds of any leading `shape`."""
+    """Walks one robot, or worlds of any leading `shape`; by default as the robot's own gait is set."""
 
-    def __init__(self, robot: Robot, shape: tuple[int, ...] = ()) -> None:
-        self._gait, self._feedback = Gait(robot, shape), GyroFeedback(robot)
+    def __init__(self, robot: Robot, shape: tuple[int, ...] = (), settings: GaitSettings | None = None) -> None:
+        self._gait, self._feedback = Gait(robot, shape, settings), GyroFeedback(robot, settings)
 
     def reset(self, where: Array | None, seeds: Array) -> None:
         self._gait.reset(slice(None) if where is None else where)

@@ -22,6 +22,7 @@ from servoid.stack.control.base import BasePolicy
 
 if TYPE_CHECKING:
     from servoid.policy.diffusion.settings import DiffusionSettings
+    from servoid.policy.references.gait import GaitSettings
     from servoid.stack.control.closed_loop import ClosedLoopSettings
     from servoid.stack.control.diffusion import DiffusionPolicy
 
@@ -60,8 +61,15 @@ def _expert(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[
 def _gait(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
     from servoid.stack.control.gait import GaitPolicy
 
-    policy: Policy = GaitPolicy(robot, shape)
+    policy: Policy = GaitPolicy(robot, shape, _gait_settings(source, robot))
     return policy
+
+
+def _gait_settings(source: str, robot: Robot) -> GaitSettings:
+    """Raises ConfigError."""
+    from servoid.policy.references.gait import gait_of, load_gait
+
+    return gait_of(robot) if source == "gait" else load_gait(source)
 
 
 def _clip(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
@@ -133,6 +141,11 @@ def check_policy(name: str) -> None:
     _maker(name)
 
 
+def is_diffusion(name: str) -> bool:
+    """Whether a name or a file is of the diffusion policy. Raises ConfigError for an unknown one."""
+    return _maker(name) is _diffusion
+
+
 def make_policy(
     name: str,
     robot: Robot,
@@ -153,6 +166,19 @@ def make_policy(
     return _maker(name)(name, robot, task, realtime, shape)
 
 
+def skills_known(name: str, robot: Robot, planner: DiffusionSettings | None = None) -> tuple[str, ...]:
+    """Names of the skills that a policy performs by itself, when it is told them: those that its network learned.
+
+    `planner` are settings as in `make_policy`. Raises ConfigError.
+    """
+    from servoid.policy.checkpoint import read_header, resolve
+
+    if planner is None and _maker(name) is not _diffusion:
+        return ()
+    settings = planner or _planner(name)
+    return tuple(read_header(resolve(settings.checkpoint, robot)).get("skills", {}))
+
+
 def policy_fingerprint(name: str, robot: Robot | None = None) -> dict[str, Any]:
     """Name of a policy and what it is made of, for the flight log: its checkpoint and that of odometry by their hashes,
     settings of the planner, of a closed loop with its tracker or of the robot's gait, and the file of a user's own.
@@ -161,7 +187,7 @@ def policy_fingerprint(name: str, robot: Robot | None = None) -> dict[str, Any]:
     `robot` is by default the shipped one. Raises ConfigError.
     """
     from servoid.policy.checkpoint import resolve
-    from servoid.policy.references.gait import gait_of
+    from servoid.policy.tracker.network import gait_of_tracker
     from servoid.stack.log.provenance import described, sha256
 
     robot = robot or shipped_robot()
@@ -173,6 +199,9 @@ def policy_fingerprint(name: str, robot: Robot | None = None) -> dict[str, Any]:
     if (planned := planner or loop) is not None:
         named = planned.checkpoint
     checkpoint = None if named is None else resolve(named, robot)
+    gait = _gait_settings(name, robot) if maker is _gait else None
+    if maker is _expert and checkpoint is not None:
+        gait = gait_of_tracker(checkpoint, robot)
     return {
         "name": name,
         "checkpoint_sha256": None if checkpoint is None else sha256(checkpoint),
@@ -180,25 +209,29 @@ def policy_fingerprint(name: str, robot: Robot | None = None) -> dict[str, Any]:
         "planner": None if planner is None else described(planner),
         "closed_loop": None if loop is None else described(loop),
         "tracker_sha256": sha256(resolve(loop.tracker, robot)) if loop is not None and loop.tracker else None,
-        "gait": described(gait_of(robot)) if maker in (_gait, _expert) else None,
+        "gait": None if gait is None else described(gait),
         "source": None if own is None else own.source(),
     }
 
 
-def _is_loop(name: str) -> bool:
-    """Whether a file of settings is of planning in a closed loop: it names a tracker, be it none."""
+def _of_settings(name: str) -> Maker:
+    """Who takes a file of settings: planning in a closed loop, which names a tracker, be it none; a gait, which has
+    feet that carry both; or the diffusion policy."""
     path = find("policies", name)
     try:
-        return path.is_file() and "tracker" in (yaml.safe_load(path.read_text(encoding="utf-8")) or {})
-    except (OSError, UnicodeDecodeError, TypeError, yaml.YAMLError):
-        return False  # whoever loads it says what is wrong
+        keys = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        keys = None  # whoever loads it says what is wrong
+    if isinstance(keys, dict) and "tracker" in keys:
+        return _closed_loop
+    return _gait if isinstance(keys, dict) and "double_support" in keys else _diffusion
 
 
 def _maker(name: str) -> Maker:
     if name in POLICIES:
         return POLICIES[name]
     if name.endswith((".yaml", ".yml")) or name in available("policies"):
-        return _closed_loop if _is_loop(name) else _diffusion
+        return _of_settings(name)
     if name.endswith(".safetensors"):
         from servoid.policy.checkpoint import read_header
 

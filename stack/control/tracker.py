@@ -7,7 +7,7 @@ from servoid.hw.contracts.control import Instruction, Reference, State
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import CheckpointError, resolve
 from servoid.policy.references.gait import Gait
-from servoid.policy.tracker.network import load_tracker
+from servoid.policy.tracker.network import gait_of_tracker, load_tracker
 from servoid.policy.tracker.observation import RESIDUAL, TrackerObservation
 from servoid.stack.control.base import BasePolicy
 
@@ -36,10 +36,14 @@ class Tracker:
 
 
 class ExpertPolicy(BasePolicy):
-    """Walks one robot, or worlds of any leading `shape`. Raises CheckpointError when the tracker does not fit."""
+    """Walks one robot, or worlds of any leading `shape`, by the gait that the tracker learned on.
+
+    Raises CheckpointError when the tracker does not fit.
+    """
 
     def __init__(self, robot: Robot, checkpoint: str = "expert", shape: tuple[int, ...] = ()) -> None:
-        self._gait, self._tracker = Gait(robot, shape), Tracker(robot, checkpoint, shape)
+        gait = gait_of_tracker(resolve(checkpoint, robot), robot)
+        self._gait, self._tracker = Gait(robot, shape, gait), Tracker(robot, checkpoint, shape)
 
     def reset(self, where: Array | None, seeds: Array) -> None:
         self._gait.reset(slice(None) if where is None else where)

@@ -17,8 +17,9 @@ from servoid.hw.contracts.task import Assignment, Behaviour, Episode, Task
 from servoid.hw.dynamixel.calibration import calibrated
 from servoid.hw.robot.description import Robot, load_robot
 from servoid.hw.seeds import Stream, generator
+from servoid.policy.text.encoder import load_encoder
 from servoid.stack.control.get_up import GetUp, fingerprints, get_up
-from servoid.stack.control.policies import make_policy, policy_fingerprint
+from servoid.stack.control.policies import make_policy, policy_fingerprint, skills_known
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import odometry_of
 from servoid.stack.log.provenance import header
@@ -38,8 +39,9 @@ from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Guard
 from servoid.stack.safety.recovery import TRIES
 from servoid.stack.skills.runtime import SkillPolicy
+from servoid.stack.skills.skill import chosen, load_skills
 from servoid.stack.skills.skill import fingerprints as skill_fingerprints
-from servoid.stack.skills.skill import load_skills
+from servoid.stack.skills.telling import ToldPolicy
 from servoid.stack.tasks import load_task, source
 from servoid.stack.tasks.steer import SteeredAgain
 
@@ -188,8 +190,7 @@ class Run:
             settings.policy, robot, task, self.realtime, planner=self._script.planner
         )
         self._open.callback(self.policy.close)
-        if task.performs:
-            self.policy = SkillPolicy(robot, self.policy, load_skills(robot))
+        self.policy = self._with_skills(self.policy)
         self._interrupt.check()
         self._open.callback(body.close)
         self._open.callback(setattr, self._interrupt, "eager", False)  # a second Ctrl-C must not break off the closing
@@ -214,6 +215,21 @@ class Run:
         self.phases = Phases(
             self._controlled, self.assignment, self.behaviour, self.policy, body.simulation, recovering
         )
+
+    def _with_skills(self, policy: Policy) -> Policy:
+        """The policy with what performs skills: itself, where its network knows them. Raises ConfigError."""
+        settings, robot, assignment = self.settings, self.robot, self.assignment
+        known = () if self._policy else skills_known(settings.policy, robot, self._script.planner)
+        if known:
+            skills = load_skills(robot)
+            return ToldPolicy(robot, policy, {name: chosen(name, skills) for name in known}, load_encoder())
+        if assignment.episode.told:
+            asked = ", ".join(assignment.episode.told)
+            raise ConfigError(
+                f"policy '{settings.policy}' knows no skills, and what is said asks for some ({asked}): use --policy "
+                "skills, or servoid run skill --set text=..."
+            )
+        return SkillPolicy(robot, policy, load_skills(robot)) if assignment.task.performs else policy
 
     def loop(self) -> None:
         """Do the ticks of the run, until torque is off. Raises BackendError where the body cannot be reached."""

@@ -23,7 +23,7 @@ class Performer(Policy, Protocol):
 
 
 def _clip(skill: Skill, robot: Robot) -> Performer:
-    return ClipPolicy(robot, clip_of(skill, robot))
+    return ClipPolicy(robot, clip_of(skill, robot), balance=skill.balance)
 
 
 def _tracker(skill: Skill, robot: Robot) -> Performer:

@@ -13,6 +13,7 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import resolve
 from servoid.policy.motion.clip import POSES, SUFFIX, Clip, load
 from servoid.policy.motion.library import Library
+from servoid.stack.control.balance import Balance
 from servoid.stack.log.provenance import sha256
 
 UPRIGHT = "upright"
@@ -39,8 +40,8 @@ class Skill:
     """What a skill is; where it begins and ends is one of the poses of `policy.motion.clip.POSES`, or one of those more
     closely described: "sitting on a seat".
 
-    `policy` performs it: `clip` plays the clip open loop, `tracker` follows it with feedback, by a network that knows
-    clips.
+    `policy` performs it: `clip` plays the clip, open loop or with some `balance`; `tracker` follows it with feedback,
+    by a network that knows clips.
     """
 
     about: str  # in a line, for people
@@ -49,6 +50,7 @@ class Skill:
     held_out: tuple[str, ...] = ()  # others, by which the understanding of words is measured
     policy: Literal["clip", "tracker"] = "tracker"
     tracker: str = "tracker"  # checkpoint, where a tracker performs it
+    balance: Balance | None = None  # of a clip that is played: what hips and ankles do about a base that tilts
     entry: str = UPRIGHT
     end: str = UPRIGHT
     interrupted_by: Literal["anything", "nothing"] = "nothing"  # another skill, or being asked to stop, before its end
@@ -63,6 +65,8 @@ class Skill:
         for key, pose in (("entry", self.entry), ("end", self.end)):
             if not any(pose == known or pose.startswith(f"{known} ") for known in POSES):
                 raise ValueError(f"{key}: '{pose}' is none of {', '.join(POSES)}")
+        if self.balance is not None and self.policy != "clip":
+            raise ValueError("balance: is for policy: clip; a tracker keeps its own")
         if self.interrupted_by == "anything" and self.low:
             raise ValueError("interrupted_by: a skill that does not stay on its feet is not left half done")
 
@@ -70,6 +74,11 @@ class Skill:
     def low(self) -> bool:
         """Whether the robot is lower than one that stands, somewhere on the way."""
         return self.contacts != ("feet",) or not self.entry == self.end == UPRIGHT
+
+    @property
+    def alone(self) -> bool:
+        """Whether it takes nothing but the ground: no seat, say."""
+        return self.entry in POSES and self.end in POSES
 
 
 def load_skills(robot: Robot, folder: Path = CONFIGS / "skills") -> dict[str, Skill]:

@@ -45,6 +45,7 @@ class SkillWords:
         self._encoder, self._skills, self._walking = encoder, skills, Phrasebook(encoder)
         pairs = [(name, text) for name, skill in skills.items() for text in skill.phrases]
         self._names = np.array([name for name, _ in pairs])
+        self._texts = [text for _, text in pairs]
         self._sides = np.array([side_of(text) for _, text in pairs])
         self._codes = encoder.encode([text for _, text in pairs])
 
@@ -77,6 +78,13 @@ class SkillWords:
                 f"the instruction '{text}' says '{side}', but '{name}' has no side to choose: leave it out"
             )
         return str(self._names[fitting.argmax()])
+
+    def phrase(self, name: str, text: str = "") -> str:
+        """The phrase of a skill that is nearest to a text that asks for it; the first one without a text."""
+        rows = np.flatnonzero(self._names == name)
+        if not text:
+            return self._texts[rows[0]]
+        return self._texts[rows[similarity(self._encoder.encode([text]), self._codes[rows])[0].argmax()]]
 
     def about_skill(self, text: str) -> bool:
         """Whether a text is about a skill rather than about walking, understood or not. Raises ConfigError for one

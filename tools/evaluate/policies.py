@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from servoid.hw.config import ConfigError, available
+from servoid.hw.config import ConfigError
 from servoid.tools.evaluate.cache import depends_on, key
 from servoid.tools.evaluate.spec import Experiment, OwnNetwork
 
@@ -172,12 +172,13 @@ def _diffusion_settings(policy: str) -> DiffusionSettings | None:
     """Settings of the diffusion policy of that name, its checkpoint as a whole path; None for another policy."""
     from servoid.policy.checkpoint import read_header, resolve
     from servoid.policy.diffusion.settings import load_settings
+    from servoid.stack.control.policies import is_diffusion
 
     if policy.endswith(".safetensors"):
         if read_header(Path(policy))["kind"] != "diffusion":
             return None
         settings = replace(load_settings(), checkpoint=policy)
-    elif policy.endswith((".yaml", ".yml")) or policy in set(available("policies")) - {"gait"}:
+    elif is_diffusion(policy):
         settings = load_settings(policy)
     else:
         return None

@@ -260,6 +260,11 @@ class TrackingSettings:
     backward: Annotated[
         float, "share of commands that walk backward while turning and side-stepping, where falls were most frequent"
     ] = 0.25
+    turning: Annotated[float, "share of commands that only turn"] = 0.0
+    gait: Annotated[str, "gait to learn: a name in configs/policies, or a file; none: the robot's own"] = ""
+    faster: Annotated[
+        bool, "ask for more than the robot's top speeds, straight ahead and turning on the spot, as that is followed"
+    ] = False
     clips: Annotated[tuple[str, ...], "clips of the library to learn; none: all that are of this robot"] = ()
     clip_share: Annotated[float, "share of episodes that begin with a clip, and of walks that lead to one"] = 1.0
     rates: Annotated[Range, "how fast clips are played, of their own speed; the fastest grows over the first half"] = (
@@ -315,10 +320,9 @@ class TrackingSettings:
             low, high = getattr(self, name)
             if not 0.0 < low <= high:
                 raise ValueError(f"{name} must be positive and rising, not {low:g} {high:g}")
-        if min(self.stand, self.forward, self.single, self.backward) < 0 or (
-            self.stand + self.forward + self.single + self.backward > 1.0
-        ):
-            raise ValueError("stand, forward, single and backward must be shares whose sum is at most 1")
+        shares = (self.stand, self.forward, self.single, self.backward, self.turning)
+        if min(shares) < 0 or sum(shares) > 1.0:
+            raise ValueError("stand, forward, single, backward and turning must be shares whose sum is at most 1")
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ class TakeMaker:
         ticks, commands = self._ticks(seconds), Commands(self._robot, count)
         asked = np.zeros((ticks, count, 3))
         rngs = list(self._rng.spawn(count))
-        commands.reset(np.arange(count))
+        commands.begin(np.arange(count))
         for tick in range(ticks):
             commands.advance(rngs)
             asked[tick] = commands.velocity

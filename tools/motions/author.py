@@ -14,6 +14,7 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import About, Clip, smooth
 from servoid.tools.motions.keyframes import Authored, AuthoredClip, Keyframe
 from servoid.tools.motions.standing import Stance, Standing
+from servoid.tools.motions.stepped import stepped
 
 AFTER_SECONDS = 0.5  # that the last pose is held
 REACHED = 2e-3  # m that a foot or a hand may miss its place by
@@ -46,13 +47,21 @@ def author(recipe: Authored, robot: Robot, source: str) -> Iterator[Clip]:
     for wanted in recipe.clips:
         if wanted.after is not None and wanted.after not in made:
             raise ConfigError(f"clip '{wanted.name}': after: '{wanted.after}' is not an earlier clip")
+        about = wanted.about(source, recipe.licence)
+        if wanted.steps:
+            yield from _both(stepped(wanted, robot, about), wanted, robot)
+            continue
         start = maker.home if wanted.after is None else made[wanted.after]
         poses = maker.poses(wanted, start)
         made[wanted.name] = poses[-1]
-        clip = maker.clip(wanted, [start, *poses], wanted.about(source, recipe.licence))
-        yield clip
-        if wanted.mirrored is not None:
-            yield clip.mirrored(robot, wanted.mirrored)
+        yield from _both(maker.clip(wanted, [start, *poses], about), wanted, robot)
+
+
+def _both(clip: Clip, wanted: AuthoredClip, robot: Robot) -> Iterator[Clip]:
+    """A clip, and the one mirrored from it where that is wanted."""
+    yield clip
+    if wanted.mirrored is not None:
+        yield clip.mirrored(robot, wanted.mirrored)
 
 
 class _Author:

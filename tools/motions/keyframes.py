@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from servoid.hw.config import ConfigError, load_yaml, resolve
 from servoid.policy.motion.clip import About
+from servoid.stack.control.balance import Balance
 
 Vector = tuple[float, float, float]
 
@@ -42,10 +43,31 @@ class Keyframe:
 
 
 @dataclass(frozen=True)
+class JointStep:
+    """Goals of joints, those of legs too, and the time that they take: nothing is solved for, and physics says where it
+    leads. What a step does not name stays as it was. Joints that go on the same way pass through."""
+
+    seconds: float  # from the step before
+    joints: dict[str, float] = field(default_factory=dict)  # rad
+    hold: float = 0.0  # s
+    home: bool = False  # first, every joint goes back to the home pose
+
+    def __post_init__(self) -> None:
+        if self.seconds <= 0.0:
+            raise ValueError("seconds: must be above 0")
+        if self.hold < 0.0:
+            raise ValueError("hold: must not be negative")
+
+
+@dataclass(frozen=True)
 class AuthoredClip:
+    """Made of keyframes that keep their balance, or of steps that need not."""
+
     name: str
     captions: tuple[str, ...]
-    frames: tuple[Keyframe, ...]
+    frames: tuple[Keyframe, ...] = ()
+    steps: tuple[JointStep, ...] = ()
+    balance: Balance = field(default_factory=Balance)  # beside steps, as the skill has it that performs the clip
     begins: str = "upright"  # one of `clip.POSES`
     ends: str = "upright"
     after: str | None = None  # begins in the last pose of this clip
@@ -53,8 +75,8 @@ class AuthoredClip:
     mirrored: str | None = None  # name of the clip that is made of it with left and right swapped
 
     def __post_init__(self) -> None:
-        if not self.frames:
-            raise ValueError("frames: at least one is needed")
+        if bool(self.frames) == bool(self.steps):
+            raise ValueError("frames, or steps: at least one is needed, and not of both")
 
     def about(self, source: str, licence: str) -> About:
         """Raises ConfigError where it does not say enough, or says what cannot be."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ from servoid.hw.contracts.body import Array, Command, Mode
 from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import About, Clip
+from servoid.sim.truth import SimulatedTruth
 from servoid.sim.worlds import Worlds
 from servoid.stack.safety.limits import limit
 
@@ -53,12 +55,19 @@ class Played:
 
 
 def play(
-    goals: Array, robot: Robot, *, begins: str = "upright", worlds: int = 1, randomise: float = 0.0, seed: int = 0
+    goals: Array,
+    robot: Robot,
+    *,
+    begins: str = "upright",
+    worlds: int = 1,
+    randomise: float = 0.0,
+    seed: int = 0,
+    corrected: Callable[[Array, SimulatedTruth], Array] | None = None,
 ) -> Played:
     """Play joint goals `(ticks, n_joints)` rad in `worlds` worlds of their own robots.
 
     The robot is put down as the motion `begins` (one of `clip.POSES`), settles in its first pose, and is then told the
-    goals through the guard's limits.
+    goals through the guard's limits, `corrected` by what the truth says.
     """
     many = Worlds(robot, worlds, threads=1, randomise=randomise)
     first = np.tile(goals[0], (worlds, 1))
@@ -71,7 +80,8 @@ def play(
     rows: dict[str, list[Array]] = {key: [] for key in ("goal", "joints", "place", "turn", "contact", "effort", "fell")}
     applied, truth = first, many.truth
     for goal in goals:
-        applied = limit(np.tile(goal, (worlds, 1)), applied, robot)
+        told = np.tile(goal, (worlds, 1))
+        applied = limit(told if corrected is None else corrected(told, truth), applied, robot)
         many.step(Command(applied, gain, Mode.ACTIVE))
         for key, value in (
             ("goal", applied[0]),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,7 @@ class Trained:
     states: Normaliser
     actions: Normaliser
     latents: LatentActions | None = None
+    skills: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # that it knows, with their phrasings
 
 
 def save(path: Path, trained: Trained, robot: Robot, origin: Origin) -> None:
@@ -64,6 +65,8 @@ def save(path: Path, trained: Trained, robot: Robot, origin: Origin) -> None:
         raw_layout=raw_layout(n).to_header(),
         token_layout=token_layout(n).to_header(),
     )
+    if trained.skills:
+        head["skills"] = {name: list(phrasings) for name, phrasings in trained.skills.items()}
     tensors: dict[str, Array] = {f"denoiser.{k}": v.detach().float().cpu().numpy() for k, v in trained.weights.items()}
     for name, normaliser in (("states", trained.states), ("actions", trained.actions)):
         tensors |= {f"{name}.{key}": value for key, value in normaliser.to_numpy().items()}

@@ -37,6 +37,7 @@ class DenoiserShape:
     mask: Annotated[str, "attention mask (docs/diffusion.md)"] = "state_full_action_causal"
     actions: Annotated[int, "ticks to come that have actions; 0: the whole horizon"] = 0
     ticks: Annotated[tuple[int, ...], "ticks to come that have states, the horizon last; none given: all of them"] = ()
+    clock: Annotated[int, "waves that say how long what is told has lasted, as skills need it; 0: nothing does"] = 0
 
     def __post_init__(self) -> None:
         for name in ("layers", "width", "heads", "history", "horizon", "levels"):
@@ -46,6 +47,8 @@ class DenoiserShape:
             check_mask(self.mask)
         except ConfigError as error:
             raise ValueError(f"mask: {error}") from error
+        if self.clock < 0:
+            raise ValueError(f"clock must not be negative, not {self.clock}")
         if not 0 <= self.actions <= self.horizon:
             raise ValueError(
                 f"actions must be 1 to the horizon of {self.horizon} ticks, or 0 for all, not {self.actions}"
@@ -100,7 +103,7 @@ class DenoiserConfig(DenoiserShape):
     state_size: int
     action_size: int
     text: str = ""  # name of the encoder of its instructions; empty: it takes none
-    text_size: int = 0  # of an encoded instruction
+    text_size: int = 0  # of an encoded instruction, with its clock
 
     def __post_init__(self) -> None:
         try:
@@ -111,6 +114,8 @@ class DenoiserConfig(DenoiserShape):
             raise ConfigError(f"denoiser: sizes must be at least 1, not {self.state_size} and {self.action_size}")
         if self.text_size < 0 or bool(self.text) != bool(self.text_size):
             raise ConfigError(f"denoiser: an encoder '{self.text}' and a text_size of {self.text_size} do not agree")
+        if self.clock and not self.text:
+            raise ConfigError("denoiser: a clock goes with an encoder of instructions")
 
     @property
     def state_ticks(self) -> Array:
@@ -145,7 +150,7 @@ def check_fit(path: Path, head: Mapping[str, Any], robot: Robot) -> DenoiserConf
         checkpoint.check_layout(path, name, head.get(f"{name}_layout", []), ours.to_header())
     try:
         config = DenoiserConfig(**head["config"] | {"ticks": tuple(head["config"].get("ticks", ()))})
-        size = code_size(config.text) if config.text else 0
+        size = code_size(config.text) + 2 * config.clock if config.text else 0
     except (TypeError, ConfigError) as error:
         raise CheckpointError(f"{path}: the network's config in its header cannot be used: {error}") from error
     if config.text_size != size:

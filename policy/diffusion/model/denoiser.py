@@ -95,7 +95,9 @@ class Denoiser(nn.Module):
             self.position = nn.Parameter(0.02 * torch.randn(config.history + config.horizon, width))
         self.kind = nn.Parameter(0.02 * torch.randn(2, width))
         if config.text_size:
-            self.embed_text = nn.Sequential(nn.Linear(config.text_size, width), nn.GELU(), nn.Linear(width, width))
+            # There is one instruction for all tokens, so width costs little: skills and their times are many.
+            hidden = 4 * width if config.clock else width
+            self.embed_text = nn.Sequential(nn.Linear(config.text_size, hidden), nn.GELU(), nn.Linear(hidden, width))
             self.no_text = nn.Parameter(torch.zeros(width))
         self.blocks = nn.ModuleList(Block(width, config.heads) for _ in range(config.layers))
         self.norm = nn.LayerNorm(width)

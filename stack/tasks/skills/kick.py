@@ -29,7 +29,7 @@ class KickSettings(Settings):
     foot: Annotated[Literal["left", "right", "any"], Setting("that kicks; any: drawn")] = "any"
     ahead: Annotated[
         float, Setting("the ball's middle ahead of the base, where the foot reaches it", "m", least=0.09, most=0.17)
-    ] = 0.12
+    ] = 0.13
     aside: Annotated[float, Setting("the ball's middle to the side of the foot", "m", least=0.02, most=0.08)] = 0.05
     jitter: Annotated[float, Setting("how far the ball lies from there at most, each way", "m", least=0)] = 0.01
     diameter: Annotated[float, Setting("diameter of the ball", "m", above=0)] = 0.07

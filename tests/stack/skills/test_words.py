@@ -41,7 +41,7 @@ def test_sentences_about_walking_stay_about_walking() -> None:
 @pytest.mark.parametrize("text", ["wave", "kick forward", "please sit down"])
 def test_a_task_that_only_walks_says_where_skills_are_performed(text: str) -> None:
     with pytest.raises(ConfigError, match=f"asks for a skill: use servoid run skill --set text='{text}'"):
-        load_task("text", {"sentence": text})
+        load_task("goal", {"text": text})
 
 
 @pytest.mark.parametrize(

@@ -150,14 +150,15 @@ def test_a_recipe_makes_all_of_its_clips_one_after_the_other(tmp_path: Path, mot
 
 def test_the_shipped_clips_fit_the_robot_and_stand_open_loop(motions: Motions) -> None:
     """They are what `servoid motions import --recipe op3-action-file` makes of the manufacturer's file, and what
-    `servoid motions author authored` makes."""
+    `servoid motions author` makes of `authored` and `kick`."""
     from servoid.tools.motions.keyframes import load_authored
     from servoid.tools.motions.recipe import load_recipe
 
-    imported, authored = load_recipe("op3-action-file"), load_authored("authored")
+    imported = load_recipe("op3-action-file")
+    authored = [clip for name in ("authored", "kick") for clip in load_authored(name).clips]
     shipped = {clip["name"]: clip for clip in motions("list")[1]["clips"]}
-    mirrored = {clip.mirrored for clip in authored.clips if clip.mirrored is not None}
-    assert shipped.keys() == {clip.name for clip in (*imported.clips, *authored.clips)} | mirrored
-    assert {clip["licence"] for clip in shipped.values()} == {imported.licence, authored.licence}
+    mirrored = {clip.mirrored for clip in authored if clip.mirrored is not None}
+    assert shipped.keys() == {clip.name for clip in (*imported.clips, *authored)} | mirrored
+    assert {clip["licence"] for clip in shipped.values()} == {imported.licence}
     for name in ("bow", "get-up-front", "get-up-back", "stand-on-left-foot", "kick-side-right"):
         assert motions("play", name)[1]["stands_share"] == 1.0, name

@@ -4,6 +4,10 @@ Every world walks and stands under commands that change every few seconds, with 
 the labels are the expert's actions without the noise. An episode that ends in a fall loses its last second. Mirrored
 copies are not stored, because training mirrors each window as it reads it: the same as twice the data.
 
+With `--skills` the worlds also perform the skills of configs/skills that take nothing but the ground, each for as many
+ticks, and go from any of them to any other and to walking, some in mid motion. Each tick says what was told, and how
+long a skill has lasted: what a model learns from that follows sentences about skills.
+
 The same options and the same seed make the same files.
 """
 
@@ -28,6 +32,7 @@ if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
     from servoid.tools.learn.collect.disturbances import DisturbanceSettings
     from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
+    from servoid.tools.learn.collect.performances import Performances
     from servoid.tools.learn.dataset.schema import Feature
 
 LICENCE = "Apache-2.0"
@@ -49,6 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="expert, gait or a tracker's checkpoint (default: expert)",
     )
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
+    parser.add_argument("--skills", action="store_true", help="perform skills, too, by their tracker")
+    parser.add_argument(
+        "--tracker", default="tracker", metavar="NAME|FILE", help="tracker that performs skills (default: tracker)"
+    )
     parser.add_argument(
         "--seconds", type=positive, default=15.0, metavar="S", help="length of an episode (default: %(default)g)"
     )
@@ -102,6 +111,8 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(f"--randomise must be between 0 and 1, not {args.randomise:g}")
     if not 0.0 <= args.noise[0] <= args.noise[1] < math.inf:
         raise ConfigError(f"--noise {args.noise[0]:g} {args.noise[1]:g}: must not be negative, the lower one first")
+    if args.skills and args.policy == "gait":
+        raise ConfigError("--skills goes with --policy expert or a tracker: the gait cannot walk on from a skill")
     if args.seed < 0:
         raise ConfigError(f"--seed must not be negative, not {args.seed}")
 
@@ -110,14 +121,17 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
     """Record a dataset into `args.out`; returns what `--json` prints. Raises ConfigError."""
     from tqdm import tqdm
 
+    from servoid.hw.contracts.control import Policy
     from servoid.hw.robot.description import load_robot
     from servoid.policy.checkpoint import resolve
     from servoid.stack.control.fleet import Fleet
     from servoid.stack.control.gait import GaitPolicy
     from servoid.stack.control.tracker import ExpertPolicy
     from servoid.stack.estimation.odometry import load_odometry
+    from servoid.stack.skills.skill import load_skills
     from servoid.tools.learn.collect.disturbances import DisturbanceSettings
     from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
+    from servoid.tools.learn.collect.performances import Performances
     from servoid.tools.learn.collect.skills import SKILLS
     from servoid.tools.learn.dataset.lerobot import DatasetWriter
     from servoid.tools.learn.dataset.schema import Schema
@@ -125,17 +139,26 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
     begin = time.perf_counter()
     robot = load_robot(args.robot)
     shape = (args.worlds,)
-    policy = GaitPolicy(robot, shape) if args.policy == "gait" else ExpertPolicy(robot, args.policy, shape)
+    policy: Policy
+    performances = None
+    if args.skills:
+        skills = {name: skill for name, skill in load_skills(robot).items() if skill.alone}
+        policy = performances = Performances(robot, skills, args.worlds, expert=args.policy, tracker=args.tracker)
+    else:
+        policy = GaitPolicy(robot, shape) if args.policy == "gait" else ExpertPolicy(robot, args.policy, shape)
     odometry = None if args.plain_odometry else load_odometry(robot)
     sources = {
         "policy": {"name": "gait"} if args.policy == "gait" else _source(resolve(args.policy, robot)),
         "odometry": {"name": "legs"} if odometry is None else _source(resolve("odometry", robot)),
     }
+    if performances is not None:
+        sources["tracker"] = _source(resolve(args.tracker, robot))
     settings = DisturbanceSettings(scale=(args.noise[0], args.noise[1]))
-    schema = Schema(robot.name, robot.rate, _features(robot), tuple(skill.text for skill in SKILLS))
+    texts = tuple(skill.text for skill in SKILLS) if performances is None else performances.texts
+    schema = Schema(robot.name, robot.rate, _features(robot, performances), texts)
     with locked(args.out), DatasetWriter(args.out, schema, args.force) as writer:
         fleet = Fleet(robot, args.worlds, odometry, randomise=args.randomise, seed=args.seed, threads=args.threads)
-        cutter = EpisodeCutter(fleet, policy, settings, args.seconds)
+        cutter = EpisodeCutter(fleet, policy, settings, args.seconds, performances)
         with tqdm(total=args.frames, desc="walking", unit="frame", mininterval=1.0) as bar:
 
             def progress(total: int) -> None:
@@ -156,9 +179,10 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
     return result | {"out": str(args.out), "seconds": round(time.perf_counter() - begin, 1)}
 
 
-def _features(robot: Robot) -> dict[str, Feature]:
+def _features(robot: Robot, performances: Performances | None = None) -> dict[str, Feature]:
     """The dataset's columns and the names of their numbers."""
     from servoid.policy.features import recorded_names
+    from servoid.policy.recording import CLOCK, SKILLS_NOTE
     from servoid.tools.learn.dataset.schema import Feature
 
     notes = {
@@ -167,7 +191,14 @@ def _features(robot: Robot) -> dict[str, Feature]:
         "action_applied": {"meaning": "the joint targets that ran, with noise, rad"},
         "command": {"meaning": "the velocity asked for, m/s and rad/s"},
     }
-    return {name: Feature(names, notes[name]) for name, names in recorded_names(robot).items()}
+    found = {name: Feature(names, notes[name]) for name, names in recorded_names(robot).items()}
+    if performances is not None:
+        about = {
+            "meaning": "time since the skill began that is told, s; 0 of a walk",
+            SKILLS_NOTE: ", ".join(performances.names),
+        }
+        found[CLOCK] = Feature(("seconds",), about)
+    return found
 
 
 def _source(path: Path) -> dict[str, str]:
@@ -198,7 +229,9 @@ def _provenance(
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
     skills = skills_of(robot)
-    options = {name: getattr(args, name) for name in ("frames", "worlds", "seconds", "randomise", "plain_odometry")}
+    options = {
+        name: getattr(args, name) for name in ("frames", "worlds", "seconds", "randomise", "plain_odometry", "skills")
+    }
     content = {
         "licence": LICENCE,
         "git_commit": git_commit(),

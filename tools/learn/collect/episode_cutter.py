@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Policy
 from servoid.policy.features import raw_layout, raw_row
+from servoid.sim.truth import SimulatedTruth
 from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.collect.disturbances import Disturbances, DisturbanceSettings
 from servoid.tools.learn.collect.skills import Commands
@@ -28,6 +30,30 @@ class RecordedEpisode:
     skill: Array
 
 
+class Drilled(Protocol):
+    """What the worlds are asked: `Commands`, or `Performances`."""
+
+    velocity: Array  # (n, 3) m/s forward, m/s left, rad/s
+    skill: Array  # (n,) number of the dataset's task
+
+    @property
+    def columns(self) -> dict[str, Array]:
+        """What else is recorded, `(n, size)` by column."""
+        ...
+
+    def begin(self, ids: Array) -> None:
+        """Episodes begin in the worlds `ids`."""
+        ...
+
+    def advance(self, rngs: list[np.random.Generator]) -> None:
+        """By a tick, before anything is read."""
+        ...
+
+    def fallen(self, truth: SimulatedTruth) -> Array:
+        """Which worlds have fallen `(n,)`."""
+        ...
+
+
 class EpisodeCutter:
     """Records a fleet. Row k of an episode holds the state at tick k, and what was decided and done on it.
 
@@ -36,8 +62,16 @@ class EpisodeCutter:
     still walking when the last frame is in count as begun.
     """
 
-    def __init__(self, fleet: Fleet, policy: Policy, settings: DisturbanceSettings, seconds: float) -> None:
-        """Episodes end after `seconds`, or with a fall. `policy` is of shape `(fleet.n,)`."""
+    def __init__(
+        self,
+        fleet: Fleet,
+        policy: Policy,
+        settings: DisturbanceSettings,
+        seconds: float,
+        script: Drilled | None = None,
+    ) -> None:
+        """Episodes end after `seconds`, or with a fall. `policy` is of shape `(fleet.n,)`; without a `script` it is
+        asked to walk by `Commands`."""
         robot = fleet.robot
         self.fleet, self._policy = fleet, policy
         self.ticks = round(seconds * robot.rate)
@@ -46,10 +80,11 @@ class EpisodeCutter:
             raise ConfigError(
                 f"episodes of {seconds:g} s are too short: at least {FALL_SECONDS + SHORTEST_SECONDS:g} s are needed"
             )
-        self._commands = Commands(robot, fleet.n)
+        self._script: Drilled = script or Commands(robot, fleet.n)
         self._disturbances = Disturbances(robot, fleet.n, settings)
         n = len(robot.joints)
         sizes = {"observation.state": raw_layout(n).size, "action": n, "action_applied": n, "command": 3}
+        sizes |= {name: values.shape[1] for name, values in self._script.columns.items()}
         self._rows = {name: np.zeros((fleet.n, self.ticks, size), np.float32) for name, size in sizes.items()}
         self._skills = np.zeros((fleet.n, self.ticks), np.int64)
         self._length = np.zeros(fleet.n, int)
@@ -66,7 +101,7 @@ class EpisodeCutter:
         while True:
             self._start(done)
             self._tick()
-            fallen = self.fleet.truth.fallen
+            fallen = self._script.fallen(self.fleet.truth)
             done = fallen | (self._length == self.ticks)
             self.fell += int(fallen.sum())
             worth = self._worth(self._length)
@@ -96,7 +131,7 @@ class EpisodeCutter:
             return
         self.fleet.reset(where)
         self._policy.reset(where, self.fleet.seeds)
-        self._commands.reset(ids)
+        self._script.begin(ids)
         self._disturbances.reset(ids, self.fleet.rngs)
         self._length[ids] = 0
         self.begun += len(ids)
@@ -104,16 +139,16 @@ class EpisodeCutter:
     def _tick(self) -> None:
         fleet, rngs = self.fleet, self.fleet.rngs
         state = fleet.observe()
-        self._commands.advance(rngs)
+        self._script.advance(rngs)
         fleet.worlds.push(self._disturbances.push(rngs))
-        command = self._commands.velocity
+        command = self._script.velocity
         target = self._policy.act(state, fleet.applied, Instruction(command))
         clean = fleet.step(target, self._disturbances.noise(rngs))
         worlds, at = np.arange(fleet.n), self._length
         values = {"observation.state": raw_row(state), "action": clean, "action_applied": fleet.applied}
-        for name, value in (values | {"command": command}).items():
+        for name, value in (values | {"command": command} | self._script.columns).items():
             self._rows[name][worlds, at] = value
-        self._skills[worlds, at] = self._commands.skill
+        self._skills[worlds, at] = self._script.skill
         self._length += 1
         self.walked += fleet.n
 

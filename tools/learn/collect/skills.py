@@ -8,6 +8,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot, Walking
+from servoid.sim.truth import SimulatedTruth
 
 Range = tuple[float, float]
 
@@ -70,6 +71,11 @@ def skills_of(robot: Robot) -> tuple[Drill, ...]:
     return tuple(replace(skill, boxes=tuple(box.of(robot.walking) for box in skill.boxes)) for skill in SKILLS)
 
 
+def drawn(skills: tuple[Drill, ...], rng: np.random.Generator) -> Drill:
+    """One of `SKILLS`, or of the same in a robot's own terms, by their weights."""
+    return skills[int(np.searchsorted(_SHARES, rng.random(), side="right"))]
+
+
 class Commands:
     """The present command of each of `n` worlds, changed every few seconds, drawn from the worlds' own streams."""
 
@@ -80,7 +86,16 @@ class Commands:
         self._left = np.zeros(n, int)  # ticks until the next change
         self._first = np.ones(n, bool)
 
-    def reset(self, ids: Array) -> None:
+    @property
+    def columns(self) -> dict[str, Array]:
+        """What a recording holds beside what is asked, `(n, size)`: nothing."""
+        return {}
+
+    def fallen(self, truth: SimulatedTruth) -> Array:
+        """Which worlds have fallen `(n,)`."""
+        return truth.fallen
+
+    def begin(self, ids: Array) -> None:
         """A new command is due in the worlds `ids`."""
         self._left[ids], self._first[ids] = 0, True
 

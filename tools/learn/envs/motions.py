@@ -15,7 +15,9 @@ from servoid.hw.robot.description import Robot, Walking
 from servoid.hw.robot.legs import Legs
 from servoid.policy.motion.clip import Clip
 from servoid.policy.references.either import GaitOrClip
+from servoid.policy.references.gait import load_gait
 from servoid.sim.truth import SimulatedTruth
+from servoid.tools.learn.envs.speeds import Speeds
 from servoid.tools.learn.envs.starts import States, along, lying
 from servoid.tools.learn.settings import TrackingSettings
 
@@ -44,7 +46,8 @@ class Motions:
     def __init__(self, robot: Robot, clips: Sequence[Clip], n: int, settings: TrackingSettings, seed: int) -> None:
         """Rolls the clips out first, which takes seconds. Raises ConfigError for clips of another robot."""
         self.robot, self.n, self.settings, self.clips = robot, n, settings, tuple(clips)
-        self.reference = GaitOrClip(robot, clips, (n,))
+        self.reference = GaitOrClip(robot, clips, (n,), load_gait(settings.gait) if settings.gait else None)
+        self.speeds = Speeds(robot, self.reference.gait if settings.faster else None)
         self._begins = np.array([clip.about.begins for clip in clips])
         self._lies = np.char.startswith(self._begins, "lying")
         wanted = settings.clip_share > 0.0
@@ -190,7 +193,7 @@ class Motions:
         rate = self.robot.rate
         command = self.reference.gait.target.copy()
         for i in np.flatnonzero(~self.on_clip & (ticks >= self._next_command)).tolist():
-            command[i] = _draw(rngs[i], self.settings, self.robot.walking)
+            command[i] = _draw(rngs[i], self.settings, self.robot.walking, self.speeds.walking)
             self._next_command[i] = ticks[i] + round(rngs[i].uniform(*self.settings.command_every) * rate)
         for i in np.flatnonzero(~self.on_clip & (ticks >= self._next_change) & (self._done_at < 0)).tolist():
             command[i] = 0.0
@@ -231,22 +234,25 @@ class Motions:
                 self._next_change[i] = ticks[i] + self._walk_ticks(rngs[i])
 
 
-def _draw(rng: np.random.Generator, s: TrackingSettings, walking: Walking) -> Array:
-    """A command `(3,)`: standing, straight ahead, along one other axis, backward, or any mixture."""
+def _draw(rng: np.random.Generator, s: TrackingSettings, walking: Walking, alone: Walking) -> Array:
+    """A command `(3,)`: standing, straight ahead, along one other axis, backward, or any mixture; straight ahead and on
+    the spot as fast as `alone` says."""
     command = rng.uniform(walking.lower, walking.upper)
     slowest, fastest = -walking.backward, walking.forward
     kind = rng.random()
-    shares = np.cumsum([s.stand, s.forward, s.single, s.backward])
+    shares = np.cumsum([s.stand, s.forward, s.single, s.backward, s.turning])
     if kind < shares[0]:
         return np.zeros(3)
     if kind < shares[1]:
-        fast = rng.uniform(fastest - (fastest - slowest) / 3, fastest)
+        fast = rng.uniform(alone.forward - (alone.forward - slowest) / 3, alone.forward)
         return np.array([fast if rng.random() < 0.5 else command[0], 0.0, 0.0])
     if kind < shares[2]:
         command[0] = rng.uniform(slowest, 0.0)
         return np.where(np.arange(3) == rng.integers(3), command, 0.0)
     if kind < shares[3]:
         command[0] = rng.uniform(slowest, 0.0)
+    elif kind < shares[4]:
+        return np.array([0.0, 0.0, command[2] * alone.turning / walking.turning])
     elif command[0] > _MIXED_SPEED * fastest:  # no fast walking while turning or side-stepping
         command[0] -= _MIXED_SPEED * fastest
     return command

@@ -37,13 +37,14 @@ class Tracking:
         seed: int = 0,
         clips: Sequence[Clip] = (),
     ) -> None:
-        """Call `reset` first. Without `clips` it follows the gait alone."""
+        """Call `reset` first. Without `clips` it follows the gait alone, and sees no more than that takes where the
+        `clip_share` is 0."""
         self.robot, self.n, self.settings = robot, n, settings
         self.fleet = Fleet(robot, n, odometry, randomise=settings.randomised, seed=seed)
         share = settings.clip_share if clips else 0.0
         self.motions = Motions(robot, clips or [_still(robot)], n, replace(settings, clip_share=share), seed)
         self.reference = self.motions.reference
-        self.observation = TrackerObservation(robot, (n,), clips=True)
+        self.observation = TrackerObservation(robot, (n,), clips=settings.clip_share > 0.0)
         joints, feet = Mirror.joints(robot), Mirror.feet(robot)
         critic = Mirror.join(
             self.observation.mirror, Mirror.VECTOR, feet, Mirror.vectors(feet),
@@ -75,8 +76,11 @@ class Tracking:
 
     @property
     def measures(self) -> dict[str, float]:
-        """Share of tries that do well, of each clip."""
-        return {f"success/{name}": value for name, value in self.motions.successes.items()}
+        """Share of tries that do well, of each clip, and how fast worlds are asked to go."""
+        return {
+            **{f"success/{name}": value for name, value in self.motions.successes.items()},
+            **self.motions.speeds.measures,
+        }
 
     def reset(self) -> None:
         """Begin a new episode in every world."""
@@ -172,6 +176,8 @@ class Tracking:
         truth = self.fleet.truth
         failed = self.motions.failed(truth, frames)
         self._measure()
+        walks = ~self.motions.on_clip
+        self.motions.speeds.learn(self._twist[walks, 3:], self._twist[walks, :3], failed[walks])
         reward = self._judge(frames, failed)
         late = ((self.ticks >= self.limit) | self.motions.closing) & ~failed
         done = failed | late

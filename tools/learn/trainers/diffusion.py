@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
 from importlib import import_module
@@ -59,10 +59,13 @@ def main(args: argparse.Namespace) -> int:
     from servoid.policy.diffusion.dataset import Windows
     from servoid.policy.latent.actions import load_latents
     from servoid.policy.recording import read_recording
+    from servoid.tools.learn.collect.told import skills_in, told_of
 
     # What cannot be trained or measured is refused before the data is read.
     settings = read_settings(args, DiffusionTraining())
     judge = _judge(settings, args.robot) if settings.survival_worlds else None
+    if settings.clock and not settings.text:
+        raise ConfigError("--clock says how long what is told has lasted: it goes with --text words")
     torch.set_num_threads(args.threads)
     robot = load_robot(args.robot)
     latents = load_latents(args.latent, robot) if args.latent else None
@@ -72,8 +75,17 @@ def main(args: argparse.Namespace) -> int:
 
         planning(config, asdict(settings))
     recording = read_recording(args.data, robot)
-    windows = Windows(recording, robot, config, emphasis=settings.emphasis, seed=settings.seed, latents=latents)
+    skills = skills_in(recording, robot)
+    if bool(skills) != bool(settings.clock):
+        raise ConfigError(
+            f"{args.data}: shows skills, which take --config skills: a clock says how far they are"
+            if skills
+            else f"{args.data}: shows no skills, and --clock is for those: record some with `servoid collect --skills`"
+        )
+    told = told_of(recording, robot, skills)
+    windows = Windows(recording, robot, config, told, settings.emphasis, settings.seed, latents)
     trainer = DiffusionTrainer(windows, robot, settings, args.out, source_of(args.data, recording), judge)
+    trainer.skills = {name: skill.phrases for name, skill in skills.items()}
     trainer.start(args.resume, args.init)
     trainer.run()
     return 0
@@ -88,7 +100,7 @@ def denoiser_config(settings: DiffusionTraining, n_joints: int, latent_size: int
         token_layout(n_joints).size * (2 if settings.emphasis else 1),
         latent_size or n_joints,
         settings.text,
-        load_encoder(settings.text).size if settings.text else 0,
+        load_encoder(settings.text).size + 2 * settings.clock if settings.text else 0,
         **{f.name: getattr(settings, f.name) for f in fields(DenoiserShape)},
     )
 
@@ -102,6 +114,8 @@ def _judge(settings: DiffusionTraining, robot: str) -> Judge:
             f"closed-loop survival cannot be measured ({error}); "
             "--survival-worlds 0 keeps the best checkpoint by validation loss instead"
         ) from error
+    if settings.clock:
+        measure = import_module("servoid.tools.learn.following").sentences_followed
     seconds, worlds = settings.survival_seconds, settings.survival_worlds
     return partial(measure, seconds=seconds, worlds=worlds, seed=settings.seed, robot_name=robot)
 
@@ -112,8 +126,17 @@ class DiffusionTrainer(Trainer):
     settings: DiffusionTraining
 
     LOSS = "validation_action_loss"
-    columns = ("loss", "state_loss", "action_loss", "learning_rate", "tokens_per_s", LOSS, "survival", "velocity_error")
-    panels = (("state_loss", "action_loss", LOSS), ("survival",), ("velocity_error",))
+    columns: Sequence[str] = (
+        "loss",
+        "state_loss",
+        "action_loss",
+        "learning_rate",
+        "tokens_per_s",
+        LOSS,
+        "survival",
+        "velocity_error",
+    )
+    panels: Sequence[Sequence[str]] = (("state_loss", "action_loss", LOSS), ("survival",), ("velocity_error",))
 
     def __init__(
         self,
@@ -133,6 +156,10 @@ class DiffusionTrainer(Trainer):
         super().__init__(out, settings, source, judge)
         torch.manual_seed(settings.seed)
         self.windows, self.robot, self.config = windows, robot, windows.config
+        self.skills: Mapping[str, tuple[str, ...]] = {}  # that are learned, with their phrasings
+        if self.config.clock:
+            shares = ("followed", "followed_walks", "followed_skills")
+            self.columns, self.panels = (*self.columns[:-1], *shares), (*self.panels[:-1], shares)
         self.network = Denoiser(self.config)
         self.average = Average(self.network, settings.average)
         self.optimiser = torch.optim.AdamW(
@@ -142,18 +169,28 @@ class DiffusionTrainer(Trainer):
         self.generator = torch.Generator().manual_seed(settings.seed)
 
     def adopt(self, path: Path) -> None:
-        """Take weights and normalisation of a checkpoint, to go on with other data. Raises ConfigError."""
+        """Take weights and normalisation of a checkpoint, to go on with other data; of one of another shape, the
+        weights alone, converted. Raises ConfigError."""
         from servoid.policy.diffusion.model.checkpoint import load
+        from servoid.policy.diffusion.model.converted import converted
         from servoid.policy.latent.actions import same_latents
 
         model = load(path, self.robot)
-        if model.config != self.config:
-            raise ConfigError(f"{path}: not the network that the options ask for: {model.config}")
         if not same_latents(model.latents, self.windows.latents):
             raise ConfigError(f"{path}: its actions are not those of --latent: use the same latents, or none")
-        self.network.load_state_dict(model.denoiser.state_dict())
+        windows = self.windows
+        try:
+            weights = (
+                converted(model, self.config, windows.states, windows.actions)
+                if model.config != self.config
+                else model.denoiser.state_dict()
+            )
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from None
+        self.network.load_state_dict(weights)
         self.average.weights = {name: p.detach().clone() for name, p in self.network.named_parameters()}
-        self.windows.states, self.windows.actions = model.states, model.actions
+        if model.config == self.config:
+            windows.states, windows.actions = model.states, model.actions
 
     @property
     def title(self) -> str:
@@ -200,6 +237,10 @@ class DiffusionTrainer(Trainer):
         text = f"states {means['state_loss']:.3f}, actions {means['action_loss']:.3f}, {1000 / steps_per_s:.0f} ms/step"
         return {"tokens_per_s": speed}, f"{text}, {speed:,.0f} tokens/s"
 
+    def score(self, results: Mapping[str, float]) -> tuple[float, float]:
+        """By the sentences that it follows, where it is told such, or by survival."""
+        return (results["followed"], 0.0) if "followed" in results else super().score(results)
+
     def held_out(self) -> dict[str, float]:
         return {self.LOSS: self.validation_loss()}
 
@@ -224,7 +265,9 @@ class DiffusionTrainer(Trainer):
         from servoid.policy.diffusion.model.checkpoint import Trained, save
 
         windows = self.windows
-        trained = Trained(self.average.weights, self.config, windows.states, windows.actions, windows.latents)
+        trained = Trained(
+            self.average.weights, self.config, windows.states, windows.actions, windows.latents, self.skills
+        )
         save(path, trained, self.robot, Origin(self.source, self.settings.licence, results, plain(self.settings)))
 
     def state(self) -> dict[str, Any]:
@@ -248,7 +291,7 @@ class DiffusionTrainer(Trainer):
         ours = self.windows.latents.to_tensors() if self.windows.latents else {}
         if ours.keys() != latents.keys() or any((ours[name] != latents[name]).any() for name in ours):
             raise ConfigError(f"{path}: trained with other latents; use --no-resume or another --out")
-        require_same(path, "another network", asdict(self.config), {"ticks": ()} | saved["config"])
+        require_same(path, "another network", asdict(self.config), {"ticks": (), "clock": 0} | saved["config"])
         self.windows.states, self.windows.actions = (
             Normaliser.from_numpy(_arrays(saved[name])).to_torch() for name in ("states", "actions")
         )
