@@ -26,22 +26,22 @@ _PATIENCE = 0.3  # s of that until the clip begins anew
 
 
 @dataclass(frozen=True)
-class Pace:
+class LeadPace:
     """How fast the lead goes. A policy that was trained with one needs it."""
 
     rate: float = 1.4  # of a clip's own speed, for an action of zero
     exponent: float = 1.0  # of e, by which an action of one is faster
-    behind: float = 0.6  # rad that a joint's goal may be behind what is wanted until the lead slows down,
-    waits: float = 1.4  # and until it waits
+    behind: float = 0.8  # rad that a joint's goal may be behind what is wanted until the lead slows down,
+    waits: float = 1.8  # and until it waits
 
 
-PACE = Pace()
+PACE = LeadPace()
 
 
 class Rising:
     """Of one robot, or worlds of any leading `shape`."""
 
-    def __init__(self, robot: Robot, clips: Sequence[Clip], shape: tuple[int, ...] = (), pace: Pace = PACE) -> None:
+    def __init__(self, robot: Robot, clips: Sequence[Clip], shape: tuple[int, ...] = (), pace: LeadPace = PACE) -> None:
         """`clips`: from lying on the front, and on the back."""
         self.pace = pace
         longest = max(clip.ticks for clip in clips) + _HOMING

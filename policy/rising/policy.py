@@ -17,7 +17,7 @@ from servoid.policy.mlp import Mlp
 from servoid.policy.motion.clip import Clip
 from servoid.policy.priors.goals import GOALS
 from servoid.policy.priors.observation import TaskObservation
-from servoid.policy.rising.lead import Pace, Rising
+from servoid.policy.rising.lead import LeadPace, Rising
 
 KIND = "get_up"  # of a checkpoint
 
@@ -30,7 +30,7 @@ class RisingPolicy:
         head = checkpoint.read_header(path)
         checkpoint.check(path, head, KIND, robot)
         config, self._shape, self._home = head["config"], shape, robot.home
-        self._lead = None if config["lead"] is None else Rising(robot, clips, shape, Pace(**config["lead"]))
+        self._lead = None if config["lead"] is None else Rising(robot, clips, shape, LeadPace(**config["lead"]))
         goal = GOALS[config["goal"]] if self._lead is None else self._lead.goal
         self._observation = TaskObservation(robot, goal, shape)
         self._network, _ = Mlp.load(path, KIND, robot, self._observation.size)

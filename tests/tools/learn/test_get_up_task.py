@@ -20,11 +20,12 @@ from servoid.policy.rising.lead import CLIPS
 from servoid.policy.rising.policy import RisingPolicy
 from servoid.tools.cli import main
 from servoid.tools.learn.envs.down import Down
+from servoid.tools.learn.envs.score_term import Manner
 from servoid.tools.learn.envs.starts import lying
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
 from servoid.tools.learn.envs.tasks import TaskState, load_learned_task
-from servoid.tools.learn.envs.tasks.get_up import GetUp, GetUpByClips
-from servoid.tools.learn.prior_settings import EpisodeSettings, PolicyTraining
+from servoid.tools.learn.envs.tasks.get_up import GettingUp, GettingUpByClips
+from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.policy import PolicyTrainer, environment
 
 ROBOT = load_robot()
@@ -47,23 +48,15 @@ def down(eased: tuple[float, float] = (0.0, 0.0)) -> Down:
     return states
 
 
-class Free(GetUp):
-    def begins(self, settings: EpisodeSettings, seed: int) -> Down:
-        return down(settings.eased)
-
-
-class Led(GetUpByClips):
-    begins = Free.begins  # type: ignore[assignment]
-
-
-def made(task: type[GetUp], settings: PolicyTraining = SETTINGS) -> TaskEnvironment:
-    env = environment(task(ROBOT), None, Style(), settings, settings.worlds, 0)
+def made(task: type[GettingUp], settings: PolicyTraining = SETTINGS) -> TaskEnvironment:
+    free = Manner(settings.worlds, settings.decide_every, np.full(len(ROBOT.joints), settings.reach))
+    env = TaskEnvironment(task(ROBOT), free, down(settings.eased), None, settings, settings.worlds, 0)
     env.reset()
     return env
 
 
 def test_episodes_begin_lying_and_no_fall_ends_them() -> None:
-    env = made(Free, replace(SETTINGS, eased=(0.0, 0.0)))
+    env = made(GettingUp, replace(SETTINGS, eased=(0.0, 0.0)))
     assert (env.fleet.truth.gravity[:, 2] > -0.6).all()
     ends = [env.step(np.zeros((env.n, env.action_size)))[1:] for _ in range(TICKS)]
     assert not any(done.any() for done, _ in ends[:-1])
@@ -72,7 +65,7 @@ def test_episodes_begin_lying_and_no_fall_ends_them() -> None:
 
 
 def test_velocity_and_height_by_legs_that_do_not_stand_are_not_seen() -> None:
-    env = made(Free)
+    env = made(GettingUp)
     with_odometry = environment(load_learned_task("speed", ROBOT), None, Style(), SETTINGS, 2, 0)
     assert with_odometry.observation.size - env.observation.size == 3 + 2  # and the goal
 
@@ -90,7 +83,7 @@ def test_standing_still_at_home_is_worth_most_and_is_achieved() -> None:
         position=np.zeros((n, 2)), yaw=np.zeros(n), velocity=np.zeros((n, 2)), height=height, gravity=gravity,
         angular_velocity=np.zeros((n, 3)), joints=joints, joint_velocity=moving,
     )  # fmt: skip
-    task = GetUp(ROBOT)
+    task = GettingUp(ROBOT)
     reward = task.reward(np.zeros((n, 0)), state)
     assert reward[0] == pytest.approx(1.0)
     assert (reward[1:] < 0.95).all()
@@ -99,7 +92,7 @@ def test_standing_still_at_home_is_worth_most_and_is_achieved() -> None:
 
 
 def test_states_along_clips_begin_where_the_clip_is() -> None:
-    env = made(Led, replace(SETTINGS, eased=(1.0, 1.0)))
+    env = made(GettingUpByClips, replace(SETTINGS, eased=(1.0, 1.0)))
     assert env.down is not None
     assert env.lead is not None
     along = env.down.clip >= 0
@@ -123,7 +116,7 @@ def test_what_fails_is_begun_with_more_often() -> None:
 
 
 def test_pushes_come_and_grow() -> None:
-    env = made(Free, replace(SETTINGS, hardest_push=1.0, push_every=(0.04, 0.04), episode_seconds=1.0))
+    env = made(GettingUp, replace(SETTINGS, hardest_push=1.0, push_every=(0.04, 0.04), episode_seconds=1.0))
     pushed: list[float] = []
     push = env.fleet.worlds.push
     env.fleet.worlds.push = lambda v: (pushed.append(float(np.abs(v).max())), push(v))[1]  # type: ignore[method-assign]
@@ -136,8 +129,8 @@ def test_pushes_come_and_grow() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", [Free, Led])
-def test_a_policy_that_gets_up_runs_as_it_learned(task: type[GetUp], tmp_path: Path) -> None:
+@pytest.mark.parametrize("task", [GettingUp, GettingUpByClips])
+def test_a_policy_that_gets_up_runs_as_it_learned(task: type[GettingUp], tmp_path: Path) -> None:
     """What the checkpoint decides tick by tick, as in a run, is what the training rewarded."""
     env = made(task)
     trainer = PolicyTrainer(env, Style(), SETTINGS, tmp_path, None)

@@ -17,6 +17,7 @@ from servoid.policy.priors.observation import TaskObservation
 from servoid.policy.references.gait import gait_of
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.safety.limits import clamp
+from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.score_term import GeneratedStarts, Manner
 from servoid.tools.learn.envs.tasks import LearnedTask, TaskState
 from servoid.tools.learn.prior_settings import EpisodeSettings
@@ -61,13 +62,14 @@ class TaskEnvironment:
     """`n` worlds: see `servoid.tools.learn.trainers.ppo.Environment`. A tick of that is a decision here."""
 
     def __init__(
-        self, task: LearnedTask, score: Manner, starts: GeneratedStarts | None, odometry: Mlp | None,
+        self, task: LearnedTask, score: Manner, starts: GeneratedStarts | Down | None, odometry: Mlp | None,
         s: EpisodeSettings, n: int, seed: int,
     ) -> None:  # fmt: skip
-        """Call `reset` first. Episodes begin as the task says, or else as `starts`, or without them standing."""
+        """Call `reset` first. Episodes begin as `starts` has them, or without them standing."""
         robot = task.robot
-        self.task, self.score, self.starts, self.settings, self.robot, self.n = task, score, starts, s, robot, n
-        self.down = task.begins(s, seed)
+        self.task, self.score, self.settings, self.robot, self.n = task, score, s, robot, n
+        self.generated = starts if isinstance(starts, GeneratedStarts) else None
+        self.down = starts if isinstance(starts, Down) else None
         self.fleet = Fleet(robot, n, odometry if task.seen.odometry else None, randomise=s.randomised, seed=seed)
         self.lead = task.lead(n)
         self.observation = TaskObservation(robot, task.seen if self.lead is None else self.lead.goal, (n,))
@@ -115,10 +117,10 @@ class TaskEnvironment:
             self.lead.pace = replace(self.lead.pace, rate=rate)
         if self.down is not None:
             self.down.schedule(progress)
-        if self.starts is not None and int(progress * self.settings.renewals) > int(
+        if self.generated is not None and int(progress * self.settings.renewals) > int(
             self.progress * self.settings.renewals
         ):
-            self.starts.refresh()
+            self.generated.refresh()
         self.progress = progress
 
     def reset(self) -> None:
@@ -130,8 +132,8 @@ class TaskEnvironment:
         fleet, windows = self.fleet, None
         if self.down is not None:
             start = self.down.draw(fleet.rngs, where)
-        elif self.starts is not None:
-            windows, start = self.starts.draw(fleet.rngs, where)
+        elif self.generated is not None:
+            windows, start = self.generated.draw(fleet.rngs, where)
         else:
             start = Start(joints=np.tile(self.robot.home, (self.n, 1)), velocity=np.zeros((self.n, 3)))
         fleet.reset(where, start)
@@ -173,7 +175,7 @@ class TaskEnvironment:
 
     def _sense(self) -> State:
         state = self.fleet.observe()
-        if not self.task.falls:  # as in a run, where a robot that lies learns no bias of its gyro
+        if self.task.lies:  # as in a run, where a robot that lies learns no bias of its gyro
             self.fleet.estimator.fall()
         return state
 
@@ -239,7 +241,7 @@ class TaskEnvironment:
         unlike = (self.score.ratio > self.settings.unlike) if self.settings.unlike else np.zeros(self.n, bool)
         unlike &= self.ticks > self.settings.unlike_after / self.dt
         over = unlike | self.task.ended(self.asked, known)
-        if self.task.falls:
+        if not self.task.lies:
             over |= fallen
         self._held = np.where(self.task.achieved(known), self._held + 1, 0)
         self.achieved = self._held * self.dt >= self.task.hold

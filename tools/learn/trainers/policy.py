@@ -160,15 +160,19 @@ def environment(
 ) -> TaskEnvironment:
     """Worlds of a task under a prior, under a rival of it, or without one. Raises ConfigError."""
     from servoid.stack.estimation.odometry import load_odometry
+    from servoid.tools.learn.envs.down import Down
     from servoid.tools.learn.envs.score_term import AdversarialTerm, GeneratedStarts, Manner, ScoreTerm
 
     robot = task.robot
-    if prior is None:
-        free = Manner(worlds, settings.decide_every, np.full(len(robot.joints), settings.reach))
-        return TaskEnvironment(task, free, None, load_odometry(robot), settings, worlds, seed)
-    given = prior, style, worlds, settings, seed
-    score = ScoreTerm(*given) if rival is None else AdversarialTerm(*given, rival)
-    starts = GeneratedStarts(prior, style, settings, seed)
+    score = Manner(worlds, settings.decide_every, np.full(len(robot.joints), settings.reach))
+    starts: GeneratedStarts | Down | None = None
+    if prior is not None:
+        given = prior, style, worlds, settings, seed
+        score = ScoreTerm(*given) if rival is None else AdversarialTerm(*given, rival)
+    if task.lies:
+        starts = Down(robot, settings.eased, settings.starts, seed)
+    elif prior is not None:
+        starts = GeneratedStarts(prior, style, settings, seed)
     return TaskEnvironment(task, score, starts, load_odometry(robot), settings, worlds, seed)
 
 
@@ -198,7 +202,7 @@ class PolicyTrainer(PpoTrainer):
         self._kind = KIND if env.down is None else RISING  # of its checkpoint: what gets up acts while no task does
         if env.lead is not None:
             self.begin_small(_LED_SHARE)
-        if not env.task.falls:  # no fall ends them: they would all end at once
+        if env.task.lies:  # no fall ends them: they would all end at once
             env.ticks[:] = np.random.default_rng(settings.seed).integers(0, env.limit, env.n)
         nominal = replace(
             settings,

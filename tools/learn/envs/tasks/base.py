@@ -17,8 +17,6 @@ from servoid.policy.priors.goals import GOALS, SeenGoal
 
 if TYPE_CHECKING:
     from servoid.policy.rising.lead import Rising
-    from servoid.tools.learn.envs.down import Down
-    from servoid.tools.learn.prior_settings import EpisodeSettings
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,7 @@ class LearnedTask(ABC):
     size: ClassVar[int]  # numbers that are drawn
     every: ClassVar[tuple[float, float]]  # s from one draw to the next
     run: ClassVar[str]  # the task that `servoid run` runs it in
-    falls: ClassVar[bool] = True  # whether a fall ends an episode
+    lies: ClassVar[bool] = False  # whether episodes begin lying, and no fall ends them
     hold: ClassVar[float] = math.inf  # s for which it is `achieved` until an episode is over, as when its time is up
 
     def __init__(self, robot: Robot) -> None:
@@ -64,10 +62,6 @@ class LearnedTask(ABC):
     @abstractmethod
     def reward(self, asked: Array, state: TaskState) -> Array:
         """How well it does what is asked `(n,)`, 0 to 1."""
-
-    def begins(self, settings: EpisodeSettings, seed: int) -> Down | None:
-        """Where episodes begin; None: as the prior has it, or without one standing."""
-        return None
 
     @property
     def achievable(self) -> bool:

@@ -9,9 +9,7 @@ from servoid.hw.contracts.control import Instruction, State
 from servoid.policy.motion.library import Library
 from servoid.policy.rising.lead import CLIPS, Rising
 from servoid.stack.safety.recovery import AT_HOME, UPRIGHT
-from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
-from servoid.tools.learn.prior_settings import EpisodeSettings
 
 _LYING = 0.25  # of the standing height: where a base that lies is
 _TALL = 0.85  # of the standing height: it stands on straight legs
@@ -19,18 +17,15 @@ _NEAR = 0.5  # rad of a joint from home, root mean square, at which the pose sti
 _QUIET = 1.0  # rad/s, likewise of the base and of the joints
 
 
-class GetUp(LearnedTask):
+class GettingUp(LearnedTask):
     """Nothing is asked but to stand, and no fall is an end.
 
     It is achieved as the guard sees it, who lets the robot go on then, but for joints at rest: what explores has none.
     """
 
     name, goal, size, every, run = "get-up", "stand", 0, (1e6, 1e6), "get-up"
-    falls = False
+    lies = True
     hold = 1.0
-
-    def begins(self, settings: EpisodeSettings, seed: int) -> Down:
-        return Down(self.robot, settings.eased, settings.starts, seed)
 
     def draw(self, rng: np.random.Generator, position: Array) -> Array:
         return np.zeros(0)
@@ -55,7 +50,7 @@ class GetUp(LearnedTask):
         return home & tall & (-state.gravity[:, 2] > np.cos(UPRIGHT))
 
 
-class GetUpByClips(GetUp):
+class GettingUpByClips(GettingUp):
     """The same, led by the clips that get up: it begins with what they can do, and learns to be sure and quick."""
 
     name = "get-up-by-clips"
