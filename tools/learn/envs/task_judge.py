@@ -50,18 +50,20 @@ def measure(env: TaskEnvironment, actor: Actor) -> dict[str, float]:
     """
     walks = walk(env, actor)
     settled = round(_SETTLED / env.dt)
-    later = walks.alive[settled:]
+    later, prior = walks.alive[settled:], env.score.prior
     results = {
         "return": float(walks.reward.mean()),
         "falls": float(1.0 - walks.alive[-1].mean()),
         "survival": float(walks.alive[-1].mean()),
-        "prior_error": float(walks.ratio[settled:][later].mean()) if later.any() else float("nan"),
+        "prior_error": float(walks.ratio[settled:][later].mean())
+        if prior is not None and later.any()
+        else float("nan"),
     }
     if env.task.achievable:
         first = np.argmax(walks.achieved, 0)[walks.achieved.any(0)]
         results["achieved"] = float(walks.achieved.any(0).mean())
         results["seconds"] = float(np.median(first + 1) * env.dt - env.task.hold) if len(first) else float("nan")
-    prior, manners = env.score.prior, []
+    manners = []
     for share in (0.4, 0.6, 0.8):
         asked = env.task.steady(share * env.robot.walking.forward)
         if asked is None or prior is None:
