@@ -110,7 +110,7 @@ def test_without_recover_the_same_fall_is_the_end() -> None:
 
 
 def test_time_that_is_over_while_it_lies_is_a_fall() -> None:
-    result, watch = fall(0.0, seconds=4.0)
+    result, watch = fall(0.0, seconds=2.8)
     assert result.outcome == "fell"
     assert result.trace.fallen
     assert watch.ground_truth.trace().fallen
