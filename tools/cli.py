@@ -49,10 +49,11 @@ VERBS: dict[str, Verb] = {
         },
     ),
     "motions": Verb(
-        "import, author, retarget, list, play, film, check, mirror and blend clips",
+        "import, author, pose, retarget, list, play, film, check, mirror and blend clips",
         verbs={
             "import": Verb("make clips from a file", "servoid.tools.motions.verbs.import_clip"),
             "author": Verb("make clips from keyframes", "servoid.tools.motions.verbs.author"),
+            "keyframes": Verb("make a clip at the page, by hand", "servoid.tools.motions.verbs.keyframes"),
             "retarget": Verb("put a person's motion on the robot", "servoid.tools.motions.verbs.retarget"),
             "list": Verb("list the clips of a library", "servoid.tools.motions.verbs.list_clips"),
             "play": Verb("play a clip open loop in physics", "servoid.tools.motions.verbs.play"),
@@ -84,6 +85,7 @@ VERBS: dict[str, Verb] = {
             "kick": Verb("search for a harder kick that stays on its feet", "servoid.tools.robots.tune_kick"),
         },
     ),
+    "identify": Verb("measure what a robot's servos are like, on a gantry", "servoid.tools.identify"),
     "collect": Verb("record demonstrations as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
         "train a network",
@@ -110,8 +112,12 @@ VERBS: dict[str, Verb] = {
             "interrupt": Verb(
                 "press Ctrl-C at any instant and check that torque is off", "servoid.tools.faults.interrupt"
             ),
+            "operator": Verb(
+                "press stop, and lose whoever steers, and measure when the robot rests", "servoid.tools.faults.operator"
+            ),
             "bus": Verb("time a control cycle on the servo bus", "servoid.tools.bench.bus"),
             "clients": Verb("check other people's clients against the virtual rig", "servoid.tools.bench.clients"),
+            "identify": Verb("identify virtual rigs with hidden servos", "servoid.tools.bench.identify"),
             "faults": Verb("inject every fault while the robot walks", "servoid.tools.faults.campaign"),
             "soak": Verb("walk for minutes over a line that loses packets", "servoid.tools.faults.soak"),
             "fuzz": Verb("feed random bytes to everything that reads bytes", "servoid.tools.faults.fuzz"),
@@ -120,6 +126,7 @@ VERBS: dict[str, Verb] = {
     "view": Verb("look at a recorded run in the browser", "servoid.tools.web.view"),
     "replay": Verb("repeat a recorded run and compare", "servoid.tools.commands.replay"),
     "export": Verb("write a recorded run as CSV or Parquet", "servoid.tools.commands.export"),
+    "onnx": Verb("write a diffusion policy for ONNX Runtime alone", "servoid.tools.commands.onnx_policy"),
     "plot": Verb("draw a recorded run", "servoid.tools.commands.plot"),
     "completion": Verb("print what completes commands in a shell", "servoid.tools.completion"),
 }

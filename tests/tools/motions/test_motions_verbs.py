@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from test_action_file import file, page
 from servoid.hw.robot.description import load_robot
 from servoid.policy.motion.library import Library
 from servoid.tools.cli import main
+from servoid.tools.motions.bodies import body_error
+from servoid.tools.motions.physics import play
 
 ROBOT = load_robot()
 HOME = {joint.id: round(2048 + home * 4096 / (2 * np.pi)) for joint, home in zip(ROBOT.joints, ROBOT.home, strict=True)}
@@ -54,8 +57,25 @@ def test_a_page_becomes_a_clip_that_stands_and_says_where_it_comes_from(nod: Pat
     code, played, _ = motions("play", "look-left", "--library", nod)
     assert (code, played["stands_share"]) == (0, 1.0)
     assert played["joint_error_rad"] < 0.1
+    assert 0.0 < played["body_error_m"] < 0.015
     code, checked, _ = motions("check", "--library", nod)
     assert checked["clips"][0]["beyond_range_rad"] == 0.0
+
+
+def test_a_folder_is_played_a_row_a_clip(nod: Path, motions: Motions) -> None:
+    """And a robot that does not do what the clip says is far from it."""
+    still = Library(ROBOT, nod)["look-left"]
+    moved = still.joints + 0.0
+    moved[:, 2] -= 1.0  # an arm
+    Library(ROBOT, nod).add(replace(still, name="arm", joints=moved, about=replace(still.about, mirror="")))
+    code, answer, err = motions("play", "--library", nod)
+    assert code == 0, err
+    assert [row["clip"] for row in answer["clips"]] == ["arm", "look-left"]
+    for key in ("stands_share", "body_error_m"):
+        assert answer["all"][key] == pytest.approx(np.mean([row[key] for row in answer["clips"]]))
+    played = play(still.joints, ROBOT)
+    near, far = (body_error(played, Library(ROBOT, nod)[name], ROBOT)[0] for name in ("look-left", "arm"))
+    assert 2.0 * near < far
 
 
 def test_clips_are_mirrored_and_blended_into_new_files(nod: Path, motions: Motions) -> None:
@@ -97,7 +117,10 @@ def test_a_run_becomes_a_clip(tmp_path: Path, motions: Motions, monkeypatch: pyt
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("import", "{}/walk.c3d", "--name", "x"), "not an action file (.bin) or a flight log (.mcap)"),
+        (
+            ("import", "{}/walk.c3d", "--name", "x"),
+            "a flight log (.mcap) or a dataset's folder",
+        ),
         (("import", "{}/motion.bin", "--name", "x"), "page missing; choose one with --page: 7 nod"),
         (("import", "{}/motion.bin", "--name", "x", "--page", 8), "page 8 is empty; pages with a motion: 7"),
         (("import", "{}/motion.bin", "--name", "look-left", "--page", 7), "look-left.safetensors: already exists"),

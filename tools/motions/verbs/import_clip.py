@@ -53,9 +53,7 @@ def main(args: argparse.Namespace) -> int:
     with reporting(args.json) as report:
         robot = load_robot(args.robot)
         if args.file.suffix not in (".bin", ".mcap") and not args.file.is_dir():
-            raise ConfigError(
-                f"{args.file}: not an action file (.bin), a flight log (.mcap) or the folder of a dataset"
-            )
+            raise ConfigError(f"{args.file}: not an action file (.bin), a flight log (.mcap) or a dataset's folder")
         for option, fits in (("page", args.file.suffix == ".bin"), ("episode", args.file.is_dir())):
             if vars(args)[option] is not None and not fits:
                 raise ConfigError(f"--{option} {vars(args)[option]}: {args.file} has none: drop it")
@@ -65,7 +63,7 @@ def main(args: argparse.Namespace) -> int:
         if args.file.suffix == ".bin":
             clips = make_clips(args.file, recipe, robot)
         elif args.file.is_dir():
-            from servoid.tools.motions.episodes import clip_of_episode
+            from servoid.tools.motions.verbs.episodes import clip_of_episode
 
             wanted = recipe.clips[0]
             source = f"dataset {args.file.resolve().name}, episode {args.episode or 0}"
