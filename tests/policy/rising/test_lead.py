@@ -7,7 +7,7 @@ import pytest
 
 from servoid.hw.robot.description import load_robot
 from servoid.policy.motion.library import Library
-from servoid.policy.rising.lead import CLIPS, Rising
+from servoid.policy.rising.lead import CLIPS, PACE, Rising
 
 ROBOT = load_robot()
 LIBRARY = Library(ROBOT)
@@ -47,7 +47,7 @@ def test_it_waits_for_joints_that_are_on_their_way() -> None:
     lead = Rising(ROBOT, PAIR)
     lead.begin(np.ones((), bool), FRONT)
     late = lead.target.copy()
-    late[3] += 1.5
+    late[3] += PACE.waits + 0.1
     lead.advance(np.zeros(()), FRONT, lead.target, late)
     assert float(lead.time) == 0.0
     beyond = ROBOT.upper + 5.0  # what is asked out of range is never reached, and not waited for
