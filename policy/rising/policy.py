@@ -23,7 +23,10 @@ KIND = "get_up"  # of a checkpoint
 
 
 class RisingPolicy:
-    """Drives one robot, or worlds of any leading `shape`. It decides once in `stride` ticks."""
+    """Drives one robot, or worlds of any leading `shape`.
+
+    It decides once in `stride` ticks, and goes from one decision to the next evenly: goals that leap wear gears.
+    """
 
     def __init__(self, robot: Robot, path: Path, clips: Sequence[Clip], shape: tuple[int, ...] = ()) -> None:
         """`clips`: from lying on the front, and on the back. Raises CheckpointError where the file does not fit."""
@@ -45,7 +48,7 @@ class RisingPolicy:
         self._observation.reset()
         self._tick = 0
         self._before: tuple[Array, Array] | None = None  # gravity and targets of the last tick
-        self._action = np.zeros((*self._shape, self._network.sizes[-1]))
+        self._last = self._action = np.zeros((*self._shape, self._network.sizes[-1]))
 
     def __call__(self, state: State, applied: Array) -> Array:
         """Joint targets `(..., n_joints)` rad; `applied` is what became of the last ones. Once a tick."""
@@ -57,10 +60,13 @@ class RisingPolicy:
             lead.advance(self._action[..., -1], gravity, wanted, applied)
         if self._tick % self._stride == 0:
             seen = np.zeros((*self._shape, 0)) if lead is None else lead.seen
-            self._action = self._network(self._observation(state, applied, seen))
+            decided = self._network(self._observation(state, applied, seen))
+            self._last, self._action = (self._action if self._tick else decided), decided
+        share = (self._tick % self._stride + 1) / self._stride
         self._tick += 1
+        joints = (self._last + share * (self._action - self._last))[..., : len(self._home)]
         around = self._home if lead is None else lead.target
-        target = around + self._reach * self._action[..., : len(self._home)]
+        target = around + self._reach * joints
         self._before = state.gravity, target
         return target
 

@@ -205,14 +205,17 @@ class TaskEnvironment:
         The prior judges the window up to the state that the decision is made in: what this one leads to, it says next.
         """
         manner = self.score(self.fleet.state)
-        joints = self.reach * action[:, : len(self.robot.joints)]
+        before = np.where(self.ticks[:, None] == 0, action, self._action) if self.task.lies else action
         fallen, shock, blocked = np.zeros(self.n, bool), np.zeros(self.n), np.zeros(self.n)
         if self.settings.hardest_push:
             self._push()
         for tick in range(self.stride):
             if tick:
                 self._sense()
-            target = joints + (self.robot.home if self.lead is None else self.lead.target)
+            act = before + (tick + 1) / self.stride * (action - before)  # as `RisingPolicy` goes from one to the next
+            target = self.reach * act[:, : len(self.robot.joints)] + (
+                self.robot.home if self.lead is None else self.lead.target
+            )
             self.fleet.step(target)
             if self.lead is not None:
                 self.lead.advance(action[:, -1], self.fleet.state.gravity, target, self.fleet.applied)
