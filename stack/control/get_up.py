@@ -196,9 +196,11 @@ def get_up(robot: Robot, checkpoints: Path = CHECKPOINTS) -> GetUp:
 
 
 def _found(name: str, robot: Robot, checkpoints: Path) -> Path | None:
-    """A checkpoint, where there is one of this robot."""
-    path = checkpoints / f"{name}.safetensors"
-    return path if path.is_file() and read_header(path)["robot"] == robot.name else None
+    """The robot's own checkpoint, or the shipped one where that is of this robot."""
+    own, shipped = (folder / f"{name}.safetensors" for folder in (Path(robot.folder), checkpoints))
+    if own.is_file():
+        return own
+    return shipped if shipped.is_file() and read_header(shipped)["robot"] == robot.name else None
 
 
 def fingerprints(robot: Robot, checkpoints: Path = CHECKPOINTS) -> dict[str, str | None]:

@@ -82,6 +82,8 @@ METRICS: dict[str, Metric] = {
     "rose_in_time": Metric("rose_in_time", share=True),
     "seconds_to_rise": Metric("seconds_to_rise", "s", lower=True, median=True, unfinished="left out"),
     "ball_speed": Metric("ball_speed_mps", "m/s"),
+    "steady_speed": Metric("steady_speed_mps", "m/s"),
+    "turning_rate": Metric("turning_rate_radps", "rad/s"),
     "joint_error": Metric("joint_rms_rad", "rad", lower=True),
     "understood": Metric("understood", share=True),
     "ticks": Metric("ticks", "ticks", unfinished="whole"),
