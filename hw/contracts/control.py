@@ -108,6 +108,9 @@ class Instruction:
     # Where parts of the body shall be at the end of a plan, by name: m in the heading frame from below the base, a
     # point of the ground being (2,), others (3,); "heading": rad.
     targets: Mapping[str, Array] | None = None
+    # Bars to pass under (n, 5): x, y m of the middle in the heading frame, rad of its direction there, half its length
+    # and the height of its lower edge above the ground, m.
+    bars: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
