@@ -76,6 +76,10 @@ def _add_body(model: mujoco.MjSpec, robot: Robot, number: int) -> None:
     for text in warned:
         if not re.match(EXPECTED, text):
             warnings.warn(f"{path}: {text}", stacklevel=2)
+    for name, load in robot.loads.items():
+        carried = model.body(prefix(number) + name).add_body(name=f"{prefix(number)}{ADDED}{name}_load", pos=load.at)
+        carried.mass, carried.ipos, carried.inertia = load.mass, [0, 0, 0], [1e-6, 1e-6, 1e-6]
+        carried.explicitinertial = True
     base = model.body(prefix(number) + robot.base)
     for part in [base, *base.find_all("body")]:
         part.gravcomp = 0.0

@@ -57,7 +57,7 @@ class Crowd:
         Of bodies by the first robot's numbers, from 1 on; what is of geoms is shared by all rows.
         """
         field = self._batch.expand(name)
-        if name.startswith("actuator_"):
+        if name.startswith(("actuator_", "dof_")):
             return _rows(field, self._n)
         step = self._bodies if name.startswith("body_") else 0
         length = self._bodies + 1 if step else field.shape[1]

@@ -18,6 +18,7 @@ from servoid.hw.contracts.world import Start
 from servoid.hw.geometry import headed
 from servoid.hw.robot.description import Imu, Robot
 from servoid.hw.robot.legs import Legs
+from servoid.sim.friction import Friction
 from servoid.sim.ground import Ground
 from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.multi_robot import Crowd
@@ -88,6 +89,9 @@ class Worlds:
         self._gain, self._force = b.expand("actuator_gainprm"), b.expand("actuator_forcerange")
         if self.model.nmocap:
             self._mocap = b.bind("mocap_pos")
+        self._friction = Friction(robot)
+        if self._friction.varies:
+            self._loss = b.expand("dof_frictionloss")
         self._floor = b.expand("geom_friction")[:, self.model.geom(FLOOR).id]
         if randomise > 0:
             self._mass, self._inertia = b.expand("body_mass"), b.expand("body_inertia")
@@ -201,12 +205,25 @@ class Worlds:
         start = (np.arange(self.substeps) * TIMESTEP)[:, None] - self._delay[:, None, :]
         which = np.clip(np.floor(start / self.robot.dt + 1e-6).astype(int) + self._delayed - 1, 0, self._delayed - 1)
         control = np.take_along_axis(self._commands, which, 1) - self._zero[:, None]
-        self.batch.rollout(self.substeps, control, record=tuple(self._record), out=self._fresh)
+        if self._friction.varies:
+            self._step_by_step(control)
+        else:
+            self.batch.rollout(self.substeps, control, record=tuple(self._record), out=self._fresh)
         for key, value in self._record.items():
             value[:, : -self.substeps] = value[:, self.substeps :]
             value[:, -self.substeps :] = self._fresh[key]
         self.ticks += 1
         self.tick += 1
+
+    def _step_by_step(self, control: Array) -> None:
+        """A rollout whose gears' friction follows speed and load: it is set anew before every substep."""
+        for i in range(self.substeps):
+            force = self.batch.bind("actuator_force")
+            self._loss[:, self._dof] = self._friction.at(self._state_qvel[:, self._dof], force)
+            out = {key: value[:, i : i + 1].copy() for key, value in self._fresh.items()}
+            self.batch.rollout(1, control[:, i : i + 1], record=tuple(self._record), out=out)
+            for key, value in out.items():
+                self._fresh[key][:, i : i + 1] = value
 
     @property
     def weight(self) -> float:

@@ -84,6 +84,7 @@ VERBS: dict[str, Verb] = {
             "kick": Verb("search for a harder kick that stays on its feet", "servoid.tools.robots.tune_kick"),
         },
     ),
+    "identify": Verb("measure what a robot's servos are like, on a gantry", "servoid.tools.identify"),
     "collect": Verb("record demonstrations as a dataset", "servoid.tools.learn.collect"),
     "train": Verb(
         "train a network",
@@ -112,6 +113,7 @@ VERBS: dict[str, Verb] = {
             ),
             "bus": Verb("time a control cycle on the servo bus", "servoid.tools.bench.bus"),
             "clients": Verb("check other people's clients against the virtual rig", "servoid.tools.bench.clients"),
+            "identify": Verb("identify virtual rigs with hidden servos", "servoid.tools.bench.identify"),
             "faults": Verb("inject every fault while the robot walks", "servoid.tools.faults.campaign"),
             "soak": Verb("walk for minutes over a line that loses packets", "servoid.tools.faults.soak"),
             "fuzz": Verb("feed random bytes to everything that reads bytes", "servoid.tools.faults.fuzz"),

@@ -36,10 +36,12 @@ def check_servo(servo: Servo, marks: Marks) -> None:
     positive = (
         *("ticks_per_turn", "velocity_unit", "current_unit", "torque_per_ampere", "voltage_unit", "position_p_gain"),
         *("voltage", "stiffness", "stall_torque", "no_load_speed", "braking_torque", "max_temperature"),
+        "stribeck_speed",
     )
     for key in positive:
         _require_positive(getattr(servo, key), key, marks)
-    for key in ("damping", "friction", "armature", "command_delay", "position_latency"):
+    resisting = ("damping", "friction", "stribeck_friction", "load_friction", "armature")
+    for key in (*resisting, "command_delay", "position_latency"):
         _require_not_negative(getattr(servo, key), key, marks)
     if not 0 <= servo.center_tick < servo.ticks_per_turn:
         raise marks.error("center_tick", f"{servo.center_tick} is outside 0..{servo.ticks_per_turn - 1}")
@@ -64,6 +66,9 @@ def _check_numbers(robot: Robot, marks: Marks) -> None:
         _require_positive(getattr(robot.walking, key), f"walking.{key}", marks)
     if robot.weight is not None:
         _require_positive(robot.weight, "weight", marks)
+    for body, load in robot.loads.items():
+        _require_positive(load.mass, f"loads.{body}.mass", marks)
+    _require_not_negative(robot.bus.supply_resistance, "bus.supply_resistance", marks)
     _check_derating(robot, marks)
     _check_imu(robot, marks)
 

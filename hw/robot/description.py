@@ -46,6 +46,19 @@ class Servo:
     position_latency: float
     max_temperature: float
     voltage_range: tuple[float, float]
+    # Beyond `friction`, which is Coulomb's: what more of it a gear has at rest [N m], the speed [rad/s] at which that
+    # has faded to 1/e, and the share of the motor's torque that the gear loses.
+    stribeck_friction: float = 0.0
+    stribeck_speed: float = 0.1
+    load_friction: float = 0.0
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A known weight [kg] on a body of the MJCF, at a point of that body's frame [m]."""
+
+    mass: float
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -192,12 +205,14 @@ Button = Literal["mode", "start", "user"]
 @dataclass(frozen=True)
 class BusSettings:
     """The servo bus. Any of the board's `stop_buttons` is an emergency stop. With `board` none the servos are on an
-    adapter such as a U2D2 and have a supply of their own."""
+    adapter such as a U2D2 and have a supply of their own. `supply_resistance` is that of the battery and its wires, by
+    which a virtual rig's voltage sags."""
 
     baud: int
     board_id: int = 200
     board: Literal["opencr", "none"] = "opencr"
     stop_buttons: tuple[Button, ...] = ("mode", "start", "user")
+    supply_resistance: float = 0.04  # Ohm: a 3S pack of the size that fits an OP3, with its wires
 
 
 @dataclass(frozen=True)
@@ -223,6 +238,7 @@ class Robot:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, of the base's frame, in that of its body in the MJCF
     passive: tuple[str, ...] = ()  # joints that no servo drives: not commanded, not read
     weight: float | None = None  # N; None: the file does not say it
+    loads: dict[str, Payload] = field(default_factory=dict)  # what the MJCF lacks, by the body that carries it
     # Settings of its gait: a name in configs/policies/, or a .yaml file beside the robot's; empty: none of its own.
     gait: str = ""
     folder: str = ""  # of its networks and its gait; absolute once loaded
@@ -267,7 +283,7 @@ class Robot:
     def servos(self) -> tuple[Servo, ...]:
         """The servo of each joint as it acts there, behind the joint's gear; ticks alone are the servo's own."""
         pairs = zip(self.joints, self.bare_servos, strict=True)
-        return tuple(servo if joint.gear == 1.0 else _geared(servo, joint.gear) for joint, servo in pairs)
+        return tuple(servo if joint.gear == 1.0 else geared(servo, joint.gear) for joint, servo in pairs)
 
     @cached_property
     def tick_angles(self) -> Array:
@@ -284,7 +300,7 @@ class Robot:
         return 1.0 / self.rate
 
 
-def _geared(servo: Servo, gear: float) -> Servo:
+def geared(servo: Servo, gear: float) -> Servo:
     """A servo seen through a gear: `gear` turns of its own for one of the joint."""
     return replace(
         servo,
@@ -297,6 +313,8 @@ def _geared(servo: Servo, gear: float) -> Servo:
         damping=servo.damping * gear**2,
         friction=servo.friction * gear,
         armature=servo.armature * gear**2,
+        stribeck_friction=servo.stribeck_friction * gear,
+        stribeck_speed=servo.stribeck_speed / gear,
     )
 
 
@@ -305,6 +323,13 @@ def load_servo(name: str) -> Servo:
     servo, marks = load_marked(resolve("servos", name), Servo)
     check_servo(servo, marks)
     return servo
+
+
+def save_servo(servo: Servo, path: Path, head: str = "") -> None:
+    """Write a servo's file, after lines of comment. Numbers have six digits."""
+    values = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(servo).items()}
+    values = {key: float(f"{value:.6g}") if isinstance(value, float) else value for key, value in values.items()}
+    path.write_text(head + yaml.safe_dump(values, sort_keys=False, default_flow_style=None))
 
 
 def load_robot(name: str | Path = "op3") -> Robot:

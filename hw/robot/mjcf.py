@@ -126,6 +126,8 @@ def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
         need("joint", joint.name, list(kinds))
         if kinds[joint.name] != mujoco.mjtJoint.mjJNT_HINGE:
             raise ConfigError(f"{path}: joint {joint.name!r} is not a hinge, but a servo turns")
+    for name in robot.loads:
+        need("body (that carries a load)", name, [body.name for body in [base, *base.find_all("body")]])
     need("site (the IMU's)", robot.imu_site, [site.name for site in base.find_all("site")])
     geoms = [geom.name for geom in base.find_all("geom")]
     elsewhere = {geom.name for geom in model.geoms} - set(geoms)

@@ -14,7 +14,6 @@ from servoid.sim.model import TIMESTEP
 from servoid.sim.rig.servo.firmware import Firmware
 from servoid.sim.rig.servo.plant import Plant
 
-BATTERY_RESISTANCE = 0.04  # Ohm: a 3S pack of the size that fits such a robot, with its wires
 STEP_NS = round(TIMESTEP * 1e9)
 
 
@@ -75,7 +74,7 @@ class MotorBank:
         volts = firmware.step(now_ns, angle, speed, self.supply)
         plant.step(self._direction * volts, firmware.powered, self.supply)
         draw = firmware.settle(plant.torque / self._ratio, self._ratio * plant.joint_speed, self.supply)
-        self.supply = max(self.open_circuit - self.sag - BATTERY_RESISTANCE * float(draw.sum()), 0.0)
+        self.supply = max(self.open_circuit - self.sag - self.robot.bus.supply_resistance * float(draw.sum()), 0.0)
         self.sense()
 
     def sense(self) -> None:

@@ -16,6 +16,7 @@ from servoid.hw.contracts.world import Scene, Start
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
 from servoid.hw.seeds import Stream, generator
+from servoid.sim.friction import Friction
 from servoid.sim.ground import Ground
 from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.randomise import Body, draw
@@ -24,6 +25,8 @@ from servoid.sim.truth import SimulatedTruth
 from servoid.sim.worlds import NOISE_ROWS, VELOCITY_NOISE, with_errors
 
 CLEARANCE = 0.05  # m between the soles and the floor while the robot is held
+_HELD = 1e6  # kg and kg m2 that the base has beside its own while somebody holds it: it gives to no motion of a limb
+_HELD_TOLERANCE = 1e-14  # of the solver, which would otherwise take the light limbs beside it for settled
 _R, _K, _KP, _VMAX = 0, 1, 4, 7  # indices in a dcmotor's gainprm
 
 
@@ -55,6 +58,8 @@ class Plant:
         self.resistance = self.model.actuator_gainprm[:, _R].copy()  # Ohm, at the joint: V = R/K torque + K speed
         self.constant = self.model.actuator_gainprm[:, _K].copy()  # V s/rad
         self.model.actuator_gainprm[:, _KP] = self.constant / self.resistance
+        self._friction = Friction(robot)
+        self._armature, self._tolerance = self.model.dof_armature[:6].copy(), float(self.model.opt.tolerance)
         self._braking = np.array([servo.braking_torque for servo in robot.servos])
         self._slowest = np.array([servo.velocity_unit / 2 for servo in robot.servos])  # rad/s that are no count
         self._noise = np.zeros((NOISE_ROWS, 6 + len(joints)))
@@ -78,6 +83,7 @@ class Plant:
         self.model.body_inertia[own] = self._nominal["body_inertia"][own] * self.body.mass[:, None]
         self.model.geom_friction[:] = self._nominal["geom_friction"]
         self.model.geom_friction[self.model.geom(FLOOR).id, 0] = self.body.friction
+        self.model.dof_armature[:6] = self._armature
         mujoco.mj_setConst(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
         self.held, self._noise_block, self._ticks = True, -1, 0
@@ -145,6 +151,10 @@ class Plant:
         model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1] = -limit, limit
         model.actuator_gainprm[:, _VMAX] = supply
         data.ctrl[:] = data.qpos[self._qpos] + volts
+        if self._friction.varies:
+            model.dof_frictionloss[self._dof] = self._friction.at(data.qvel[self._dof], data.actuator_force)
+        model.dof_armature[:6] = _HELD if self.held else self._armature
+        model.opt.tolerance = _HELD_TOLERANCE if self.held else self._tolerance
         if not self.held:
             mujoco.mj_step(model, data)
             self._ticks += 1
