@@ -13,15 +13,13 @@ from servoid.hw.robot.description import Robot
 # OP3-class robot: another one's range is as much wider or narrower as its own value is greater or smaller.
 STIFFNESS, _STIFFNESS = (5.0, 19.0), 9.4  # N m/rad at the servo's nominal voltage
 VOLTAGE, _VOLTAGE = (11.0, 12.6), 12.0  # V
-FRICTION = (0.4, 1.2)  # of the floor
+FRICTION, _FRICTION = (0.4, 1.2), 0.8  # of the floor
 MASS = (0.9, 1.1)  # factor on each body
 COMMAND_DELAY, _COMMAND_DELAY = (0.008, 0.040), 0.020  # s
 LATENCY, _LATENCY = (0.0, 0.012), 0.004  # s, of joints and of the IMU, each its own
 ZERO = 0.03  # rad, half-width
 BACKLASH = np.deg2rad(0.25)  # rad, whole play of a gear
 IMU_TILT = 0.02  # rad, half-width of the mounting error about x and y
-
-NOMINAL_FRICTION = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +49,8 @@ def draw(rng: np.random.Generator, robot: Robot, n_bodies: int, randomise: bool)
     if not randomise:
         return Body(
             stiffness=servo.stiffness,
-            voltage=servo.voltage,
-            friction=NOMINAL_FRICTION,
+            voltage=robot.bus.supply_voltage or servo.voltage,
+            friction=robot.floor_friction,
             mass=np.ones(n_bodies),
             command_delay=servo.command_delay,
             joint_latency=servo.position_latency,
@@ -65,8 +63,8 @@ def draw(rng: np.random.Generator, robot: Robot, n_bodies: int, randomise: bool)
         )
     return Body(
         stiffness=rng.uniform(*STIFFNESS) * (servo.stiffness / _STIFFNESS),
-        voltage=rng.uniform(*VOLTAGE) * (servo.voltage / _VOLTAGE),
-        friction=rng.uniform(*FRICTION),
+        voltage=rng.uniform(*VOLTAGE) * ((robot.bus.supply_voltage or servo.voltage) / _VOLTAGE),
+        friction=rng.uniform(*FRICTION) * (robot.floor_friction / _FRICTION),
         mass=rng.uniform(*MASS, n_bodies),
         command_delay=rng.uniform(*COMMAND_DELAY) * (servo.command_delay / _COMMAND_DELAY),
         joint_latency=rng.uniform(*LATENCY) * (servo.position_latency / _LATENCY),

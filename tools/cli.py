@@ -49,10 +49,11 @@ VERBS: dict[str, Verb] = {
         },
     ),
     "motions": Verb(
-        "import, author, retarget, list, play, film, check, mirror and blend clips",
+        "import, author, pose, retarget, list, play, film, check, mirror and blend clips",
         verbs={
             "import": Verb("make clips from a file", "servoid.tools.motions.verbs.import_clip"),
             "author": Verb("make clips from keyframes", "servoid.tools.motions.verbs.author"),
+            "keyframes": Verb("make a clip at the page, by hand", "servoid.tools.motions.verbs.keyframes"),
             "retarget": Verb("put a person's motion on the robot", "servoid.tools.motions.verbs.retarget"),
             "list": Verb("list the clips of a library", "servoid.tools.motions.verbs.list_clips"),
             "play": Verb("play a clip open loop in physics", "servoid.tools.motions.verbs.play"),
@@ -110,6 +111,9 @@ VERBS: dict[str, Verb] = {
             "kill": Verb("kill the controller and check the servo state after", "servoid.tools.faults.kill"),
             "interrupt": Verb(
                 "press Ctrl-C at any instant and check that torque is off", "servoid.tools.faults.interrupt"
+            ),
+            "operator": Verb(
+                "press stop, and lose whoever steers, and measure when the robot rests", "servoid.tools.faults.operator"
             ),
             "bus": Verb("time a control cycle on the servo bus", "servoid.tools.bench.bus"),
             "clients": Verb("check other people's clients against the virtual rig", "servoid.tools.bench.clients"),

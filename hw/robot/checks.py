@@ -69,6 +69,9 @@ def _check_numbers(robot: Robot, marks: Marks) -> None:
     for body, load in robot.loads.items():
         _require_positive(load.mass, f"loads.{body}.mass", marks)
     _require_not_negative(robot.bus.supply_resistance, "bus.supply_resistance", marks)
+    if robot.bus.supply_voltage is not None:
+        _require_positive(robot.bus.supply_voltage, "bus.supply_voltage", marks)
+    _require_positive(robot.floor_friction, "floor_friction", marks)
     _check_derating(robot, marks)
     _check_imu(robot, marks)
 

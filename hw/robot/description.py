@@ -213,6 +213,7 @@ class BusSettings:
     board: Literal["opencr", "none"] = "opencr"
     stop_buttons: tuple[Button, ...] = ("mode", "start", "user")
     supply_resistance: float = 0.04  # Ohm: a 3S pack of the size that fits an OP3, with its wires
+    supply_voltage: float | None = None  # V in simulation, the servos idle; None: what the servos' figures hold for
 
 
 @dataclass(frozen=True)
@@ -238,6 +239,7 @@ class Robot:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, of the base's frame, in that of its body in the MJCF
     passive: tuple[str, ...] = ()  # joints that no servo drives: not commanded, not read
     weight: float | None = None  # N; None: the file does not say it
+    floor_friction: float = 0.8  # of what it walks on, in simulation
     loads: dict[str, Payload] = field(default_factory=dict)  # what the MJCF lacks, by the body that carries it
     # Settings of its gait: a name in configs/policies/, or a .yaml file beside the robot's; empty: none of its own.
     gait: str = ""

@@ -15,7 +15,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import Robot
-from servoid.policy.checkpoint import CHECKPOINTS, read_header
+from servoid.policy.checkpoint import CHECKPOINTS, CheckpointError, read_header, resolve
 from servoid.policy.motion.clip import Clip
 from servoid.policy.motion.library import Library
 from servoid.policy.references.clip import BLEND_SHARE, ClipReference
@@ -158,9 +158,12 @@ def get_up(robot: Robot) -> GetUp:
 
 
 def _tracker_of(robot: Robot) -> Path | None:
-    """The shipped tracker, where there is one of this robot."""
-    path = CHECKPOINTS / "tracker.safetensors"
-    return path if path.is_file() and read_header(path)["robot"] == robot.name else None
+    """The robot's own tracker, or the shipped one where that is of this robot."""
+    try:
+        path = resolve("tracker", robot)
+    except CheckpointError:
+        return None
+    return path if path.parent != CHECKPOINTS or read_header(path)["robot"] == robot.name else None
 
 
 def fingerprints(robot: Robot) -> dict[str, str | None]:

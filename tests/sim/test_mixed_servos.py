@@ -13,6 +13,7 @@ from servoid.hw.contracts.body import Command, Mode
 from servoid.hw.dynamixel.protocol.tables import table
 from servoid.hw.dynamixel.protocol.units import Units
 from servoid.hw.robot.description import Robot, load_robot
+from servoid.sim.randomise import draw
 from servoid.sim.rig.in_process import InProcessBackend
 from servoid.sim.rig.rig import Rig
 from servoid.sim.worlds import Worlds
@@ -105,3 +106,13 @@ def test_a_gear_that_cannot_be_is_refused(tmp_path: Path, value: str, said: str)
     (tmp_path / "op3.yaml").write_text(text.replace("{name: head_pan,", f"{{name: head_pan, gear: {value},"))
     with pytest.raises(ConfigError, match=rf"joints\[0\].gear: {said}"):
         load_robot(tmp_path / "op3.yaml")
+
+
+def test_friction_of_the_floor_and_the_supply_are_the_robots_files() -> None:
+    """They were constants, so that nobody could see how a robot does on a slippery floor or a low battery."""
+    own = replace(OP3, floor_friction=0.35, bus=replace(OP3.bus, supply_voltage=10.8))
+    body = draw(np.random.default_rng(3), own, 5, False)
+    assert (body.friction, body.voltage) == (0.35, 10.8)
+    drawn, before = (draw(np.random.default_rng(3), robot, 5, True) for robot in (own, OP3))
+    assert drawn.friction / before.friction == pytest.approx(0.35 / 0.8)
+    assert drawn.voltage / before.voltage == pytest.approx(0.9)

@@ -17,7 +17,7 @@ from servoid.tools.bringup.line import is_virtual
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import reporting
 from servoid.tools.common.prompt import Cancelled
-from servoid.tools.web.launch import STOPS, open_page, view_of
+from servoid.tools.web.launch import open_page, tell_page, view_of
 
 if TYPE_CHECKING:
     from servoid.tools.web.line.link import PageLink
@@ -36,7 +36,7 @@ def at_desk(args: argparse.Namespace, verb: str, work: Work) -> int:
         is_virtual(args)  # refuses a port that is missing
         robot = load_robot(args.robot)
         with open_page(view_of(args), args.robot) as page:
-            report.line(f"page: {page.url}  ({STOPS})")
+            tell_page(report, page)
             session = Session(page.link, args, robot, verb)
             try:
                 session.run()

@@ -26,7 +26,7 @@ from servoid.tools.common.parser import (
 )
 from servoid.tools.common.pictures.drawing import prepare
 from servoid.tools.common.prompt import confirm
-from servoid.tools.web.launch import STOPS, add_view_arguments, open_page, view_of
+from servoid.tools.web.launch import add_foxglove_argument, add_view_arguments, open_page, tell_page, view_of
 
 if TYPE_CHECKING:
     from servoid.stack.runtime.result import Result
@@ -70,6 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--fast", action="store_true", help="simulate as fast as possible, also on a terminal")
     add_view_arguments(parser)
+    add_foxglove_argument(parser)
     add_json_argument(parser)
 
 
@@ -85,6 +86,7 @@ def main(args: argparse.Namespace) -> int:
         from servoid.tools.common.live import LiveLine
         from servoid.tools.common.summary import summary
 
+        args.view |= args.foxglove is not None  # the page's process is what serves it
         watched = (sys.stdout.isatty() and not args.json) or args.view or find(args.task).cls.steered
         plan = RunSettings(
             task=args.task,
@@ -130,7 +132,7 @@ def _shown(report: Report, args: argparse.Namespace, plan: RunSettings, live: Li
 
     check_steered(plan)
     with open_page(view_of(args), plan.robot) as page:
-        report.line(f"page: {page.url}  ({STOPS})")
+        tell_page(report, page)
         return watched_run(page.link, plan, on_tick=live, confirm=asks)
 
 

@@ -28,8 +28,8 @@ Solved = tuple[Array, Array, Array]  # joints, and place and quaternion of the b
 
 
 @dataclass(frozen=True)
-class _Pose:
-    """A stance of one keyframe, before it is solved."""
+class KeyPose:
+    """A stance of one keyframe, before it is solved. `feet` m are from where the soles are at home."""
 
     height: Array  # ()
     tilt: Array  # (3,)
@@ -42,8 +42,8 @@ class _Pose:
 
 def author(recipe: Authored, robot: Robot, source: str) -> Iterator[Clip]:
     """The clips of a recipe, and those mirrored from them. Raises ConfigError naming the keyframe that cannot be."""
-    maker = _Author(robot)
-    made: dict[str, _Pose] = {}
+    maker = Author(robot)
+    made: dict[str, KeyPose] = {}
     for wanted in recipe.clips:
         if wanted.after is not None and wanted.after not in made:
             raise ConfigError(f"clip '{wanted.name}': after: '{wanted.after}' is not an earlier clip")
@@ -64,25 +64,37 @@ def _both(clip: Clip, wanted: AuthoredClip, robot: Robot) -> Iterator[Clip]:
         yield clip.mirrored(robot, wanted.mirrored)
 
 
-class _Author:
+class Author:
+    """Makes clips of a robot. `middle` `(3,)` m is that of the soles at home. Raises ConfigError for legs of another
+    build than `Standing` solves."""
+
     def __init__(self, robot: Robot) -> None:
-        self._robot, self._standing = robot, Standing(robot)
-        home = self._standing.home
+        self._robot, self.standing = robot, Standing(robot)
+        home = self.standing.home
         n = len(robot.feet)
         self._soles = home.feet[0]
-        self._middle = self._soles.mean(0)
-        lean = home.centre[0] - self._middle[:2]
+        self.middle = self._soles.mean(0)
+        lean = home.centre[0] - self.middle[:2]
         still = np.zeros((n, 3))
-        self.home = _Pose(home.height[0], home.tilt[0], np.full(n, 1.0 / n), lean, still, still, home.joints[0])
+        self.home = KeyPose(home.height[0], home.tilt[0], np.full(n, 1.0 / n), lean, still, still, home.joints[0])
 
-    def poses(self, wanted: AuthoredClip, before: _Pose) -> list[_Pose]:
+    def stand(self, pose: KeyPose) -> Solved:
+        """A pose as it stands, without a leading dimension; where legs do not reach, they come as near as they can."""
+        joints, place, turn = self.standing.solve(self._stance(_unflat(_flat(pose)[None], pose)))
+        return joints[0], place[0], turn[0]
+
+    def offset(self, foot: int, place: Array, heading: float) -> Array:
+        """What `feet` of a pose is where the sole of a foot with that heading [rad] is at `place` `(3,)` m."""
+        return turned(place - self.middle, -heading) - (self._soles[foot] - self.middle) * [1.0, 1.0, 0.0]
+
+    def poses(self, wanted: AuthoredClip, before: KeyPose) -> list[KeyPose]:
         out = []
         for number, frame in enumerate(wanted.frames, 1):
             before = self._after(frame, before, f"clip '{wanted.name}', keyframe {number}")
             out.append(before)
         return out
 
-    def _after(self, frame: Keyframe, before: _Pose, where: str) -> _Pose:
+    def _after(self, frame: Keyframe, before: KeyPose, where: str) -> KeyPose:
         pose = self.home if frame.home else before
         feet, turn, weight, joints = pose.feet.copy(), pose.turn.copy(), pose.weight.copy(), pose.joints.copy()
         names = list(self._robot.feet)
@@ -95,7 +107,7 @@ class _Author:
                 weight[_index(foot, names, where)] = share
         for joint, angle in frame.joints.items():
             i = _index(joint, self._robot.names, where)
-            if i in self._standing.legs.index:
+            if i in self.standing.legs.index:
                 raise ConfigError(f"{where}: joints.{joint}: is a leg's: say where its foot is with feet")
             joints[i] = angle
         for geom, target in frame.reach.items():
@@ -112,7 +124,7 @@ class _Author:
         )
 
     def _reached(self, geom: str, target: Array, joints: Array, where: str) -> Array:
-        statics = self._standing.statics
+        statics = self.standing.statics
         if geom not in statics.geoms:
             raise ConfigError(f"{where}: reach.{geom}: no such geom: {nearest(geom, statics.geoms)}")
         joints, missed = statics.reach(geom, target, joints)
@@ -120,7 +132,7 @@ class _Author:
             raise ConfigError(f"{where}: reach.{geom}: {1e3 * missed:.0f} mm out of reach: choose a nearer place")
         return joints
 
-    def clip(self, wanted: AuthoredClip, poses: list[_Pose], about: About) -> Clip:
+    def clip(self, wanted: AuthoredClip, poses: list[KeyPose], about: About) -> Clip:
         """Raises ConfigError naming the keyframe that is out of reach, or where a joint leaves its range."""
         seconds = np.array([frame.seconds for frame in wanted.frames])
         for _ in range(_STRETCHES):
@@ -128,8 +140,8 @@ class _Author:
             stance = self._stance(many)
             carries = stance.feet[..., 2] <= _CARRIES
             self._check_weight(wanted.name, keyframe, many.weight, carries)
-            solved = self._standing.solve(stance)
-            goals = self._standing.loaded(*solved, carries)
+            solved = self.standing.solve(stance)
+            goals = self.standing.loaded(*solved, carries)
             self._check(wanted.name, keyframe, stance, solved, goals)
             fastest = np.abs(np.diff(goals, axis=0)).max(1) / (
                 SPEED_SHARE * self._robot.limits.joint_speed * self._robot.dt
@@ -147,7 +159,7 @@ class _Author:
             )
         return Clip(wanted.name, goals, *solved[1:], carries.astype(float), about).placed()
 
-    def _between(self, wanted: AuthoredClip, poses: list[_Pose], seconds: Array) -> tuple[_Pose, Array]:
+    def _between(self, wanted: AuthoredClip, poses: list[KeyPose], seconds: Array) -> tuple[KeyPose, Array]:
         """Poses of all ticks, and the number of the keyframe that each is on the way to."""
         dt = self._robot.dt
         rows, keyframe = [_flat(poses[0])], [0]
@@ -160,10 +172,10 @@ class _Author:
             keyframe += [number] * (len(rows) - len(keyframe))
         return _unflat(np.array(rows), poses[0]), np.array(keyframe)
 
-    def _stance(self, pose: _Pose) -> Stance:
+    def _stance(self, pose: KeyPose) -> Stance:
         heading = pose.turn[..., 2]
-        offset = (self._soles - self._middle) * [1.0, 1.0, 0.0] + pose.feet
-        feet = self._middle + np.stack([turned(offset[:, i], heading[:, i]) for i in range(offset.shape[1])], 1)
+        offset = (self._soles - self.middle) * [1.0, 1.0, 0.0] + pose.feet
+        feet = self.middle + np.stack([turned(offset[:, i], heading[:, i]) for i in range(offset.shape[1])], 1)
         under = (pose.weight[..., None] * feet[..., :2]).sum(-2)
         yaw = (pose.weight * heading).sum(-1)
         lean = np.concatenate([pose.lean, np.zeros((len(yaw), 1))], -1)
@@ -179,7 +191,7 @@ class _Author:
             )
 
     def _check(self, name: str, keyframe: Array, stance: Stance, solved: Solved, goals: Array) -> None:
-        missed = self._standing.miss(stance, *solved)
+        missed = self.standing.miss(stance, *solved)
         if missed.max() > REACHED:
             tick, foot = np.unravel_index(missed.argmax(), missed.shape)
             raise ConfigError(
@@ -202,11 +214,11 @@ def _index(name: str, names: list[str] | tuple[str, ...], where: str) -> int:
     return list(names).index(name)
 
 
-def _flat(pose: _Pose) -> Array:
+def _flat(pose: KeyPose) -> Array:
     return np.concatenate([np.ravel(np.asarray(value, float)) for value in vars(pose).values()])
 
 
-def _unflat(rows: Array, like: _Pose) -> _Pose:
+def _unflat(rows: Array, like: KeyPose) -> KeyPose:
     """Poses of many ticks: every field with a leading dimension."""
     out, at = {}, 0
     for name, value in vars(like).items():
@@ -214,4 +226,4 @@ def _unflat(rows: Array, like: _Pose) -> _Pose:
         size = int(np.prod(shape))
         out[name] = rows[:, at : at + size].reshape(len(rows), *shape)
         at += size
-    return _Pose(**out)
+    return KeyPose(**out)

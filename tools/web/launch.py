@@ -14,12 +14,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from servoid.hw.config import ConfigError
+from servoid.tools.common.output import Report
 from servoid.tools.web.browser.access import Access
 from servoid.tools.web.line.link import PageLink
 
 START_SECONDS = 120.0  # for the page to come up on a busy machine
 END_SECONDS = 10.0  # for it to go away when its program is done
-PORT = 8080
+PORT, FOXGLOVE_PORT = 8080, 8765
 STOPS = "its stop button is never the only one: keep a hand on the robot's own, or on Ctrl-C"
 
 
@@ -29,11 +30,17 @@ class View:
 
     host: str = "127.0.0.1"
     port: int = PORT
+    foxglove: int | None = None  # port at which the run is served to Foxglove's own application, too
 
     def __post_init__(self) -> None:
         Access.at(self.host)
         if not 0 <= self.port < 65536:
             raise ConfigError(f"--view-port {self.port}: give a number from 0 (any that is free) to 65535")
+        if self.foxglove is not None:
+            if not 0 <= self.foxglove < 65536:
+                raise ConfigError(f"--foxglove {self.foxglove}: give a number from 0 (any that is free) to 65535")
+            if importlib.util.find_spec("foxglove") is None:
+                raise ConfigError("--foxglove needs the 'foxglove' extra: pip install 'servoid[foxglove]'")
 
 
 def add_view_arguments(parser: argparse.ArgumentParser, *, switch: bool = True) -> None:
@@ -51,8 +58,26 @@ def add_view_arguments(parser: argparse.ArgumentParser, *, switch: bool = True) 
     )
 
 
+def add_foxglove_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--foxglove",
+        type=int,
+        nargs="?",
+        const=FOXGLOVE_PORT,
+        metavar="PORT",
+        help=f"serve the run to Foxglove's own application on this machine, too (default: {FOXGLOVE_PORT})",
+    )
+
+
 def view_of(args: argparse.Namespace) -> View:
-    return View(args.view_host, args.view_port)
+    return View(args.view_host, args.view_port, vars(args).get("foxglove"))
+
+
+def tell_page(report: Report, page: OpenPage) -> None:
+    """Where the page is, and that it is not the only stop."""
+    report.line(f"page: {page.url}  ({STOPS})")
+    if page.foxglove is not None:
+        report.line(f"Foxglove: open a connection to {page.foxglove}")
 
 
 def check_installed() -> None:
@@ -67,6 +92,7 @@ class OpenPage:
 
     link: PageLink
     url: str
+    foxglove: str | None = None  # where Foxglove connects to
 
 
 @contextlib.contextmanager
@@ -85,6 +111,7 @@ def open_page(view: View, robot: str, tasks: Sequence[dict[str, str]] = ()) -> I
         "port": view.port,
         "token": access.token,
         "tasks": list(tasks),
+        "foxglove": view.foxglove,
     }
     with theirs:
         process = subprocess.Popen(
@@ -95,13 +122,13 @@ def open_page(view: View, robot: str, tasks: Sequence[dict[str, str]] = ()) -> I
         )
     link = PageLink(ours)
     try:
-        yield OpenPage(link, _address(process))
+        yield OpenPage(link, *_addresses(process))
     finally:
         link.close()
         _end(process)
 
 
-def _address(process: subprocess.Popen[bytes]) -> str:
+def _addresses(process: subprocess.Popen[bytes]) -> tuple[str, str | None]:
     """What the process says first."""
     assert process.stdout is not None
     with process.stdout as stream:
@@ -113,7 +140,7 @@ def _address(process: subprocess.Popen[bytes]) -> str:
         raise ConfigError("the page did not start: its error is above") from None
     if "error" in answer:
         raise ConfigError(answer["error"])
-    return str(answer["url"])
+    return str(answer["url"]), answer["foxglove"]
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

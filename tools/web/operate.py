@@ -18,7 +18,7 @@ from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Report, add_json_argument, reporting
 from servoid.tools.common.parser import add_gain_argument, add_recover_argument, check_seed
 from servoid.tools.common.prompt import confirm
-from servoid.tools.web.launch import STOPS, add_view_arguments, open_page, view_of
+from servoid.tools.web.launch import add_foxglove_argument, add_view_arguments, open_page, tell_page, view_of
 
 if TYPE_CHECKING:
     from servoid.tools.web.line.link import PageLink
@@ -38,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", action="store_true", help="let a real robot move without asking here first")
     parser.add_argument("--logs", type=Path, default=Path("runs"), metavar="FOLDER", help="flight logs (default: runs)")
     add_view_arguments(parser, switch=False)
+    add_foxglove_argument(parser)
     add_json_argument(parser)
 
 
@@ -53,7 +54,7 @@ def main(args: argparse.Namespace) -> int:
         if not backend_kind(args.backend).simulated and not args.start:
             confirm(f"{robot.name} will move when somebody at the page starts a task", "give --start to let it move")
         with open_page(view_of(args), args.robot, tasks) as page:
-            report.line(f"page: {page.url}  ({STOPS})")
+            tell_page(report, page)
             runs = 0
             try:
                 while (request := _wait(page.link)) is not None:

@@ -150,9 +150,8 @@ class OdometryTrainer(Trainer):
 
     @property
     def following(self) -> str:
-        return (
-            f"cp {self.best_path} {checkpoint.CHECKPOINTS / 'odometry.safetensors'}  # every run and training reads it"
-        )
+        own = Path(self.robot.folder)
+        return f"mkdir -p {own} && cp {self.best_path} {own / 'odometry.safetensors'}  # {self.robot.name} goes by it"
 
     def prepare(self) -> None:
         """Record the walks and make the network."""

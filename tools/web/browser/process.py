@@ -26,6 +26,7 @@ from servoid.hw.robot.description import load_robot
 from servoid.stack.safety.guard import Phase
 from servoid.tools.web.browser.access import Access
 from servoid.tools.web.browser.gate import Gate
+from servoid.tools.web.browser.live_foxglove import LiveFoxglove
 from servoid.tools.web.browser.rights import Rights
 from servoid.tools.web.browser.scene import Scene3D
 from servoid.tools.web.browser.server import PageServer
@@ -49,6 +50,7 @@ class PageSettings:
     host: str
     port: int
     token: str | None
+    foxglove: int | None  # port for Foxglove's application; None: not served
     tasks: list[dict[str, str]]  # that may be started from the page: name, description
 
 
@@ -62,10 +64,12 @@ class PageProcess:
         self._stream = socket.socket(fileno=settings.fd)
         self._stream.setblocking(False)
         self._telemetry, self._rights = Telemetry(robot), Rights(settings.token)
-        self._scene = Scene3D(robot, self._switch_truth)
+        self._scene = Scene3D(robot, self._switch_truth, self._drag)
+        self._foxglove = None if settings.foxglove is None else LiveFoxglove(robot, settings.foxglove)
         self._server = PageServer(self._telemetry, self._rights, self._pass)
         self._server.tasks = settings.tasks
         self._newest: Snapshot | None = None
+        self._numbers = ""  # of it, as JSON
         self._plan: Array | None = None  # (n, 2) m: the newest one's path
         self._phase: str | None = None  # of the newest tick of what runs; None: nothing runs
         self._halted: float | None = None  # s, when somebody asked to stop and was not heeded yet
@@ -89,7 +93,8 @@ class PageProcess:
                     f"{os.strerror(error.errno or 0)}: "
                     "choose another with --view-port, or --view-host"
                 ) from None
-            print(json.dumps({"url": access.url(gate.port)}), flush=True)
+            served = None if self._foxglove is None else self._foxglove.url
+            print(json.dumps({"url": access.url(gate.port), "foxglove": served}), flush=True)
             self._loop.add_reader(self._stream.fileno(), self._receive)
             drawing = asyncio.create_task(self._draw())
             await self._ended.wait()
@@ -97,6 +102,8 @@ class PageProcess:
             drawing.cancel()
             inner.close()
             self._scene.close()
+            if self._foxglove is not None:
+                self._foxglove.close()
 
     def _receive(self) -> None:
         while True:
@@ -120,7 +127,11 @@ class PageProcess:
         if kind == "tick":
             self._plan = self._plan if value.plan is None else value.plan
             self._newest, self._phase = replace(value, plan=self._plan), value.phase
-            self._server.show(self._telemetry.tick(self._newest))
+            self._numbers = self._telemetry.tick(self._newest)
+            self._server.show(self._numbers)
+            if self._foxglove is not None:
+                for event in value.events:
+                    self._foxglove.hear(event)
             if value.phase in ENDING:
                 self._halted = None
         elif kind == "run":
@@ -149,6 +160,18 @@ class PageProcess:
         request = PageRequest("truth", 0, 0.0, on=on)
         self._loop.call_soon_threadsafe(lambda: self._pass(self._rights.numbered(request)))
 
+    def _drag(self, name: str, place: Array) -> None:
+        """Called by viser, in a thread of its own, which does not say whose browser it was: somebody has to be in
+        control."""
+        value = " ".join(f"{part:.4f}" for part in place)
+        request = PageRequest("do", 0, 0.0, what=f"drag {name}", value=value)
+
+        def passed() -> None:
+            if self._rights.holder is not None:
+                self._pass(self._rights.numbered(request))
+
+        self._loop.call_soon_threadsafe(passed)
+
     async def _draw(self) -> None:
         """Draw the newest tick, as often as a picture is due, and see to it that a wish to stop is heeded."""
         drawn: Snapshot | None = None
@@ -157,6 +180,8 @@ class PageProcess:
             if self._newest is not None and self._newest is not drawn:
                 drawn = self._newest
                 self._scene.show(drawn)
+                if self._foxglove is not None:
+                    self._foxglove.show(drawn, self._numbers)
             self._insist()
 
     def _insist(self) -> None:

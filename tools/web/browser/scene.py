@@ -20,12 +20,13 @@ from servoid.hw.robot.description import Robot
 from servoid.sim.drawing.shapes import Figure
 from servoid.sim.marks import GOAL_COLOUR, PATH_COLOUR, PLAN_COLOUR, TRAIL_COLOUR
 from servoid.sim.scene import PILLAR_COLOUR, PILLAR_HEIGHT, SPHERE_COLOUR
+from servoid.tools.web.browser.handles import Handles
 from servoid.tools.web.browser.meshes import meshes
 from servoid.tools.web.line.snapshot import BodyPose, RunInfo, Snapshot
 
 WORLD = "/world"
 TRUTH_COLOUR, BESIDE_COLOUR, OPACITY = (60, 110, 220), (225, 130, 30), 0.35
-CONTACT_COLOUR = (40, 170, 90)
+CONTACT_COLOUR, BECAME_COLOUR = (40, 170, 90), (0.2, 0.35, 0.85)
 FOLLOW = 0.15  # share of the way to the robot that the picture goes each frame
 CELL = 0.5  # m of the floor's grid
 TRAIL_STEP, TRAIL_LENGTH = 0.03, 400  # m between marks of the way, and how many there are
@@ -33,13 +34,16 @@ TRAIL_STEP, TRAIL_LENGTH = 0.03, 400  # m between marks of the way, and how many
 
 class Scene3D:
     """Draws into a viser server of its own, at a port of this machine. `truth_wanted` is told when somebody switches
-    the truth on or off."""
+    the truth on or off, and `dragged` where a handle was put, by its name, `(3,)` m."""
 
-    def __init__(self, robot: Robot, truth_wanted: Callable[[bool], None]) -> None:
+    def __init__(
+        self, robot: Robot, truth_wanted: Callable[[bool], None], dragged: Callable[[str, Array], None]
+    ) -> None:
         """Raises ConfigError where the robot's model cannot be compiled."""
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own greeting names an address that is not the page's
             self._server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         self._robot, self._figure = robot, Figure(robot)
+        self._handles = Handles(self._server, WORLD, dragged)
         self._at: Array = np.zeros(2)  # m: what the picture looks at
         self._marks: dict[str, Any] = {}
         self._drawn: dict[str, Array] = {}
@@ -107,7 +111,9 @@ class Scene3D:
                 self._put(self._truth_parts, snapshot.truth)
             if self._truth.visible != shown:
                 self._truth.visible = shown
-            self._show_beside(snapshot.beside)
+            other = None if snapshot.other is None else snapshot.other.pose
+            self._show_beside(snapshot.beside if other is None else other)
+            self._handles.show(snapshot.handles or {})
             self._show_marks(snapshot)
 
     def close(self) -> None:
@@ -177,6 +183,8 @@ class Scene3D:
             self._goal_at(snapshot.goal)
         if snapshot.plan is not None or not self._shows_plan.value:
             self._line("plan", snapshot.plan if self._shows_plan.value else None, PLAN_COLOUR, 0.009)
+        became = None if snapshot.became is None or not self._shows_plan.value else snapshot.became.places
+        self._line("became", became, BECAME_COLOUR, 0.009)
         if snapshot.path is not None:
             self._line("ahead", snapshot.path if self._shows_plan.value else None, PATH_COLOUR, 0.006)
         for number, (x, y, radius) in enumerate(() if snapshot.obstacles is None else snapshot.obstacles):

@@ -141,21 +141,21 @@ class Telemetry:
         self.events.append((self._numbered, json.dumps(told | {"text": event.text})))
         del self.events[:-KEPT_EVENTS]
 
+    def _other(self, snapshot: Snapshot) -> dict[str, Any]:
+        """What is plotted of another run."""
+        pose = snapshot.pose
+        return {
+            "phase": snapshot.phase,
+            "late": round(snapshot.late, 3),
+            "busy": round(snapshot.busy, 3),
+            "velocity": _numbers(snapshot.velocity),
+            "place": None if pose is None else _numbers(np.array([*pose.place, yaw_of(pose.orientation)])),
+            "values": _numbers(_values(snapshot)),
+        }
+
     def _frame(self, snapshot: Snapshot) -> dict[str, Any]:
         pose = snapshot.pose
         supply = snapshot.voltage[np.isfinite(snapshot.voltage)]
-        values = np.stack(
-            [
-                snapshot.position,
-                snapshot.target,
-                snapshot.effort,
-                snapshot.temperature,
-                snapshot.voltage,
-                snapshot.age * 1e3,
-                snapshot.gain,
-            ],
-            axis=1,
-        )
         faults = {
             self.robot.names[i]: ", ".join(describe(int(snapshot.fault[i]) & ~ROBOT))
             for i in np.flatnonzero(snapshot.fault & ~ROBOT).tolist()
@@ -185,10 +185,19 @@ class Telemetry:
             "obstacles": _numbers(snapshot.obstacles),
             "robots": _numbers(snapshot.robots),
             "plan": _numbers(snapshot.plan),
-            "values": _numbers(values),
+            "became": None if snapshot.became is None else _numbers(snapshot.became.places),
+            "off": None if snapshot.became is None else [round(snapshot.became.off, 4), snapshot.became.ticks],
+            "values": _numbers(_values(snapshot)),
+            "other": None if snapshot.other is None else self._other(snapshot.other),
             "levels": levels(self.robot, snapshot, self._full).tolist(),
             "faults": faults,
         }
+
+
+def _values(snapshot: Snapshot) -> Array:
+    """COLUMNS of each joint `(n_joints, columns)`."""
+    s = snapshot
+    return np.stack([s.position, s.target, s.effort, s.temperature, s.voltage, s.age * 1e3, s.gain], axis=1)
 
 
 def _number(value: float) -> float | None:

@@ -48,6 +48,15 @@ class BodyPose:
 
 
 @dataclass(frozen=True)
+class PlanOutcome:
+    """What came of a plan."""
+
+    places: Array  # (n, 2) m, where the robot was at the plan's ticks
+    off: float  # m between the last of them and where the plan had it,
+    ticks: float  # this many ticks after it was asked for
+
+
+@dataclass(frozen=True)
 class Snapshot:
     """One tick. Places are in the odometry frame, but for the truth, which is in the world's."""
 
@@ -78,6 +87,9 @@ class Snapshot:
     plan: Array | None = None  # (n, 2) m: where the robot means to go, where a plan was adopted at this tick
     truth: BodyPose | None = None
     beside: BodyPose | None = None  # another pose to be compared with: of a reference, or of another run
+    became: PlanOutcome | None = None  # of the newest plan, where what came after it is known
+    other: Snapshot | None = None  # the same moment of another run
+    handles: dict[str, Array] | None = None  # (3,) m: what can be dragged in the picture, by name
     events: tuple[Event, ...] = field(default=())
 
 

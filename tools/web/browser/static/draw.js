@@ -2,6 +2,8 @@
 
 export const COLOURS = ["#3367d6", "#e8710a", "#1e8e3e", "#a142f4", "#c5221f", "#00838f"];
 
+export const DOTS = [2, 3], DASHES = [7, 4];
+
 export class Plot {
   constructor(canvas) { this.canvas = canvas; }
 
@@ -27,9 +29,9 @@ export class Plot {
       pen.strokeStyle = "#eceef2";
       line(pen, [[34, y(v)], [width, y(v)]]);
     });
-    for (const { get, colour, dotted } of series) {
+    for (const { get, colour, dash } of series) {
       pen.strokeStyle = colour;
-      pen.setLineDash(dotted ? [2, 3] : []);
+      pen.setLineDash(dash ?? []);
       pen.beginPath();
       let down = false;
       for (const frame of frames) {
@@ -78,6 +80,8 @@ export function drawMap(canvas, frame, run) {
   way(run?.path, "#26804d");
   way(frame.path, "#26804d");
   way(frame.plan, "#f28c19");
+  way(frame.became, "#3359d9");
+  if (frame.other?.place) disc(frame.other.place, 0.06, "#e1821e");
   if (goal) { disc(goal, run?.reach ?? 0.05, "rgba(38,166,77,0.35)"); disc(goal, 0.02, "#26a64d"); }
   const [cx, cy] = at([px, py]);
   pen.save();

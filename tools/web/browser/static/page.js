@@ -1,7 +1,7 @@
 // The operator's page. It shows what the page's process sends, and sends what the person asks: a request each, with a
 // sequence number, this browser's time and, where there is one, the token.
 
-import { Plot, drawMap, COLOURS } from "./draw.js";
+import { Plot, drawMap, COLOURS, DASHES, DOTS } from "./draw.js";
 import { PanelView } from "./panel.js";
 
 const byId = (id) => document.getElementById(id);
@@ -296,6 +296,8 @@ function showTick() {
     `${frame.missed} missed`,
     frame.plans ? `${frame.plans} notes on plans` : null,
     frame.unread ? `${frame.unread} joint samples lost` : null,
+    frame.off ? `plan off by ${(100 * frame.off[0]).toFixed(1)} cm after ${(frame.off[1] / hello.rate).toFixed(2)} s` : null,
+    frame.other ? `the second: ${frame.other.phase}` : null,
     frame.contact ? hello.feet.map((name, i) => `${name} ${frame.contact[i] > 0.5 ? "●" : "○"}`).join(" ") : null,
   ];
   byId("asked").textContent = asked();
@@ -328,12 +330,15 @@ const plots = {
 };
 
 function showPlots() {
-  const order = [...chosen], column = Number(byId("quantity").value || 2);
-  const series = (get, colour, dotted = false) => ({ get, colour: COLOURS[colour % COLOURS.length], dotted });
-  plots.position.draw(frames, HISTORY, order.flatMap((i, n) => [series((f) => f.values[i][0], n), series((f) => f.values[i][1], n, true)]));
-  plots.quantity.draw(frames, HISTORY, order.map((i, n) => series((f) => f.values[i][column], n)));
-  plots.speed.draw(frames, HISTORY, [0, 1, 2].flatMap((i) => [series((f) => f.velocity?.[i] ?? null, i), series((f) => f.asked?.[i] ?? null, i, true)]));
-  plots.timing.draw(frames, HISTORY, [series((f) => f.late, 0), series((f) => f.busy, 1)]);
+  const order = [...chosen], column = Number(byId("quantity").value || 2), two = Boolean(frame?.other);
+  const series = (get, colour, dash = null) => ({ get, colour: COLOURS[colour % COLOURS.length], dash });
+  // Of two runs, the second one is dashed, in the place of targets and of what is asked.
+  const both = (get, colour) => [series(get, colour), ...(two ? [series((f) => (f.other ? get(f.other) : null), colour, DASHES)] : [])];
+  const with_ = (get, more, colour) => (two ? both(get, colour) : [series(get, colour), series(more, colour, DOTS)]);
+  plots.position.draw(frames, HISTORY, order.flatMap((i, n) => with_((f) => f.values[i][0], (f) => f.values[i][1], n)));
+  plots.quantity.draw(frames, HISTORY, order.flatMap((i, n) => both((f) => f.values[i][column], n)));
+  plots.speed.draw(frames, HISTORY, [0, 1, 2].flatMap((i) => with_((f) => f.velocity?.[i] ?? null, (f) => f.asked?.[i] ?? null, i)));
+  plots.timing.draw(frames, HISTORY, [...both((f) => f.late, 0), ...both((f) => f.busy, 1)]);
 }
 
 // Ten times a second is enough for a person, and leaves a slow machine time for what is asked.
@@ -363,7 +368,10 @@ function raise() {
 }
 view.onload = () => { try { listenForKeys(view.contentWindow); } catch { /* a page of an error, which hears no keys */ } };
 byId("raise").onclick = () => { wanted = true; raise(); };
-if (location.hash === "#flat") flatten("The page was opened without the picture in 3D.");
+// Without WebGL viser would show nothing but an error of its own.
+function draws() { return Boolean(document.createElement("canvas").getContext("webgl2")); }
+if (!draws()) flatten("This browser cannot draw in 3D: it has no WebGL. Numbers, map and stop work all the same.");
+else if (location.hash === "#flat") flatten("The page was opened without the picture in 3D.");
 else raise();
 stand();
 connect();
