@@ -32,7 +32,7 @@ from servoid.tools.common.worker_pool import each
 
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
-    from servoid.tools.learn.collect.parts import Part, Recording, Tally
+    from servoid.tools.learn.collect.parts import FleetRecipe, Part, RecordingTally
     from servoid.tools.learn.collect.performances import Performances
     from servoid.tools.learn.dataset.lerobot import DatasetWriter
     from servoid.tools.learn.dataset.schema import Feature
@@ -133,7 +133,7 @@ def _check(args: argparse.Namespace) -> None:
 def collect(args: argparse.Namespace) -> dict[str, Any]:
     """Record a dataset into `args.out`; returns what `--json` prints. Raises ConfigError."""
     from servoid.hw.robot.description import load_robot
-    from servoid.tools.learn.collect.parts import Recording, Tally
+    from servoid.tools.learn.collect.parts import FleetRecipe, RecordingTally
     from servoid.tools.learn.collect.provenance import SOURCES, earlier, provenance
     from servoid.tools.learn.collect.skills import SKILLS
     from servoid.tools.learn.dataset.lerobot import DatasetWriter
@@ -141,7 +141,7 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
 
     begin = time.perf_counter()
     robot = load_robot(args.robot)
-    how = Recording(
+    how = FleetRecipe(
         robot=args.robot,
         policy=args.policy,
         tracker=args.tracker,
@@ -153,7 +153,7 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
         plain_odometry=args.plain_odometry,
         threads=args.threads or (1 if args.workers > 1 or args.ray is not None else 0),
     )
-    performances, tally = how.performances(1), Tally()
+    performances, tally = how.performances(1), RecordingTally()
     texts = tuple(skill.text for skill in SKILLS) if performances is None else performances.texts
     schema = Schema(robot.name, robot.rate, _features(robot, performances), texts)
     with locked(args.out), DatasetWriter(args.out, schema, args.force, args.append) as writer:
@@ -175,14 +175,14 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
     return result | {"out": str(args.out), "seconds": round(time.perf_counter() - begin, 1)}
 
 
-def _record_one(args: argparse.Namespace, how: Recording, writer: DatasetWriter, tally: Tally) -> None:
+def _record_one(args: argparse.Namespace, how: FleetRecipe, writer: DatasetWriter, tally: RecordingTally) -> None:
     from tqdm import tqdm
 
     from servoid.tools.learn.collect.parts import Part, recorded
 
     with tqdm(total=args.frames, desc="walking", unit="frame", mininterval=1.0) as bar:
 
-        def progress(total: int, walked: Tally) -> None:
+        def progress(total: int, walked: RecordingTally) -> None:
             bar.update(min(total, args.frames) - bar.n)
             bar.set_postfix_str(f"{walked.fell} of {walked.begun} fell", refresh=False)
 
@@ -190,7 +190,7 @@ def _record_one(args: argparse.Namespace, how: Recording, writer: DatasetWriter,
             writer.add(episode.columns, episode.skill)
 
 
-def _record_parts(args: argparse.Namespace, how: Recording, writer: DatasetWriter, tally: Tally) -> None:
+def _record_parts(args: argparse.Namespace, how: FleetRecipe, writer: DatasetWriter, tally: RecordingTally) -> None:
     """On processes or machines, each part kept as it is done; then all of them, in order."""
     from tqdm import tqdm
 
@@ -217,7 +217,7 @@ def _record_parts(args: argparse.Namespace, how: Recording, writer: DatasetWrite
     kept.remove()
 
 
-def _parts(args: argparse.Namespace, how: Recording) -> list[Part]:
+def _parts(args: argparse.Namespace, how: FleetRecipe) -> list[Part]:
     from servoid.hw.seeds import episode_seed
     from servoid.tools.learn.collect.parts import Part
 

@@ -25,7 +25,7 @@ from servoid.tools.learn.collect.performances import Performances
 
 
 @dataclass(frozen=True)
-class Recording:
+class FleetRecipe:
     """How a fleet is recorded."""
 
     robot: str
@@ -87,11 +87,11 @@ class Part:
     number: int
     seed: int
     frames: int  # at least
-    how: Recording
+    how: FleetRecipe
 
 
 @dataclass
-class Tally:
+class RecordingTally:
     """Episodes that began and that fell, and ticks that were walked."""
 
     begun: int = 0
@@ -106,17 +106,17 @@ class Tally:
 class RecordedPart:
     number: int
     episodes: list[RecordedEpisode]
-    tally: Tally = field(default_factory=Tally)
+    tally: RecordingTally = field(default_factory=RecordingTally)
 
 
 def record(part: Part) -> RecordedPart:
     """Record a part in this process. Raises ConfigError."""
     cutter = part.how.cutter(part.seed)
     episodes = list(cutter.episodes(part.frames))
-    return RecordedPart(part.number, episodes, Tally(cutter.begun, cutter.fell, cutter.walked))
+    return RecordedPart(part.number, episodes, RecordingTally(cutter.begun, cutter.fell, cutter.walked))
 
 
-def what_records(how: Recording) -> dict[str, Any]:
+def what_records(how: FleetRecipe) -> dict[str, Any]:
     """By names, what must be the same wherever parts are recorded. Raises ConfigError."""
     from servoid.stack.log.provenance import fingerprint
     from servoid.tools.common.cluster.installed import installed
@@ -174,7 +174,7 @@ class KeptParts:
                 if slash:
                     episodes[int(at)][name] = kept[key]
         found = [RecordedEpisode({n: v for n, v in one.items() if n}, one[""]) for one in episodes]
-        return RecordedPart(number, found, Tally(begun, fell, walked))
+        return RecordedPart(number, found, RecordingTally(begun, fell, walked))
 
     def remove(self) -> None:
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -183,12 +183,14 @@ class KeptParts:
         return self.folder / f"part-{number:03d}.npz"
 
 
-def recorded(part: Part, tally: Tally, progress: Callable[[int, Tally], None]) -> Iterator[RecordedEpisode]:
+def recorded(
+    part: Part, tally: RecordingTally, progress: Callable[[int, RecordingTally], None]
+) -> Iterator[RecordedEpisode]:
     """Episodes of a part as they end, without keeping them; `progress` is told frames and what was walked so far."""
     cutter = part.how.cutter(part.seed)
 
     def told(frames: int) -> None:
-        progress(frames, Tally(cutter.begun, cutter.fell, cutter.walked))
+        progress(frames, RecordingTally(cutter.begun, cutter.fell, cutter.walked))
 
     yield from cutter.episodes(part.frames, told)
     tally.add(cutter.begun, cutter.fell, cutter.walked)

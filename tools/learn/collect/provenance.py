@@ -11,14 +11,14 @@ import yaml
 
 from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import Robot
-from servoid.tools.learn.collect.parts import Recording
+from servoid.tools.learn.collect.parts import FleetRecipe
 
 LICENCE = "Apache-2.0"
 MIRRORING = "applied when read (servoid.policy.diffusion.dataset): each window also serves with left and right swapped"
 SOURCES = "servoid.yaml"  # in meta/
 
 
-def earlier(args: argparse.Namespace, how: Recording) -> dict[str, Any]:
+def earlier(args: argparse.Namespace, how: FleetRecipe) -> dict[str, Any]:
     """What meta/servoid.yaml says of the dataset that is appended to. Raises ConfigError where it would be recorded
     once more."""
     path = args.out / "meta" / SOURCES
@@ -34,7 +34,7 @@ def earlier(args: argparse.Namespace, how: Recording) -> dict[str, Any]:
 def provenance(
     args: argparse.Namespace,
     robot: Robot,
-    how: Recording,
+    how: FleetRecipe,
     result: Mapping[str, Any],
     before: dict[str, Any],
 ) -> str:
