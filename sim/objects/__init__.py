@@ -11,7 +11,10 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.world import SceneObject
 
-COLOURS = {"ball": (0.95, 0.55, 0.10, 1.0), "bag": (0.35, 0.30, 0.65, 1.0), "seat": (0.55, 0.42, 0.32, 1.0)}
+COLOURS = {
+    "ball": (0.95, 0.55, 0.10, 1.0), "bag": (0.35, 0.30, 0.65, 1.0), "seat": (0.55, 0.42, 0.32, 1.0),
+    "bar": (0.80, 0.20, 0.20, 1.0), "target": (0.15, 0.65, 0.30, 0.8),
+}  # fmt: skip
 POSE, RATE = 7, 6  # numbers of a free body's pose and velocity
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _PLATE = 0.03  # m, of a seat
@@ -24,10 +27,10 @@ def shapes(thing: SceneObject) -> list[tuple[mujoco.mjtGeom, list[float], list[f
     A seat is a plate with a block under its rear half: as under any chair, there is room for the heels.
     """
     x, y, z = (part / 2 for part in thing.size)
-    if thing.kind == "ball":
+    if thing.round:
         return [(mujoco.mjtGeom.mjGEOM_SPHERE, [x, 0, 0], [0.0, 0.0, 0.0])]
     box = mujoco.mjtGeom.mjGEOM_BOX
-    if thing.kind == "bag":
+    if thing.kind != "seat":
         return [(box, [x, y, z], [0.0, 0.0, 0.0])]
     plate = min(_PLATE / 2, z)
     return [(box, [x, y, plate], [0.0, 0.0, z - plate]), (box, [x / 2, y, z], [-x / 2, 0.0, 0.0])]
@@ -48,14 +51,15 @@ def add_object(model: mujoco.MjSpec, name: str, thing: SceneObject) -> None:
         more |= {"condim": 6, "priority": 2, "friction": [0.8, 0.005, _ROLLING]}
     if thing.movable:
         body.add_freejoint(name=name)
+    meets = int(thing.kind != "target")
     for kind, size, place in shapes(thing):
         body.add_geom(
             type=kind,
             size=size,
             pos=place,
             rgba=COLOURS[thing.kind],
-            contype=1,
-            conaffinity=1,
+            contype=meets,
+            conaffinity=meets,
             solref=[0.008, 1.0],
             **more,
         )

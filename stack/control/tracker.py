@@ -100,6 +100,6 @@ class ExpertPolicy(BasePolicy):
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         self._gait.command(instruction.velocity)
-        target = self._tracker(state, applied, self._gait)
+        target = self._gait.led(self._tracker(state, applied, self._gait))
         self._gait.advance()
         return target

@@ -19,8 +19,12 @@ from waiting import until
 
 from servoid.hw.contracts.operator import Halt
 from servoid.hw.robot.description import load_robot
+from servoid.policy.motion.library import Library
 from servoid.stack.safety.event import Event
+from servoid.tools.motions.editor.editor import Editor
+from servoid.tools.motions.editor.page import KeyframePage
 from servoid.tools.web.launch import OpenPage, View, open_page
+from servoid.tools.web.line.panel import Panel, Question, Slider
 from servoid.tools.web.line.snapshot import BodyPose, RunInfo, Snapshot
 
 pytestmark = pytest.mark.slow
@@ -43,12 +47,17 @@ TICK = Snapshot(
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        gl = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        started = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *gl])
+def playwright() -> Iterator[Any]:
+    with sync_api.sync_playwright() as started:
         yield started
-        started.close()
+
+
+@pytest.fixture(scope="module")
+def browser(playwright: Any) -> Iterator[Any]:
+    gl = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    started = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *gl])
+    yield started
+    started.close()
 
 
 @pytest.fixture(scope="module")
@@ -216,3 +225,89 @@ def test_space_stops_a_run_and_a_killed_page_leaves_it_alone(opened: Callable[..
         os.kill(int(pages[0]), signal.SIGKILL)
         run.communicate()
     assert run.returncode in (0, 1)
+
+
+def slide(tab: Any, what: str, value: float, *, held: bool = False) -> None:
+    """Push a slider of the panel; one that is `held` is not let go."""
+    script = """([what, value, held]) => {
+      const slider = document.querySelector(`#panel [data-do="${what}"]`);
+      slider.value = value;
+      slider.dispatchEvent(new Event("input"));
+      if (!held) slider.dispatchEvent(new Event("change"));
+    }"""
+    tab.evaluate(script, [what, value, held])
+
+
+def test_skills_panels_and_a_soft_start(page: OpenPage, opened: Callable[..., Any]) -> None:
+    link = page.link
+    link.begin(replace(INFO, skills=("wave", "kick-left")))
+    tab = opened(page.url)
+    take_control(tab)
+    tab.fill("#gain", "0.8")
+    tab.uncheck("#record")
+    requests: list[Any] = []
+    again(lambda: tab.click("#start button"), lambda: requests.append(link.take("start")) or requests[-1])
+    assert (requests[-1].gain, requests[-1].on) == (0.8, False)
+    again(lambda: tab.click("#skills button:has-text('kick left')"), lambda: link.read().skill == "kick-left")
+    link.show(Panel("jog", (Slider("jog", "l_knee", -1.0, 1.0, 0.0, springs=True), Question(3, "Support the robot"))))
+    says(tab, "#panel", "Support the robot")
+    slide(tab, "jog", 0.5, held=True)
+    until(lambda: link.read().way.tolist() == [0.5, 0.0, 0.0])
+    tab.evaluate("document.querySelector('#panel [data-do=jog]').dispatchEvent(new Event('pointerup'))")
+    until(lambda: not link.read().way.any())
+    actions: list[str] = []
+    again(
+        lambda: tab.click("#panel [data-do=yes]"),
+        lambda: actions.extend(a.value for a in link.take_actions()) or actions,
+    )
+    assert actions[0] == "yes 3"
+    link.show(None)
+    tab.wait_for_function("document.querySelector('#panel').hidden")
+
+
+def test_a_wave_is_made_in_the_browser_and_is_a_clip(opened: Callable[..., Any], tmp_path: Path) -> None:
+    editor = Editor(ROBOT, tmp_path)
+    with open_page(View(port=0), "op3") as page:
+        program = threading.Thread(target=KeyframePage(page.link, editor, "op3").run)
+        program.start()
+        tab = opened(page.url)
+        take_control(tab)
+
+        def press(what: str, happened: Callable[[], object]) -> None:
+            again(lambda: tab.click(f"#panel [data-do={what}]"), happened)
+
+        elbow = ROBOT.names.index("r_el")
+        for number, angle in enumerate((0.6, -0.2, 0.6), 1):
+            press("add", lambda number=number: len(editor.frames) > number)
+            again(
+                lambda angle=angle: slide(tab, "joint r_el", angle),
+                lambda angle=angle: abs(editor.frame.pose.joints[elbow] - angle) < 0.02,
+            )
+        again(
+            lambda: slide(tab, "joint r_sho_pitch", 0.8),
+            lambda: abs(editor.frame.pose.joints[ROBOT.names.index("r_sho_pitch")] - 0.8) < 0.02,
+        )
+        tab.fill("#panel [data-do=name]", "browser-wave")
+        tab.keyboard.press("Tab")
+        until(lambda: editor.name == "browser-wave")
+        press("play", lambda: "in physics, open loop: it stands at the end" in editor.said)
+        until(lambda: editor.played is None)
+        tab.click("#panel [data-do=save]")
+        until(lambda: editor.saved)
+    program.join()
+    assert np.ptp(Library(ROBOT, tmp_path)["browser-wave"].joints[:, elbow]) > 0.6
+
+
+def test_a_browser_without_webgl_has_all_but_the_picture(page: OpenPage, playwright: Any) -> None:
+    flags = ["--no-sandbox", "--disable-3d-apis", "--disable-gpu"]
+    started = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
+    try:
+        tab = started.new_page(viewport={"width": 1400, "height": 1000}, bypass_csp=True)
+        tab.set_default_timeout(100_000)
+        tab.goto(page.url)
+        says(tab, "#flat-why", "it has no WebGL")
+        says(tab, "#phase", "running")
+        tab.click("#stop")
+        until(lambda: page.link.read().halt is Halt.ORDERLY)
+    finally:
+        started.close()

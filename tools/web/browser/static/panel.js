@@ -46,7 +46,14 @@ export class PanelView {
 
   paragraph() {
     const root = element("p", { className: "said" });
-    return { root, put: (item) => { root.textContent = item.text; } };
+    return {
+      root,
+      put: (item) => {
+        if (root.textContent === item.text) return;
+        root.textContent = item.text;
+        root.scrollTop = root.scrollHeight; // the newest line, which may ask for something
+      },
+    };
   }
 
   table(item) {
