@@ -11,7 +11,10 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.world import SceneObject
 
-COLOURS = {"ball": (0.95, 0.55, 0.10, 1.0), "bag": (0.35, 0.30, 0.65, 1.0), "seat": (0.55, 0.42, 0.32, 1.0)}
+COLOURS = {
+    "ball": (0.95, 0.55, 0.10, 1.0), "bag": (0.35, 0.30, 0.65, 1.0), "seat": (0.55, 0.42, 0.32, 1.0),
+    "bar": (0.80, 0.20, 0.20, 1.0), "target": (0.15, 0.65, 0.30, 0.8),
+}  # fmt: skip
 POSE, RATE = 7, 6  # numbers of a free body's pose and velocity
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _ROLLING = 0.0005  # m: a ball of 0.07 m slows down by 0.1 m/s2
@@ -20,7 +23,7 @@ _ROLLING = 0.0005  # m: a ball of 0.07 m slows down by 0.1 m/s2
 def shape(thing: SceneObject) -> tuple[mujoco.mjtGeom, list[float]]:
     """Kind and half sizes [m] of an object's geom."""
     x, y, z = (part / 2 for part in thing.size)
-    return (mujoco.mjtGeom.mjGEOM_SPHERE, [x, 0, 0]) if thing.kind == "ball" else (mujoco.mjtGeom.mjGEOM_BOX, [x, y, z])
+    return (mujoco.mjtGeom.mjGEOM_SPHERE, [x, 0, 0]) if thing.round else (mujoco.mjtGeom.mjGEOM_BOX, [x, y, z])
 
 
 def pose(thing: SceneObject) -> Array:
@@ -39,7 +42,16 @@ def add_object(model: mujoco.MjSpec, name: str, thing: SceneObject) -> None:
         more |= {"condim": 6, "priority": 2, "friction": [0.8, 0.005, _ROLLING]}
     if thing.movable:
         body.add_freejoint(name=name)
-    body.add_geom(type=kind, size=size, rgba=COLOURS[thing.kind], contype=1, conaffinity=1, solref=[0.008, 1.0], **more)
+    meets = int(thing.kind != "target")
+    body.add_geom(
+        type=kind,
+        size=size,
+        rgba=COLOURS[thing.kind],
+        contype=meets,
+        conaffinity=meets,
+        solref=[0.008, 1.0],
+        **more,
+    )
 
 
 class ObjectsOf:

@@ -10,7 +10,7 @@ from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
 
 _LONGEST = 36_000  # ticks that room is made for at once; a longer run takes as much again
-_COLUMNS = {"displacement": 3, "yaw": 1, "velocity": 3, "yaw_rate": 1, "command": 3}  # and the joints
+_COLUMNS = {"displacement": 3, "yaw": 1, "velocity": 3, "yaw_rate": 1, "command": 3, "gravity": 3}  # and joints
 
 
 class TraceBuffer:
@@ -43,6 +43,7 @@ class TraceBuffer:
                 state.velocity,
                 [about_vertical],
                 instruction.velocity,
+                state.gravity,
                 state.position,
             ]
         )
@@ -65,6 +66,7 @@ class TraceBuffer:
             command=part["command"],
             fallen=fallen,
             joints=joints,
+            gravity=part["gravity"],
             goal=self._stacked("goal"),
             obstacles=self._stacked("obstacles"),
             robots=self._stacked("robots"),

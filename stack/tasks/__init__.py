@@ -14,6 +14,8 @@ from servoid.hw.overrides import override
 from servoid.hw.plugins import Plugin, installed, load_plugin
 from servoid.hw.robot.description import Robot
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings, beyond, fitted
+from servoid.stack.tasks.body.crouch_under import CrouchUnder
+from servoid.stack.tasks.body.reach_hand import ReachHand
 from servoid.stack.tasks.cross import Cross
 from servoid.stack.tasks.forest import Forest
 from servoid.stack.tasks.goal import Goal
@@ -43,7 +45,7 @@ class TaskEntry:
 
 
 _CLASSES: tuple[type[BaseTask], ...] = (
-    Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Cross, Inbetween, Survive, Text, Steer,
+    Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Cross, ReachHand, CrouchUnder, Inbetween, Survive, Text, Steer,
     PerformSkills, Kick, LieAndStand,
 )  # fmt: skip
 _OWN: dict[str, TaskEntry] = {

@@ -114,6 +114,7 @@ class GroundTruth:
             command=command,
             fallen=self._fallen,
             joints=np.array(self._joints),
+            gravity=-np.array(self._up),
             goal=goal,
             obstacles=turned(np.array(self._obstacles) - origin, -heading) if self._obstacles else None,
             robots=turned(np.array(self._robots) - [*origin[:2], heading], -heading) if self._others() else None,
