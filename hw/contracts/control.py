@@ -97,7 +97,7 @@ class Instruction:
     goal: Array | None = None  # (..., 2) m in the heading frame, from the base
     text: str | None = None  # a sentence that says what to do; None: go by the velocity; empty: by neither
     texts: tuple[str, ...] | None = None  # one for each world, instead of `text`
-    since: Array | None = None  # (...,) s since the skill began that `text` tells; None: it tells none
+    since: Array | None = None  # (...,) s since the skill began that `text` tells, or a walk's clock; None: 0
     path: Array | None = None  # (n, 2) m in the heading frame: where to be at the next n ticks
     obstacles: Array | None = None  # (n, 5) in the heading frame: x, y, radius m, velocity m/s; to be kept clear of
     keyframes: Keyframes | None = None

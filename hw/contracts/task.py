@@ -50,7 +50,7 @@ class Episode:
     reach: float | None = None  # m from the goal that count as there, where that is judged
     path: Array | None = None  # (n, 2) m to walk along, in the frame that the robot starts in
     start: Start | None = None  # how a simulated body begins, one row; None: standing at home
-    told: tuple[str, ...] = ()  # skills that sentences ask for: the policy must know them
+    told: tuple[str, ...] = ()  # skills that are asked for, by name or in sentences
     low: bool = False  # the task has the robot sit, lie or touch the ground: only its tilt tells a fall then
 
 
