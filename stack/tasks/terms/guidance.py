@@ -16,11 +16,9 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction
 from servoid.policy.trajectory import Slope, SlopedCost, Trajectory, sloped
 from servoid.stack.tasks.terms.body import Build, bar_cost, reach_cost
-from servoid.stack.tasks.terms.motion import ground_cost, twist_cost
+from servoid.stack.tasks.terms.motion import ground_cost, standing_cost, twist_cost
 from servoid.stack.tasks.terms.places import goal_cost, obstacle_cost, path_cost, way_cost
 from servoid.stack.tasks.terms.weights import Weights
-
-_STAND = Weights()
 
 
 @dataclass(frozen=True)
@@ -72,5 +70,5 @@ class Stopping(SlopedCost):
 
     def slope(self, trajectory: Trajectory, instruction: Instruction) -> tuple[Array, Slope]:
         if instruction.stand:
-            return twist_cost(trajectory, np.zeros(3), _STAND)
+            return standing_cost(trajectory)
         return sloped(self.cost).slope(trajectory, instruction)

@@ -11,6 +11,7 @@ from servoid.policy.trajectory import Slope, Trajectory
 from servoid.stack.tasks.terms.weights import Weights
 
 _STANDING = 1e-3  # m/s and rad/s: an instructed twist below it means to stand
+_STAND, _STAND_TURN = 10.0, 0.1  # 1/(m/s)^2 and 1/(rad/s)^2, of a robot that shall stand
 _SLOW = 0.05  # m/s below which the direction of a motion says little
 
 
@@ -98,3 +99,18 @@ def ground_cost(trajectory: Trajectory, asked: Array, weights: Weights) -> tuple
         "yaw": by_yaw - by_x * y + by_y * x,
     }
     return cost, slope
+
+
+def standing_cost(trajectory: Trajectory) -> tuple[Array, Slope]:
+    """Squared velocity, after the first quarter of the horizon: by then the robot shall stand.
+
+    Who runs and shall stand at once leans back too late and falls on its face; and nobody has to come back to where
+    the robot was when it was asked.
+    """
+    shares = trajectory.shares * (trajectory.ticks > trajectory.ticks[-1] / 4)
+    shares = shares / shares.sum()
+    cost = _STAND * ((trajectory.velocity**2).sum(-1) @ shares) + _STAND_TURN * (trajectory.yaw_rate**2 @ shares)
+    return cost, {
+        "velocity": 2.0 * _STAND * shares[:, None] * trajectory.velocity,
+        "yaw_rate": 2.0 * _STAND_TURN * shares * trajectory.yaw_rate,
+    }

@@ -170,6 +170,22 @@ def test_a_robot_that_shall_stand_is_guided_to_stand_whatever_the_task_wants() -
     assert pickle.loads(pickle.dumps(cost))(walking, asked) == cost(walking, asked)
 
 
+def test_who_runs_may_slow_down_over_the_first_quarter_of_what_is_planned() -> None:
+    """A robot that shall stand at once falls on its face."""
+    ticks = np.array([1, 2, 4, 8, 16, 24, 32])
+    speeds = np.array([0.4, 0.4, 0.3, 0.1, 0.0, 0.0, 0.0])
+    braking = moves(np.zeros((7, 2)), ticks=ticks)
+    braking.velocity[..., 0] = speeds
+    asked = Instruction(np.zeros(3), stand=True)
+    cost = Stopping(TotalCost(NOTHING))
+    assert cost(braking, asked) == 0.0
+    running = moves(np.zeros((7, 2)), velocity=(0.4, 0.0), ticks=ticks)
+    value_, slope = cost.slope(running, asked)
+    assert value_.item() == pytest.approx(10.0 * 0.4**2)
+    assert (slope["velocity"][0, 4:, 0] > 0.0).all()
+    assert not slope["velocity"][0, :4].any()
+
+
 def test_a_waypoint_costs_the_square_of_its_distance() -> None:
     cost = goal_cost(moves(np.zeros((3, 2))), np.array([0.0, 2.0]), Weights(waypoint=0.5))
     assert value(cost) == pytest.approx(2.0, rel=1e-5)
