@@ -15,7 +15,8 @@ from servoid.hw.contracts.world import SceneObject
 from servoid.hw.setting import Range
 from servoid.stack.tasks.stories.act import PELVIS, Act
 
-CLEAR = 0.27  # m of a thing's middle from the ways that do not lead to it, and of things from each other
+# m of a thing's middle from the ways that do not lead to it, and from other things: half of it, and of the robot.
+CLEAR = {"bag": 0.19, "seat": 0.27}
 IN_FRONT = 0.06  # m of the base from a seat's front edge as it rises from it
 IN_FRONT_OF_BAG = 0.15  # m of the base from its middle as it strikes
 _BEGINNINGS, _TRIES = 300, 40
@@ -114,13 +115,17 @@ def _front(seat: SceneObject) -> Array:
 
 def _free(objects: Sequence[SceneObject], ways: Sequence[tuple[Array, Array, int]]) -> bool:
     """Whether no object is near another one, or near a way that leads elsewhere, which may begin at it."""
-    places = [np.array(thing.place) for thing in objects]
-    if any(np.linalg.norm(a - b) < CLEAR for i, a in enumerate(places) for b in places[:i]):
+    places, room = [np.array(thing.place) for thing in objects], [CLEAR[thing.kind] for thing in objects]
+    if any(
+        np.linalg.norm(a - b) < max(room[i], r)
+        for i, a in enumerate(places)
+        for b, r in zip(places[:i], room, strict=False)
+    ):
         return False
     for number, (begin, end, index) in enumerate(ways):
         at = ways[number - 1][2] if number else -1  # the object that it begins at
         for i, place in enumerate(places):
-            clear = min(CLEAR, float(np.linalg.norm(begin - place)) - 0.01) if i == at else CLEAR
+            clear = min(room[i], float(np.linalg.norm(begin - place)) - 0.01) if i == at else room[i]
             if i != index and _apart(place, begin, end) < clear:
                 return False
     return True
