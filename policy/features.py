@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -34,24 +34,28 @@ class Layout:
     def size(self) -> int:
         return sum(size for _, size in self.fields)
 
+    @cached_property
+    def slices(self) -> Mapping[str, slice]:
+        """Where each field lies in a row."""
+        ends = np.cumsum([size for _, size in self.fields]).tolist()
+        return {name: slice(end - size, end) for (name, size), end in zip(self.fields, ends, strict=True)}
+
     def slice(self, name: str) -> slice:
         """Where a field lies in a row. Raises KeyError."""
-        start = 0
-        for field, size in self.fields:
-            if field == name:
-                return slice(start, start + size)
-            start += size
-        raise KeyError(f"no field '{name}' in this layout: {', '.join(field for field, _ in self.fields)}")
+        if name not in self.slices:
+            raise KeyError(f"no field '{name}' in this layout: {', '.join(field for field, _ in self.fields)}")
+        return self.slices[name]
 
     def split(self, rows: AnyArray) -> dict[str, AnyArray]:
         """Fields of `(..., size)` rows by name."""
-        return {name: rows[..., self.slice(name)] for name, _ in self.fields}
+        return {name: rows[..., at] for name, at in self.slices.items()}
 
     def to_header(self) -> list[list[Any]]:
         """The layout as a checkpoint stores it."""
         return [[name, size] for name, size in self.fields]
 
 
+@cache
 def raw_layout(n_joints: int) -> Layout:
     """A tick as it is recorded: odometry frame, SI units (see `servoid.hw.contracts.control.State`)."""
     return Layout(
@@ -77,6 +81,7 @@ def recorded_names(robot: Robot) -> dict[str, tuple[str, ...]]:
     return {"observation.state": state, "action": joints, "action_applied": joints, "command": command}
 
 
+@cache
 def token_layout(n_joints: int) -> Layout:
     """A tick as the network sees it: canonical frame, SI units, before normalisation."""
     return Layout(
@@ -198,6 +203,10 @@ class Normaliser:
     def decode(self, x: AnyArray) -> AnyArray:
         return x * self.std + self.mean
 
+    def pull_back(self, gradient: AnyArray) -> AnyArray:
+        """The gradient by what is decoded, of a gradient by what it is decoded to."""
+        return gradient * self.std
+
 
 def joints_seen(states: Normaliser) -> int:
     """How many joints the tokens describe that `states` normalises."""
@@ -237,52 +246,5 @@ class Emphasis(Normaliser):
     def decode(self, x: AnyArray) -> AnyArray:
         return super().decode(x @ self.recover)
 
-
-@dataclass(frozen=True)
-class Trajectory:
-    """The predicted future in physical units, in the heading frame of now: what a guidance cost is given (torch)."""
-
-    displacement: AnyArray  # (batch, horizon, 2) m
-    yaw: AnyArray  # (batch, horizon) rad
-    velocity: AnyArray  # (batch, horizon, 2) m/s, heading frame of its own tick
-    yaw_rate: AnyArray  # (batch, horizon) rad/s
-    height: AnyArray  # (batch, horizon) m
-    joints: AnyArray  # (batch, horizon, n_joints) rad
-    ticks: Array  # (horizon,) int, ahead of now: at least 1, and rising
-    dt: float  # s, length of a tick
-
-    @property
-    def times(self) -> Array:
-        """Of the predicted states, `(horizon,)` s from now."""
-        return self.dt * self.ticks
-
-    @cached_property
-    def _even(self) -> bool:
-        return bool((np.diff(self.ticks, prepend=0) == self.ticks[0]).all())
-
-    def mean(self, values: AnyArray, axis: int = -1) -> AnyArray:
-        """Mean over time of `values` of the horizon along `axis`, or of its first part.
-
-        Each state stands for the time since the one before it.
-        """
-        if self._even:
-            return values.mean(axis)
-        spans = np.diff(self.ticks[: values.shape[axis]], prepend=0)
-        weights = values.new_tensor(spans / spans.sum())
-        return (values * weights.reshape(-1, *[1] * (-1 - axis))).sum(axis)
-
-    @classmethod
-    def of(cls, tokens: AnyArray, n_joints: int, dt: float, ticks: Array | None = None) -> Trajectory:
-        """From tokens `(batch, horizon, token size)` in physical units, at `ticks`; None: at 1, 2, ..."""
-        xp = _namespace(tokens)
-        token = token_layout(n_joints).split(tokens)
-        return cls(
-            displacement=token["displacement"],
-            yaw=xp.arctan2(token["heading"][..., 1], token["heading"][..., 0]),
-            velocity=token["velocity"][..., :2],
-            yaw_rate=token["angular_velocity"][..., 2],
-            height=token["height"][..., 0],
-            joints=token["position"],
-            ticks=np.arange(1, tokens.shape[-2] + 1) if ticks is None else ticks,
-            dt=dt,
-        )
+    def pull_back(self, gradient: AnyArray) -> AnyArray:
+        return super().pull_back(gradient) @ self.recover.T

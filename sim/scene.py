@@ -24,8 +24,10 @@ FOUND = 1  # data bit of MuJoCo's contact sensor
 
 
 def add_scene(model: mujoco.MjSpec, scene: Scene) -> None:
-    """Add static pillars, mocap spheres and a contact sensor for each of both, and objects. Like the floor, they meet
-    all that collides with the floor."""
+    """Add static pillars, mocap spheres and objects, and a contact sensor for pillars, spheres and bars.
+
+    Like the floor, they meet all that collides with the floor.
+    """
     bodies = []
     if len(scene.pillars):
         bodies.append(model.worldbody.add_body(name=f"{SCENE}pillars"))
@@ -35,16 +37,18 @@ def add_scene(model: mujoco.MjSpec, scene: Scene) -> None:
         body = model.worldbody.add_body(name=f"{SCENE}sphere{number}", mocap=True, pos=[x, y, radius])
         _add_geom(body, mujoco.mjtGeom.mjGEOM_SPHERE, [radius, 0, 0], SPHERE_COLOUR)
         bodies.append(body)
-    for body in bodies:
-        model.add_sensor(
-            name=body.name,
-            type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_BODY,
-            objname=body.name,
-            intprm=[FOUND, 0, 1],
-        )
     for number, thing in enumerate(scene.objects):
         add_object(model, f"{OBJECTS}{number}", thing)
+    felt = [body.name for body in bodies]
+    felt += [f"{OBJECTS}{number}" for number, thing in enumerate(scene.objects) if thing.kind == "bar"]
+    for name in felt:
+        model.add_sensor(
+            name=name,
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname=name,
+            intprm=[FOUND, 0, 1],
+        )
 
 
 def _add_geom(

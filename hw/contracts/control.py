@@ -97,7 +97,7 @@ class Instruction:
     goal: Array | None = None  # (..., 2) m in the heading frame, from the base
     text: str | None = None  # a sentence that says what to do; None: go by the velocity; empty: by neither
     texts: tuple[str, ...] | None = None  # one for each world, instead of `text`
-    since: Array | None = None  # (...,) s since the skill began that `text` tells; None: it tells none
+    since: Array | None = None  # (...,) s since the skill began that `text` tells, or a walk's clock; None: 0
     path: Array | None = None  # (n, 2) m in the heading frame: where to be at the next n ticks
     obstacles: Array | None = None  # (n, 5) in the heading frame: x, y, radius m, velocity m/s; to be kept clear of
     keyframes: Keyframes | None = None
@@ -108,6 +108,9 @@ class Instruction:
     # Where parts of the body shall be at the end of a plan, by name: m in the heading frame from below the base, a
     # point of the ground being (2,), others (3,); "heading": rad.
     targets: Mapping[str, Array] | None = None
+    # Bars to pass under (n, 5): x, y m of the middle in the heading frame, rad of its direction there, half its length
+    # and the height of its lower edge above the ground, m.
+    bars: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,38 +30,46 @@ class Percept:
 
 @dataclass(frozen=True, slots=True)
 class SceneObject:
-    """A thing with a body of its own: a ball that rolls and a bag that stands and falls, or a seat, which is fixed.
+    """A thing with a body of its own: a ball that rolls and a bag that stands and falls; or one that is fixed: a seat,
+    a bar that lies across the way at a height, or a target, a ball in the air that nothing bumps into.
 
     Raises ValueError for a size or mass that no thing has.
     """
 
-    kind: Literal["ball", "bag", "seat"]
+    kind: Literal["ball", "bag", "seat", "bar", "target"]
     place: tuple[float, float]  # m, its middle, in the frame that the robot starts in
-    size: tuple[float, float, float]  # m along its x, y and z; of a ball the first, its diameter
-    mass: float = 0.0  # kg; of a seat it is not asked for
+    size: tuple[float, float, float]  # m along its x, y and z; of a ball or target the first, its diameter
+    mass: float = 0.0  # kg; of what is fixed it is not asked for
     heading: float = 0.0  # rad
+    lift: float = 0.0  # m from the ground to its lowest point; of what is fixed alone
 
     def __post_init__(self) -> None:
         if min(self.size) <= 0.0:
             raise ValueError(f"size: must be positive, not {min(self.size):g}")
         if self.movable and self.mass <= 0.0:
             raise ValueError(f"mass: must be positive, not {self.mass:g}")
+        if self.lift < 0.0 or (self.movable and self.lift):
+            raise ValueError(f"lift: a {self.kind} cannot be {self.lift:g} m above the ground")
 
     @property
     def movable(self) -> bool:
-        return self.kind != "seat"
+        return self.kind in ("ball", "bag")
+
+    @property
+    def round(self) -> bool:
+        return self.kind in ("ball", "target")
 
     @property
     def height(self) -> float:
-        """Of the middle of one that stands on the ground [m]."""
-        return (self.size[0] if self.kind == "ball" else self.size[2]) / 2
+        """Of its middle, above the ground [m]."""
+        return self.lift + (self.size[0] if self.round else self.size[2]) / 2
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
     """What a task puts into a simulated world, on its floor, in the frame that the robot starts in: x ahead.
 
-    In a percept, obstacles are the pillars followed by the spheres. Objects may be touched.
+    In a percept, obstacles are the pillars followed by the spheres. Objects may be touched, but for bars.
     """
 
     pillars: Array  # (n, 3) m: x, y, radius; they stand where they are
@@ -128,6 +136,11 @@ class Truth(Protocol):
     @property
     def fallen(self) -> Array:
         """Whether each body has fallen `(n,)`."""
+        ...
+
+    @property
+    def grounded(self) -> Array:
+        """Whether each body touches the ground with anything but its feet `(n,)`."""
         ...
 
     @property

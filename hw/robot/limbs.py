@@ -22,6 +22,27 @@ class Limb:
     axes: Array  # (k, 3) unit vectors
     tip: Array  # (3,) the end
 
+    def end(self, joints: Array) -> tuple[Array, Array]:
+        """Place of the end `(..., 3)` m in the base frame at `joints` `(..., n_joints)` rad, and its change `(..., k,
+        3)` m/rad with each of the limb's joints.
+
+        Each hinge turns all that lies beyond it about its axis at rest, the outermost first (product of exponentials).
+        """
+        place = np.broadcast_to(self.tip, (*joints.shape[:-1], 3))
+        levers: list[Array] = []
+        for joint, anchor, axis in zip(self.joints[::-1], self.anchors[::-1], self.axes[::-1], strict=True):
+            angle = joints[..., joint, None]
+            cos, sin = np.cos(angle), np.sin(angle)
+
+            def turned(arm: Array, axis: Array = axis, cos: Array = cos, sin: Array = sin) -> Array:
+                along = axis * (arm @ axis)[..., None]
+                whole: Array = along + cos * (arm - along) + sin * cross(axis, arm)
+                return whole
+
+            arm = turned(place - anchor)
+            place, levers = anchor + arm, [cross(axis, arm), *(turned(lever) for lever in levers)]
+        return place, np.stack(levers, -2)
+
 
 @dataclass(frozen=True)
 class Limbs:
@@ -35,19 +56,8 @@ class Limbs:
         return 3 * len(self.limbs)
 
     def ends(self, joints: Array) -> Array:
-        """Places `(..., 3 limbs)` m of the ends in the base frame, at `joints` `(..., n_joints)` rad.
-
-        Each hinge turns all that lies beyond it about its axis at rest, the outermost first (product of exponentials).
-        """
-        places = []
-        for limb in self.limbs:
-            place = np.broadcast_to(limb.tip, (*joints.shape[:-1], 3))
-            for joint, anchor, axis in zip(limb.joints[::-1], limb.anchors[::-1], limb.axes[::-1], strict=True):
-                arm, angle = place - anchor, joints[..., joint, None]
-                along = axis * (arm @ axis)[..., None]
-                place = anchor + along + np.cos(angle) * (arm - along) + np.sin(angle) * cross(axis, arm)
-            places.append(place)
-        return np.concatenate(places, -1)
+        """Places `(..., 3 limbs)` m of the ends in the base frame, at `joints` `(..., n_joints)` rad."""
+        return np.concatenate([limb.end(joints)[0] for limb in self.limbs], -1)
 
     def mirror(self, joints: Mirror) -> Mirror:
         """Of the ends, where `joints` is that of the joints: a limb becomes that whose outermost joint mirrors its own.

@@ -6,28 +6,38 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
 
 # (states, actions, state levels, action levels) -> clean states, clean actions
 Predictor = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 ANALYTIC = "analytic"
 NETWORK = "network"
+_LARGEST = 1e38
+
+
+# Clean states `(batch, state tokens, features)`, normalised -> cost `(batch,)` and its gradient, shaped like the states
+CostSlope = Callable[[Array], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
 class DenoisingStep:
-    """One call's step of all tokens; factors are `(tokens, 1)`, the square roots of what they are of."""
+    """One call's step of all tokens, which takes noisy ones to `of_clean` clean + `of_noisy` noisy + `fresh` noise.
 
-    moving: Tensor  # (tokens,) bool: the others are left alone
-    signal_before: Tensor
-    noise_before: Tensor
-    signal_after: Tensor
-    noise_after: Tensor  # of the noise that is kept
-    noise_fresh: Tensor  # of that which is drawn anew
+    Factors are `(tokens, 1)` float32. Tokens that do not move are left alone by them.
+    """
+
+    moving: Array  # (tokens,) bool
+    of_clean: Array
+    of_noisy: Array
+    fresh: Array
+    signal: Array  # square roots of what a token holds of signal and of noise before the step
+    noise: Array
 
 
 class Diverged(ValueError):
@@ -38,7 +48,7 @@ class Diverged(ValueError):
 class Guidance:
     """Loss guidance: predicted clean states move by `-weight * gradient`, never further than `clip`.
 
-    `cost` maps normalised states `(batch, state tokens, features)` to `(batch,)`. `gradient` is "analytic": taken on
+    `slope` gives the cost of normalised states, and its gradient on them. `gradient` is "analytic": taken on
     the predicted states themselves, which is cheap; or "network": taken on the noisy states, back through the network
     (UniPhys, eq. 3). `clip` is the norm of a step over one window. Both are in the network's inputs: deviations, or
     their projection where it has emphasis. With `samples` > 1 so many neighbours in the batch are samples of one
@@ -53,7 +63,7 @@ class Guidance:
     of the weight and the gradient where the step before it led.
     """
 
-    cost: Callable[[Tensor], Tensor]
+    slope: CostSlope
     weight: float
     clip: float
     gradient: str = ANALYTIC
@@ -69,53 +79,52 @@ class Guidance:
 
     def predict(
         self, network: Predictor, states: Tensor, actions: Tensor, levels: tuple[Tensor, Tensor], step: DenoisingStep
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Array, Array]:
         """What a `network` predicts of a noisy window, the states that `step` moves being guided. Raises Diverged."""
         through = self.gradient == NETWORK
         with torch.set_grad_enabled(through):
             source = states.detach().requires_grad_(through)
             predicted, clean_actions = network(source, actions, *levels)
-        moved = torch.zeros_like(predicted)
+        clean = predicted.detach().numpy()
         for again in reversed(range(self.repeats)):
-            with torch.enable_grad():
-                clean = (predicted.detach() - moved).requires_grad_()
-                cost = self.cost(clean)
-                (slope,) = torch.autograd.grad(cost.sum(), clean)
+            cost, slope = self.slope(clean)
             gradient = slope
             if through:
-                (gradient,) = torch.autograd.grad(predicted, source, slope, retain_graph=again > 0)
+                pulled = torch.from_numpy(slope)
+                gradient = torch.autograd.grad(predicted, source, pulled, retain_graph=again > 0)[0].numpy()
             if self.scaled:
-                variance = step.noise_before**2
-                gradient = gradient * (variance / step.signal_before if through else variance)
-            moved = moved + self._limited(self.step(gradient, step.moving), slope, cost.detach())
-        return predicted.detach() - moved, clean_actions.detach()
+                gradient = gradient * (step.noise**2 / step.signal if through else step.noise**2)
+            clean = clean - self._limited(self.step(gradient, step.moving), slope, cost)
+        return clean, clean_actions.detach().numpy()
 
-    def _limited(self, step: Tensor, slope: Tensor, cost: Tensor) -> Tensor:
+    def _limited(self, step: Array, slope: Array, cost: Array) -> Array:
         """A step cut to where a `cost` `(batch,)` with this `slope` would be zero."""
         if not self.limited:
             return step
-        drop = (slope * step).flatten(1).sum(1)
-        return step * torch.where(drop > cost, cost / drop.clamp_min(1e-12), 1.0)[:, None, None]
+        drop = (slope * step).sum((1, 2))
+        share = np.where(drop > cost, cost / np.maximum(drop, 1e-12), 1.0)
+        return step * share.astype(step.dtype)[:, None, None]
 
-    def step(self, gradient: Tensor, moving: Tensor) -> Tensor:
+    def step(self, gradient: Array, moving: Array) -> Array:
         """How far states go, `(batch, state tokens, features)`: those `moving` `(state tokens,)`. Raises Diverged."""
         if self.even:
-            size = gradient.norm(dim=2, keepdim=True)
-            mean = size[:, moving].mean(1, keepdim=True)
-            gradient = gradient * (mean / size.clamp_min(1e-12))
+            size = np.linalg.norm(gradient, axis=2, keepdims=True)
+            gradient = gradient * (size[:, moving].mean(1, keepdims=True) / np.maximum(size, 1e-12))
         if self.samples > 1:
             mean = gradient.reshape(-1, self.samples, *gradient.shape[1:]).mean(1)
-            gradient = mean.repeat_interleave(self.samples, 0)
-        weight = self.weight / self.repeats
-        step = weight * gradient * moving[:, None]  # what does not move uses nothing of the step up
-        norm = step.flatten(1).norm(dim=1).clamp_min(1e-12)
-        if not torch.isfinite(norm).all():
-            if not torch.isfinite(gradient).all():
+            gradient = np.repeat(mean, self.samples, 0)
+        # What does not move uses nothing of the step up; weights are beyond all bounds before float32 is.
+        step = gradient * (moving[:, None] * np.float32(min(self.weight / self.repeats, _LARGEST)))
+        flat = step.reshape(len(step), -1)
+        norm = np.sqrt(np.einsum("bi,bi->b", flat, flat))  # infinite where a square is
+        if not np.isfinite(norm).all():
+            if not np.isfinite(gradient).all():
                 raise Diverged("the guidance cost has no finite gradient on this trajectory; check the task's cost")
             raise Diverged(
                 f"guidance with a weight of {self.weight:g} moves this trajectory out of all bounds; lower it"
             )
-        limited: Tensor = step * (self.clip / self.repeats / norm).clamp_max(1.0)[:, None, None]
+        share = np.minimum(self.clip / self.repeats / np.maximum(norm, 1e-12), 1.0)
+        limited: Array = step * share.astype(step.dtype)[:, None, None]
         return limited
 
 

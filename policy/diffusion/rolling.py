@@ -73,23 +73,23 @@ def frame_noise(config: DenoiserConfig, seeds: Sequence[Sequence[int]]) -> tuple
     Each of `seeds` is a seed, the tick of now, and further numbers. A frame is an action and the state after it; it
     keeps its noise when the tick goes on.
     """
-
-    def noise(frame: int, seed: int, tick: int, *more: int) -> tuple[Tensor, Tensor]:
-        numbers = seed, tick + frame + config.history, *more, _FRAME
-        return _noise_of_frame(config.state_size, config.action_size, *numbers)
-
-    states, actions = [], []
-    for numbers in seeds:
-        states += [noise(int(tick) - 1, *numbers)[0] for tick in config.state_ticks]
-        actions += [noise(int(tick), *numbers)[1] for tick in config.action_ticks]
-    shape = (len(seeds), -1)
-    return torch.stack(states).view(*shape, config.state_size), torch.stack(actions).view(*shape, config.action_size)
+    frames = (config.state_ticks - 1).tolist(), config.action_ticks.tolist()
+    sizes, shape = (config.state_size, config.action_size), (len(seeds), -1)
+    parts = []
+    for kind in (0, 1):
+        drawn = [
+            _noise_of_frame(*sizes, int(seed), int(tick) + config.history + frame, *more)[kind]
+            for seed, tick, *more in seeds
+            for frame in frames[kind]
+        ]
+        parts.append(torch.from_numpy(np.concatenate(drawn).reshape(*shape, sizes[kind])))
+    return parts[0], parts[1]
 
 
 @lru_cache(maxsize=4096)  # the next plan asks for all of them but one again, and drawing takes longer than a call
-def _noise_of_frame(state_size: int, action_size: int, *numbers: int) -> tuple[Tensor, Tensor]:
-    generator = seeded(*numbers)
-    return torch.randn(state_size, generator=generator), torch.randn(action_size, generator=generator)
+def _noise_of_frame(state_size: int, action_size: int, *numbers: int) -> tuple[Array, Array]:
+    generator = seeded(*numbers, _FRAME)
+    return torch.randn(state_size, generator=generator).numpy(), torch.randn(action_size, generator=generator).numpy()
 
 
 def renoise(
@@ -98,8 +98,8 @@ def renoise(
     """States and actions at the levels of the first row of `matrix`."""
     parts = []
     for x, drawn, levels in zip(clean, noise, (matrix.states[0], matrix.actions[0]), strict=True):
-        a = torch.as_tensor(signal[levels], dtype=torch.float32)[:, None]
-        parts.append(a.sqrt() * x + (1 - a).sqrt() * drawn)
+        a = signal[levels].astype(np.float32)[:, None]
+        parts.append(torch.from_numpy(np.sqrt(a) * x.numpy() + np.sqrt(1 - a) * drawn.numpy()))
     return parts[0], parts[1]
 
 

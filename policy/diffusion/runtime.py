@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,18 +22,19 @@ from servoid.hw.contracts.control import Instruction, Plan, PlanRequest
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import resolve
 from servoid.policy.diffusion.engines import Engine, load_engine
-from servoid.policy.diffusion.guidance import Diverged, Guidance, classifier_free
+from servoid.policy.diffusion.guidance import NETWORK, Diverged, Guidance, classifier_free
 from servoid.policy.diffusion.keyframes import imputation, keyframe_tokens
 from servoid.policy.diffusion.model.checkpoint import Model, load
 from servoid.policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise, seeded
 from servoid.policy.diffusion.sampler import Known, Sampler
 from servoid.policy.diffusion.schedule import DenoisingMatrix, cosine_signal
 from servoid.policy.diffusion.settings import DiffusionSettings
-from servoid.policy.features import Trajectory, joints_seen, raw_layout, to_raw, to_tokens
+from servoid.policy.features import joints_seen, raw_layout, to_raw, to_tokens
 from servoid.policy.text.captions import MOTIONS, caption, motion_of
 from servoid.policy.text.encoder import load_encoder
 from servoid.policy.text.nearest_phrase import Phrasebook
 from servoid.policy.text.told import clock_code
+from servoid.policy.trajectory import Trajectory, by_tokens, sloped
 
 # (trajectory, instruction) -> cost (batch,), as tasks define it
 Cost = Callable[[Trajectory, Instruction], Any]
@@ -59,8 +61,9 @@ class Runtime:
         config = model.config
         settings.check(config, model.header.get("training"))
         self.model, self.settings = model, settings
+        self._joints = joints_seen(model.states)
         self._dt, self._top = robot.dt, robot.walking.scale
-        self.cost = cost if settings.guidance.weight > 0 else None
+        self.cost = sloped(cost) if cost is not None and settings.guidance.weight > 0 else None
         self.engine = engine or load_engine(settings.engine, model.denoiser)
         self.samples = settings.guidance.samples if self.cost else 1
         self.horizon = settings.horizon or config.horizon  # ticks that are planned
@@ -72,10 +75,13 @@ class Runtime:
         self._encoder = load_encoder(config.text) if config.text and settings.text_weight else None
         self._phrasebook = Phrasebook(self._encoder) if self._encoder and settings.text_nearest else None
         self._read: dict[str, Tensor] = {}  # instructions that were encoded
+        self._caption = lru_cache(16)(lambda *twist: caption(np.array(twist), self._top))
+        used = settings.used(config)
+        self._used = used[0][:, None], used[1][:, None]  # state and action tokens
+        self._state_mask = torch.from_numpy((config.state_ticks <= 0) & used[0])
+        self._action_ticks = torch.arange(len(config.action_ticks))
         # Phrasings of skills are told as they are; who tells them has chosen one that the model knows.
         self._skills = {text for texts in model.header.get("skills", {}).values() for text in texts}
-        self._used = tuple(torch.from_numpy(mask) for mask in settings.used(config))
-        self._state_mask = torch.from_numpy(config.state_ticks <= 0) & self._used[0]
 
     def plan(self, request: PlanRequest) -> Plan:
         """The plan of one robot's request, or of many at once. Raises ValueError when it does not fit, and Diverged."""
@@ -129,9 +135,8 @@ class Runtime:
         """
         self._check(states, actions)
         n, history = self.samples, self.model.config.history
-        quiet = torch.inference_mode() if self.cost is None else nullcontext()
-        with one_thread(), torch.no_grad(), quiet:
-            raw = torch.from_numpy(np.ascontiguousarray(states, dtype=np.float32))
+        through = self.cost is not None and self.settings.guidance.gradient == NETWORK
+        with one_thread(), torch.no_grad() if through else torch.inference_mode():
             # Sample i of a robot's n draws noise of its own; the first one's does not depend on n.
             keys = [(*pair, *((i,) if i else ())) for pair in seeds for i in range(n)]
             known = self._known(states, actions, instruction)
@@ -139,22 +144,23 @@ class Runtime:
             text = self._text(instruction, len(states))
             predict = classifier_free(
                 self.engine,
-                None if text is None else text.repeat_interleave(n, 0),
+                text if text is None or n == 1 else text.repeat_interleave(n, 0),
                 self.settings.text_weight,
             )
             sampler = Sampler(predict, self._signal, self.settings.eta, self.settings.stabilization_level)
             guidance = self._guidance(_repeat(instruction, n))
-            clean = sampler.sample(matrix, known, [seeded(*key) for key in keys], guidance, start)
-            clean_states, clean_actions = (x[:, used] for x, used in zip(clean, self._used, strict=True))
-            reach = max(float(x.abs().max().nan_to_num(torch.inf)) for x in (clean_states, clean_actions))
-            if not reach < BOUND:
-                raise Diverged(f"the plan leaves all bounds ({reach:.3g} deviations); lower the weight of guidance")
+            drawn = start is None or self.settings.eta > 0
+            clean = sampler.sample(matrix, known, [seeded(*key) for key in keys if drawn], guidance, start)
+            reach = [np.abs(x.numpy()).max(initial=0.0, where=used) for x, used in zip(clean, self._used, strict=True)]
+            if not all(each < BOUND for each in reach):  # nor what is not a number
+                raise Diverged(
+                    f"the plan leaves all bounds ({max(reach):.3g} deviations); lower the weight of guidance"
+                )
             chosen = self._choose(clean[0], guidance)
             future, now = slice(history, history + len(self.ticks)), slice(history - 1, history - 1 + self.actions)
-            tokens = self.model.states.decode(clean[0][chosen, future])
-            predicted = to_raw(tokens, raw[:, -1], self._joints)
-            planned = self.model.actions.decode(clean[1][chosen, now])
-        return planned.numpy().astype(float), predicted.numpy()
+            tokens = self.model.states.decode(clean[0][chosen, future]).numpy()
+            planned = self.model.actions.decode(clean[1][chosen, now]).numpy()
+        return planned.astype(float), to_raw(tokens, states[:, -1].astype(np.float32), self._joints)
 
     def warm_up(self) -> None:
         """Plan once for nothing: the first call of a process takes many times longer than those that follow."""
@@ -163,10 +169,6 @@ class Runtime:
         actions = np.zeros((1, config.history - 1 + self.settings.delay, config.action_size))
         with suppress(Diverged):  # a robot that is nowhere may well be out of bounds; a real plan will say so
             self.plan_batch(states, actions, Instruction(np.zeros(3), goal=np.zeros(2)), [(0, 0)])
-
-    @property
-    def _joints(self) -> int:
-        return joints_seen(self.model.states)
 
     def _check(self, states: Array, actions: Array) -> None:
         config, rows = self.model.config, raw_layout(self._joints).size
@@ -206,8 +208,8 @@ class Runtime:
         ran = torch.from_numpy(np.ascontiguousarray(actions, dtype=np.float32))
         done = torch.zeros(batch, len(config.action_ticks), config.action_size)
         done[:, : ran.shape[1]] = self.model.actions.encode(ran)
-        action_mask = (torch.arange(len(config.action_ticks)) < ran.shape[1]) & self._used[1]
-        filled, done = (x.repeat_interleave(self.samples, 0) for x in (filled, done))
+        action_mask = (self._action_ticks < ran.shape[1]) & torch.from_numpy(self._used[1][:, 0])
+        filled, done = self._sampled(filled), self._sampled(done)
         return Known(filled, done, state_mask, action_mask, impute)
 
     def _start(
@@ -224,16 +226,19 @@ class Runtime:
             self._warm[previous.age] = self.settings.matrix(model.config, previous.age)
         matrix = self._warm[previous.age]
         clean = clean_start(model.config, model.states, model.actions, previous, present)
-        states, actions = (x.repeat_interleave(self.samples, 0) for x in clean)
-        return matrix, renoise((states, actions), noise, matrix, self._signal)
+        return matrix, renoise((self._sampled(clean[0]), self._sampled(clean[1])), noise, matrix, self._signal)
 
-    def _choose(self, states: Tensor, guidance: Guidance | None) -> Tensor:
+    def _sampled(self, windows: Tensor) -> Tensor:
+        """Each window once for each of its samples."""
+        return windows if self.samples == 1 else windows.repeat_interleave(self.samples, 0)
+
+    def _choose(self, states: Tensor, guidance: Guidance | None) -> slice | Array:
         """The sample of each robot that is run, as rows `(batch,)` of the samples' clean windows `states`."""
-        first = torch.arange(0, len(states), self.samples)
         if guidance is None or self.samples == 1 or self.settings.guidance.choose == "mean":
-            return first
-        cheapest: Tensor = guidance.cost(states).view(-1, self.samples).argmin(1)
-        return first + cheapest
+            return slice(None, None, self.samples)
+        costs, _ = guidance.slope(states.numpy())
+        cheapest: Array = np.arange(0, len(states), self.samples) + costs.reshape(-1, self.samples).argmin(1)
+        return cheapest
 
     def _text(self, instruction: Instruction, batch: int) -> Tensor | None:
         """The encoded sentence `(batch, text size)`; where the task gives none, one that names the asked motion.
@@ -249,7 +254,7 @@ class Runtime:
         elif instruction.text is not None:
             sentences = [instruction.text] * batch
         elif velocity.ndim == 1:
-            sentences = [caption(velocity, self._top)] * batch
+            sentences = [self._caption(*velocity.tolist())] * batch
         else:
             sentences = [MOTIONS[i].phrasings[0] for i in motion_of(velocity, self._top)]
         for sentence in set(sentences) - self._read.keys():
@@ -266,16 +271,21 @@ class Runtime:
         if (cost := self.cost) is None:
             return None
         history, normaliser = self.model.config.history, self.model.states
+        future = slice(history, history + len(self.ticks))
 
-        def of_states(states: Tensor) -> Tensor:
-            tokens = normaliser.decode(states[:, history : history + len(self.ticks)])
-            value: Tensor = cost(Trajectory.of(tokens, self._joints, self._dt, self.ticks), instruction)
-            return value
+        def slope(states: Array) -> tuple[Array, Array]:
+            tokens = normaliser.decode(torch.from_numpy(states[:, future])).numpy()
+            trajectory = Trajectory.of(tokens, self._joints, self._dt, self.ticks)
+            value, on_trajectory = cost.slope(trajectory, instruction)
+            gradient = np.zeros_like(states)
+            on_tokens = torch.from_numpy(by_tokens(on_trajectory, tokens, self._joints))
+            gradient[:, future] = normaliser.pull_back(on_tokens).numpy()
+            return value, gradient
 
         chosen = self.settings.guidance
         shared = self.samples if chosen.choose == "mean" else 1
         return Guidance(
-            of_states,
+            slope,
             chosen.weight,
             chosen.clip,
             chosen.gradient,

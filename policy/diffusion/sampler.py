@@ -40,6 +40,16 @@ def draw_noise(generators: Sequence[torch.Generator], tokens: int, features: int
     return torch.stack([torch.randn(tokens, features, generator=g) for g in generators])
 
 
+@dataclass(frozen=True)
+class _Call:
+    """A network call: the levels that tokens are shown with, and the steps of states and actions after it."""
+
+    levels: tuple[Tensor, Tensor]
+    states: DenoisingStep
+    actions: DenoisingStep
+    guided: bool  # once all states are finished, guidance has nothing to move
+
+
 class Sampler:
     """Walks a denoising matrix with a predictor of clean windows."""
 
@@ -50,9 +60,8 @@ class Sampler:
         were at level `stabilization_level`, with their values untouched (UniPhys, algorithm 1, line 5).
         """
         self._predict = predict
-        self._levels = signal.astype(np.float32).tobytes()
+        self._walk = _Walk(np.asarray(signal, dtype=float).tobytes(), eta, stabilization_level)
         self._eta = eta
-        self._stabilization_level = stabilization_level
 
     def sample(
         self,
@@ -67,50 +76,77 @@ class Sampler:
         Sampling begins with pure noise, or with the noisy states and actions `start` at the levels of the matrix's
         first row. Raises Diverged.
         """
-        matrix = matrix.hold(known.state_mask.numpy(), known.action_mask.numpy())
-        rows = matrix.states, matrix.actions
-        state_rows, action_rows = (torch.as_tensor(x) for x in rows)
         if start is None:
             start = draw_noise(generators, *known.states.shape[1:]), draw_noise(generators, *known.actions.shape[1:])
-        states = torch.where(known.state_mask[:, None], known.states, start[0])
-        actions = torch.where(known.action_mask[:, None], known.actions, start[1])
-        state_steps, action_steps = (_steps(x.tobytes(), x.shape, self._levels, self._eta) for x in rows)
-        shown = [rows.masked_fill(rows == 0, self._stabilization_level) for rows in (state_rows, action_rows)]
-        for call, (of_states, of_actions) in enumerate(zip(state_steps, action_steps, strict=True)):
-            # Once all states are finished, guidance has nothing to move.
-            steering = guidance if of_states.moving.any() else None
-            levels = shown[0][call], shown[1][call]
-            if steering is None:
-                clean_states, clean_actions = self._predict(states, actions, *levels)
+        masks = known.state_mask.numpy(), known.action_mask.numpy()
+        states, actions = (
+            np.where(mask[:, None], given.numpy(), noisy.numpy())
+            for mask, given, noisy in zip(masks, (known.states, known.actions), start, strict=True)
+        )
+        for call in _calls(self._walk, *(x.tobytes() for x in (matrix.states, matrix.actions, *masks)), matrix.calls):
+            window = torch.from_numpy(states), torch.from_numpy(actions)
+            if guidance is None or not call.guided:
+                clean_states, clean_actions = (x.numpy() for x in self._predict(*window, *call.levels))
             else:
-                clean_states, clean_actions = steering.predict(self._predict, states, actions, levels, of_states)
+                clean_states, clean_actions = guidance.predict(self._predict, *window, call.levels, call.states)
             if known.impute is not None:
-                clean_states = known.impute(clean_states)
-            states = self._step(states, clean_states, of_states, generators)
-            actions = self._step(actions, clean_actions, of_actions, generators)
-        return states, actions
+                clean_states = known.impute(torch.from_numpy(clean_states)).numpy()
+            states = self._step(states, clean_states, call.states, generators)
+            actions = self._step(actions, clean_actions, call.actions, generators)
+        return torch.from_numpy(states), torch.from_numpy(actions)
 
-    def _step(self, noisy: Tensor, clean: Tensor, step: DenoisingStep, generators: Sequence[torch.Generator]) -> Tensor:
+    def _step(self, noisy: Array, clean: Array, step: DenoisingStep, generators: Sequence[torch.Generator]) -> Array:
         """Tokens after a call that predicted them `clean`."""
-        noise = (noisy - step.signal_before * clean) / step.noise_before
-        stepped = step.signal_after * clean + step.noise_after * noise
+        stepped: Array = step.of_clean * clean
+        stepped += step.of_noisy * noisy
         if self._eta:
-            stepped = stepped + step.noise_fresh * draw_noise(generators, *noisy.shape[1:])
-        return torch.where(step.moving[:, None], stepped, noisy)
+            stepped += step.fresh * draw_noise(generators, *noisy.shape[1:]).numpy()
+        return stepped
+
+
+@dataclass(frozen=True)
+class _Walk:
+    """What steps depend on besides the matrix."""
+
+    signal: bytes  # float64, by level
+    eta: float
+    stabilization_level: int
 
 
 @lru_cache(maxsize=64)  # plan after plan walks the same matrix
-def _steps(rows: bytes, shape: tuple[int, ...], signal: bytes, eta: float) -> list[DenoisingStep]:
-    """Steps between rows of a denoising matrix of `shape` `(calls + 1, tokens)` int64; `signal` float32, by level."""
-    levels = torch.from_numpy(np.frombuffer(rows, dtype=np.int64).reshape(shape).copy())
-    kept = torch.from_numpy(np.frombuffer(signal, dtype=np.float32).copy())
-    a, b = kept[levels[:-1]][..., None], kept[levels[1:]][..., None]
-    fresh = eta**2 * (1 - b) / (1 - a).clamp_min(1e-6) * (1 - a / b)  # variance of the noise drawn anew
+def _calls(
+    walk: _Walk, states: bytes, actions: bytes, state_mask: bytes, action_mask: bytes, count: int
+) -> list[_Call]:
+    """The `count` calls of a matrix whose known tokens stay clean. Its rows are int64, masks bool."""
+    parts = []
+    for rows, mask in ((states, state_mask), (actions, action_mask)):
+        levels = np.frombuffer(rows, dtype=np.int64).reshape(count + 1, -1)
+        parts.append(np.where(np.frombuffer(mask, dtype=bool), 0, levels))
+    shown = [torch.from_numpy(np.where(levels == 0, walk.stabilization_level, levels)) for levels in parts]
+    steps = [_steps(levels, np.frombuffer(walk.signal), walk.eta) for levels in parts]
+    return [
+        _Call((state_levels, action_levels), of_states, of_actions, bool(of_states.moving.any()))
+        for state_levels, action_levels, of_states, of_actions in zip(shown[0], shown[1], *steps, strict=False)
+    ]
+
+
+def _steps(levels: Array, signal: Array, eta: float) -> list[DenoisingStep]:
+    """Steps between rows of `levels` `(calls + 1, tokens)`; `signal` by level.
+
+    With a and b the signal before and after, the noise in a token is e = (x - sqrt(a) x0) / sqrt(1 - a), and it goes to
+    sqrt(b) x0 + sqrt(1 - b - v) e + sqrt(v) noise, where v = eta^2 (1 - b) / (1 - a) (1 - a / b).
+    """
+    a, b = signal[levels[:-1]][..., None], signal[levels[1:]][..., None]
+    moving = levels[1:] < levels[:-1]
+    noise = np.sqrt(np.maximum(1 - a, 1e-12))
+    fresh = eta**2 * (1 - b) / noise**2 * (1 - a / b)
+    kept = np.sqrt(np.maximum(1 - b - fresh, 0.0)) / noise
+    moves = moving[..., None]
     factors = (
-        a.sqrt(),
-        (1 - a).sqrt().clamp_min(1e-6),
-        b.sqrt(),
-        (1 - b - fresh).clamp_min(0.0).sqrt(),
-        fresh.clamp_min(0.0).sqrt(),
+        np.where(moves, np.sqrt(b) - kept * np.sqrt(a), 0.0),
+        np.where(moves, kept, 1.0),
+        np.where(moves, np.sqrt(np.maximum(fresh, 0.0)), 0.0),
+        np.sqrt(a),
+        noise,
     )
-    return [DenoisingStep(*parts) for parts in zip(levels[1:] < levels[:-1], *factors, strict=True)]
+    return [DenoisingStep(*parts) for parts in zip(moving, *(x.astype(np.float32) for x in factors), strict=True)]

@@ -25,6 +25,7 @@ class SeenGoal:
     size: int
     mirror: Mirror
     observe: Callable[[Instruction, Walking], Array]
+    odometry: bool = True  # whether velocity and height by leg odometry are seen, too: they mean nothing while it lies
 
 
 def _velocity(instruction: Instruction, walking: Walking) -> Array:
@@ -65,6 +66,11 @@ def _ball(instruction: Instruction, walking: Walking) -> Array:
     return np.concatenate([nearest[..., :2], nearest[..., 3:5] / walking.forward], -1)
 
 
+def nothing(instruction: Instruction, walking: Walking) -> Array:
+    """No numbers `(..., 0)`: what is asked is always the same."""
+    return np.zeros((*np.shape(instruction.velocity)[:-1], 0))
+
+
 GOALS: Mapping[str, SeenGoal] = {
     goal.name: goal
     for goal in (
@@ -72,5 +78,6 @@ GOALS: Mapping[str, SeenGoal] = {
         SeenGoal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering),
         SeenGoal("location", 2, Mirror.PLANAR, _location),
         SeenGoal("ball", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _ball),
+        SeenGoal("stand", 0, Mirror(np.zeros(0, int), np.zeros(0, np.float32)), nothing, odometry=False),
     )
 }

@@ -23,8 +23,10 @@ class TaskObservation:
         self._past = np.zeros((*shape, _PAST, n + 3))
         self._fresh = np.ones(shape, bool)
         joints = Mirror.joints(robot)
+        self._odometry = goal.odometry
+        odometry = (Mirror.PLANAR, Mirror.SCALAR) if goal.odometry else ()
         self.mirror = Mirror.join(
-            Mirror.VECTOR, Mirror.ROTATION, Mirror.PLANAR, Mirror.SCALAR, joints, joints, joints,
+            Mirror.VECTOR, Mirror.ROTATION, *odometry, joints, joints, joints,
             *[joints, Mirror.ROTATION] * _PAST, goal.mirror,
         )  # fmt: skip
         self.size = len(self.mirror.index)
@@ -52,11 +54,11 @@ class TaskObservation:
             self._past = np.where(first[..., None, None], now[..., None, :], self._past)
             self._fresh = self._fresh & ~due
         m = self._walking
+        odometry = [row["velocity"][..., :2] / m.forward, 2.5 / m.height * (row["displacement"][..., 2:] - m.height)]
         parts = [
             row["gravity"],
             0.25 * row["angular_velocity"],
-            row["velocity"][..., :2] / m.forward,
-            2.5 / m.height * (row["displacement"][..., 2:] - m.height),
+            *(odometry if self._odometry else []),
             joints,
             0.1 * row["joint_velocity"],
             applied - row["position"],

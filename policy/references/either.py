@@ -55,6 +55,10 @@ class GaitOrClip(Reference):
         self._since = np.where(where, 0.0, self._since)
         self.on_clip = self.on_clip & ~where
 
+    def led(self, target: Array) -> Array:
+        """See `Gait.led`: joint targets `(..., n_joints)` rad, of worlds that follow the gait."""
+        return np.where(self.on_clip[..., None], target, self.gait.led(target))
+
     @property
     def ended(self) -> Array:
         return self.on_clip & self.clip.ended

@@ -21,6 +21,8 @@ from servoid.hw.robot.legs import LegInverse, Legs
 
 _SMOOTH = 0.3  # of a smooth swing's easing that is left at full speed
 _ANKLE = 0.4  # of a leg's length: joints this near the sole belong to the ankle
+_FASTEST = 8.0  # rad/s of the reference that count for `yaw_lead`: where a swing begins and ends, there are jumps
+_NOW = np.array([0])
 _ACROSS = 5.0  # rad/s of turning that weigh as much as 1 m/s sideways
 
 
@@ -48,6 +50,7 @@ class GaitSettings:
     ankle_pitch_gain: float
     ankle_roll_gain: float
     turning_gain: float = 1.0  # soles slip as they turn: how much further than asked steps turn
+    yaw_lead: float = 0.0  # s of their rate that the goals of joints that turn the feet go ahead by, for servos lag
     lift_loss: float = 0.0  # m that steps are lower at the faster speed of `even_swing`: knees are too slow for both
 
 
@@ -109,6 +112,7 @@ class Gait(Reference):
         self._inverse, self._index = inverse or leg_inverse(robot), Legs(robot).index
         self._side = np.sign(self._inverse.hip[:, 1])  # 1 left, -1 right
         self._shift = np.where(self._side > 0, 0.0, 0.5)  # the right foot steps half a cycle later
+        self._turns = _turning(robot)
         self._arms = [(robot.names.index(name), sign) for name, sign in robot.arms.items()]
         self.upper = np.array(settings.max_velocity)  # that can be asked, and the same to the other sides:
         self.lower = -np.array([settings.max_backward, *settings.max_velocity[1:]])
@@ -144,6 +148,13 @@ class Gait(Reference):
         begun = np.where(rightward, 0.5, 0.0)
         self.phase = np.where(self.activity > 0, (self.phase + self._phase_step) % 1.0, begun)
         self.activity = np.clip(self.activity + rate, 0.0, 1.0)
+
+    def led(self, target: Array) -> Array:
+        """Joint targets `(..., n_joints)` rad for the gait as it is now, those that turn feet ahead by `yaw_lead`."""
+        if not self.settings.yaw_lead:
+            return target
+        rate = np.clip(self.frames(_NOW).joint_velocity[..., 0, :], -_FASTEST, _FASTEST)
+        return target + self.settings.yaw_lead * rate * self._turns
 
     @property
     def ended(self) -> Array:
@@ -251,6 +262,15 @@ class GyroFeedback:
         out[..., self._pitch] += self._gains[0] * angular_velocity[..., 1:2] * self._pitch_sign
         out[..., self._roll] += self._gains[1] * angular_velocity[..., 0:1] * self._roll_sign
         return out
+
+
+def _turning(robot: Robot) -> Array:
+    """Legs' joints `(n_joints,)` bool that turn a foot about the vertical at home."""
+    legs = Legs(robot)
+    axes = legs.forward(legs.pick(robot.home))[3]
+    turns = np.zeros(len(robot.joints), bool)
+    turns[legs.index[np.abs(axes[..., 2]) > 0.7]] = True
+    return turns
 
 
 def _ankles(robot: Robot, axis: int) -> tuple[Array, Array]:

@@ -24,6 +24,6 @@ class GaitPolicy(BasePolicy):
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         self._gait.command(instruction.velocity)
-        target = self._gait.frames(_NOW).position[..., 0, :]
+        target = self._gait.led(self._gait.frames(_NOW).position[..., 0, :])
         self._gait.advance()
         return self._feedback(target, state.angular_velocity)

@@ -1,7 +1,9 @@
-"""Gets up by a clip, from however the robot lies, and goes home: open loop, or followed by a tracker.
+"""Gets up, from however the robot lies, and goes home: by a learned policy, or by a clip, followed or open loop.
 
-It proposes targets as a policy does. Which way the robot lies, gravity says; on its side the nearer of both. Going to
-the clip's first pose often rolls it over, so that is looked at again.
+It proposes targets as a policy does. A policy has the first try, where one is shipped for the robot; later tries, and
+robots without one, go by a clip: followed by a tracker, where one is shipped, or else open loop. Which way the robot
+lies, gravity says; on its side the nearer of both. Going to the clip's first pose often rolls it over, so that is
+looked at again.
 """
 
 from __future__ import annotations
@@ -15,21 +17,24 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import Robot
-from servoid.policy.checkpoint import CHECKPOINTS, CheckpointError, read_header, resolve
+from servoid.policy.checkpoint import CHECKPOINTS, read_header
 from servoid.policy.motion.clip import Clip
 from servoid.policy.motion.library import Library
 from servoid.policy.references.clip import BLEND_SHARE, ClipReference
 from servoid.policy.references.either import GaitOrClip
+from servoid.policy.rising.lead import CLIPS
+from servoid.policy.rising.policy import RisingPolicy
 from servoid.stack.control.tracker import Tracker
 from servoid.stack.log.provenance import sha256
 from servoid.stack.safety.min_jerk import MIN_JERK_PEAK, MinJerk
 from servoid.stack.safety.recovery import Recovery
 
-CLIPS = ("get-up-front", "get-up-back")
+POLICY = "get_up"  # name of the shipped checkpoint
 SETTLE_SECONDS = 0.5  # in a clip's first pose: clips were recorded from there, at rest
 STAND_SECONDS = 1.5  # that the robot has to come to a stand in when the clip is over
 HOME_SECONDS = 2.0  # the same, when it is home
 RATE = 1.6  # at which a tracker gets up, of the clip's own speed
+LEARNED_SECONDS = 6.0  # that a learned policy has; it begins anew by itself where it falls meanwhile
 ROLLED_SHARE = 0.15  # of a clip, in which the robot may still roll over to its other side
 
 
@@ -136,8 +141,39 @@ class TrackedGetUp(GetUp):
         return target
 
 
-def get_up(robot: Robot) -> GetUp:
-    """By the clips of the shipped library, and the shipped tracker where it knows clips of this robot.
+class LearnedGetUp(GetUp):
+    """Gets up with a policy in the first try of a fall, and in later ones as `otherwise` does."""
+
+    def __init__(self, robot: Robot, clips: tuple[Clip, Clip], policy: RisingPolicy, otherwise: GetUp) -> None:
+        """Raises ConfigError where the clips do not fit."""
+        super().__init__(robot, clips)
+        self._policy, self._otherwise = policy, otherwise
+
+    def begin(self) -> None:
+        super().begin()
+        self._otherwise.begin()
+
+    def act(self, state: State, applied: Array, recovery: Recovery) -> Array | None:
+        if recovery.tries <= 1:
+            return super().act(state, applied, recovery)
+        target = self._otherwise.act(state, applied, recovery)
+        self.failed = self._otherwise.failed
+        return target
+
+    def _rise(self, recovery: Recovery) -> Iterator[Array]:
+        self._policy.reset()
+        for _ in range(round(LEARNED_SECONDS * self._robot.rate)):
+            yield self._policy(self._state, self._applied)
+        self.failed = (
+            "it stood up, and did not come to a stand at home"
+            if recovery.stands
+            else f"the learned policy did not end on its feet and still within {LEARNED_SECONDS:g} s"
+        )
+
+
+def get_up(robot: Robot, checkpoints: Path = CHECKPOINTS) -> GetUp:
+    """By the policy that gets up among `checkpoints`, where it is of this robot; by the clips of the shipped library,
+    and the tracker where it knows clips of this robot.
 
     Raises ConfigError for a robot that has no clips, or cannot know how it lies.
     """
@@ -146,10 +182,12 @@ def get_up(robot: Robot) -> GetUp:
     try:
         library = Library(robot)
         front, back = (library[name] for name in CLIPS)
-        path = _tracker_of(robot)
-        if path is None:
-            return GetUp(robot, (front, back))
-        return TrackedGetUp(robot, (front, back), Tracker(robot, str(path), clips=True))
+        clips = front, back
+        tracker, policy = (_found(name, robot, checkpoints) for name in ("tracker", POLICY))
+        by_clips = GetUp(robot, clips)
+        if tracker is not None:
+            by_clips = TrackedGetUp(robot, clips, Tracker(robot, str(tracker), clips=True))
+        return by_clips if policy is None else LearnedGetUp(robot, clips, RisingPolicy(robot, policy, clips), by_clips)
     except ConfigError as error:
         names = " and ".join(f"'{name}'" for name in CLIPS)
         raise ConfigError(
@@ -157,17 +195,18 @@ def get_up(robot: Robot) -> GetUp:
         ) from error
 
 
-def _tracker_of(robot: Robot) -> Path | None:
-    """The robot's own tracker, or the shipped one where that is of this robot."""
-    try:
-        path = resolve("tracker", robot)
-    except CheckpointError:
-        return None
-    return path if path.parent != CHECKPOINTS or read_header(path)["robot"] == robot.name else None
+def _found(name: str, robot: Robot, checkpoints: Path) -> Path | None:
+    """The robot's own checkpoint, or the shipped one where that is of this robot."""
+    own, shipped = (folder / f"{name}.safetensors" for folder in (Path(robot.folder), checkpoints))
+    if own.is_file():
+        return own
+    return shipped if shipped.is_file() and read_header(shipped)["robot"] == robot.name else None
 
 
-def fingerprints(robot: Robot) -> dict[str, str | None]:
-    """Hashes of the clips' files, by their names, of a robot that has them, and of the tracker that follows them."""
-    library, tracker = Library(robot), _tracker_of(robot)
+def fingerprints(robot: Robot, checkpoints: Path = CHECKPOINTS) -> dict[str, str | None]:
+    """Hashes of the clips' files, by their names, of a robot that has them, of the tracker that follows them, and of
+    the policy that gets up."""
+    library = Library(robot)
     clips = {name: sha256(library.path(name)) for name in CLIPS}
-    return clips if tracker is None else {**clips, "tracker": sha256(tracker)}
+    networks = {name: _found(name, robot, checkpoints) for name in ("tracker", POLICY)}
+    return {**clips, **{name: sha256(path) for name, path in networks.items() if path is not None}}

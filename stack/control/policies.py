@@ -106,7 +106,7 @@ def _loop_settings(source: str) -> ClosedLoopSettings:
 
 
 # Policies of Servoid's own; besides there are the planner's other settings in configs/policies/.
-POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "gait": _gait}
+POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "fast": _expert, "gait": _gait}
 _KINDS: dict[str, Maker] = {  # of .safetensors files
     "diffusion": _diffusion,
     "tracker": _expert,

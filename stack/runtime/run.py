@@ -220,11 +220,17 @@ class Run:
         """The policy with what performs skills: itself, where its network knows them. Raises ConfigError."""
         settings, robot, assignment = self.settings, self.robot, self.assignment
         known = () if self._policy else skills_known(settings.policy, robot, self._script.planner)
+        told = assignment.episode.told
         if known:
+            if unknown := [name for name in told if name not in known]:
+                raise ConfigError(
+                    f"policy '{settings.policy}' does not know the skill '{unknown[0]}': use --policy expert, which "
+                    "performs it by what its file says"
+                )
             skills = load_skills(robot)
             return ToldPolicy(robot, policy, {name: chosen(name, skills) for name in known}, load_encoder())
-        if assignment.episode.told:
-            asked = ", ".join(assignment.episode.told)
+        if told and not assignment.task.performs:
+            asked = ", ".join(told)
             raise ConfigError(
                 f"policy '{settings.policy}' knows no skills, and what is said asks for some ({asked}): use --policy "
                 "skills, or servoid run skill --set text=..."

@@ -13,6 +13,7 @@ from servoid.hw.contracts.control import Adopted, Instruction, Policy, State
 from servoid.hw.robot.description import Robot
 from servoid.policy.text.captions import MOTIONS, NAMES, motion_of, twist_of
 from servoid.policy.text.encoder import TextEncoder
+from servoid.policy.text.told import walk_clock
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.skills.skill import UPRIGHT, Skill, chosen, steps, way
 from servoid.stack.skills.words import SkillWords
@@ -38,9 +39,9 @@ class Teller:
 
     @property
     def since(self) -> float:
-        """Seconds since a skill began, as training counted them; 0 of a walk."""
+        """Seconds since a skill began, as training counted them; of a walk its clock (`walk_clock`)."""
         if isinstance(self.now, int):
-            return 0.0
+            return float(walk_clock(np.array(self._ticks * self._dt)))
         return min(self._ticks * self._dt, self._skills[self.now].seconds + PAST_SECONDS)
 
     def tell(self, asked: str | int) -> None:
@@ -123,24 +124,25 @@ class ToldPolicy(BasePolicy):
         if now != before or not self._told:
             self._told = self._phrase(now)
             self._events.append(f"told: {self._told}")
+        since = np.array(self._teller.since)
         if now == asked and instruction.text is None and instruction.skill is None:
-            return self._planner.act(state, applied, instruction)  # a velocity, which says more than a sentence
+            # A velocity, which says more than a sentence.
+            return self._planner.act(state, applied, replace(instruction, since=since))
         velocity = twist_of(now, self._robot.walking.scale) if isinstance(now, int) else np.zeros(3)
         told = replace(
             instruction,
             velocity=velocity,
             text=self._told,
-            since=np.array(self._teller.since),
+            since=since,
             stand=instruction.stand and now == _STAND,
         )
         return self._planner.act(state, applied, told)
 
     def _phrase(self, now: str | int) -> str:
-        """How to tell it: in the words of the sentence that asked, or those of the training nearest to them."""
-        same = now == self._last and self._sentence != ""
+        """How to tell it: a skill in its clearest phrase, a walk in the words of the sentence that asked for it."""
         if isinstance(now, str):
-            return self._words.phrase(now, self._sentence if same else "")
-        return self._sentence if same else MOTIONS[now].phrasings[0]
+            return self._words.clearest(now)
+        return self._sentence if now == self._last and self._sentence else MOTIONS[now].phrasings[0]
 
     def _asked(self, instruction: Instruction) -> str | int | None:
         """What is asked for; None: nothing that is understood, so what was asked for last."""

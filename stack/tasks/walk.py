@@ -87,6 +87,8 @@ class Walk(BaseTask):
         return {
             "velocity_error_mps": measures.velocity_error(trace, self.settings.cycle),
             "top_speed_mps": measures.top_speed(trace),
+            "steady_speed_mps": measures.steady_speed(trace),
+            "turning_rate_radps": measures.turning_rate(trace),
             "distance_m": measures.path_length(trace, self.settings.cycle),
         }
 

@@ -11,7 +11,6 @@ from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import load_robot
 from servoid.policy.features import (
     Normaliser,
-    Trajectory,
     raw_layout,
     raw_mirror,
     raw_row,
@@ -19,6 +18,7 @@ from servoid.policy.features import (
     to_tokens,
     token_layout,
 )
+from servoid.policy.trajectory import Trajectory
 
 N = 20
 RAW = raw_layout(N)

@@ -6,11 +6,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import State
-from servoid.policy.features import Trajectory
+from servoid.policy.trajectory import Trajectory
 
 DT = 0.02
 
@@ -34,17 +33,16 @@ def moves(
     places: Array, yaw: float = 0.0, velocity: tuple[float, float] = (0.0, 0.0), ticks: Array | None = None
 ) -> Trajectory:
     """A predicted trajectory through `places` `(horizon, 2)`; `velocity` m/s is as a trajectory has it."""
-    displacement = torch.tensor(np.asarray(places, dtype=float))[None].requires_grad_()
+    displacement = np.array(places, dtype=float)[None]
     horizon = displacement.shape[1]
-    zeros = torch.zeros(1, horizon, dtype=torch.float64)
-    moving = torch.zeros(1, horizon, 2, dtype=torch.float64) + torch.tensor(velocity, dtype=torch.float64)
     return Trajectory(
         displacement=displacement,
-        yaw=zeros + yaw,
-        velocity=moving,
-        yaw_rate=zeros,
-        height=zeros,
-        joints=torch.zeros(1, horizon, 20, dtype=torch.float64),
+        yaw=np.full((1, horizon), yaw),
+        velocity=np.tile(np.array(velocity, dtype=float), (1, horizon, 1)),
+        yaw_rate=np.zeros((1, horizon)),
+        height=np.zeros((1, horizon)),
+        gravity=np.tile([0.0, 0.0, -1.0], (1, horizon, 1)),
+        joints=np.zeros((1, horizon, 20)),
         ticks=np.arange(1, horizon + 1) if ticks is None else ticks,
         dt=DT,
     )

@@ -8,6 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from servoid.tools.common.cluster.installed import installed
+
 if TYPE_CHECKING:
     from servoid.stack.runtime.run import RunSettings
 
@@ -49,17 +51,6 @@ def read_anew(robot: str) -> tuple[Any, ...]:
     from servoid.stack.log.provenance import fingerprint
 
     return digest(ROOT), fingerprint(load_robot(robot))
-
-
-def installed() -> dict[str, Any]:
-    """By names, what must be the same on each machine that takes part in a piece of work: versions of packages, and the
-    code, that of the tools too."""
-    from servoid.stack.log.provenance import versions
-
-    total = hashlib.sha256(digest(ROOT).encode())
-    for path in sorted((ROOT / "tools").rglob("*.py")):
-        total.update(f"{path.relative_to(ROOT).as_posix()} ".encode() + path.read_bytes())
-    return {f"version of {name}": version for name, version in versions().items()} | {"code": total.hexdigest()}
 
 
 def everything_of(runs: Sequence[RunSettings]) -> dict[str, Any]:

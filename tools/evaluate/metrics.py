@@ -36,6 +36,7 @@ MEASURES: dict[str, Callable[[Record], float | None]] = {
     "success": lambda record: record.get("success"),
     "fell_or_broken_off": fell_or_broken_off,
     "on_its_feet": lambda record: not fell_or_broken_off(record),
+    "ever_fell": lambda record: fell_or_broken_off(record) or bool(record.get("falls")),
     "rose_in_time": rose_in_time,
     "seconds_to_rise": rose,
     "ticks": lambda record: record.get("ticks"),
@@ -78,10 +79,13 @@ class Metric:
 METRICS: dict[str, Metric] = {
     "success": Metric("success", share=True),
     "falls": Metric("fell_or_broken_off", share=True, lower=True),  # a robot that cannot go on has not stayed up
+    "ever_fell": Metric("ever_fell", share=True, lower=True),  # and got up again, perhaps
     "on_its_feet": Metric("on_its_feet", share=True),
     "rose_in_time": Metric("rose_in_time", share=True),
     "seconds_to_rise": Metric("seconds_to_rise", "s", lower=True, median=True, unfinished="left out"),
     "ball_speed": Metric("ball_speed_mps", "m/s"),
+    "steady_speed": Metric("steady_speed_mps", "m/s"),
+    "turning_rate": Metric("turning_rate_radps", "rad/s"),
     "joint_error": Metric("joint_rms_rad", "rad", lower=True),
     "understood": Metric("understood", share=True),
     "ticks": Metric("ticks", "ticks", unfinished="whole"),

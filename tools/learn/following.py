@@ -1,7 +1,11 @@
-"""How many sentences a diffusion model follows, in many worlds at once: walks and skills, changed in mid motion."""
+"""How many sentences a diffusion model follows, in many worlds at once: walks and skills, changed in mid motion.
+
+`python -m servoid.tools.learn.following CHECKPOINT WORLDS SECONDS` prints it by what was asked for.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +19,7 @@ from servoid.hw.robot.description import Robot, load_robot
 from servoid.policy.text.captions import MOTIONS, NAMES
 from servoid.sim.truth import FALL_TILT
 from servoid.tools.learn.progress import counted
-from servoid.tools.learn.survival import measured_fleet, planning
+from servoid.tools.learn.survival import measured_fleet
 
 EVERY = 4.0  # s between sentences
 
@@ -62,14 +66,17 @@ def follow(checkpoint: Path, robot: Robot, seconds: float, worlds: int, seed: in
     """See `sentences_followed`. A world that falls begins anew, standing, with the next sentence."""
     from servoid.policy.checkpoint import read_header
     from servoid.policy.diffusion.model.config import check_fit
+    from servoid.policy.diffusion.settings import load_settings
+    from servoid.policy.text.encoder import load_encoder
     from servoid.stack.control.diffusion import diffusion_policy
     from servoid.stack.skills.telling import Teller
+    from servoid.stack.skills.words import SkillWords
     from servoid.stack.tasks import load_task
     from servoid.stack.tasks.text import Text
 
     head = read_header(checkpoint)
-    settings = planning(check_fit(checkpoint, head, robot), head["training"])
-    settings = replace(settings, checkpoint=str(checkpoint), trim=0.0)
+    settings = load_settings("skills").fitted(check_fit(checkpoint, head, robot), head["training"])
+    settings = replace(settings, checkpoint=str(checkpoint))
     policy = diffusion_policy(robot, settings, None, shape=(worlds,))
     wanted = {"about": "both", "every": str(EVERY), "seconds": str(seconds), "phrasings": "training"}
     task = load_task("text", wanted, robot.dt, robot)
@@ -79,6 +86,8 @@ def follow(checkpoint: Path, robot: Robot, seconds: float, worlds: int, seed: in
     fleet.reset(np.ones(worlds, bool))
     policy.reset(None, fleet.seeds)
     episodes = [task.scenario(rng) for rng in fleet.rngs]
+    words = SkillWords(load_encoder(), known)
+    phrases = {name: words.clearest(name) for name in known}
     tellers = [Teller(known, robot.dt) for _ in range(worlds)]
     every, found = round(EVERY * robot.rate), Followed()
     rows: list[tuple[Array, ...]] = []
@@ -87,9 +96,7 @@ def follow(checkpoint: Path, robot: Robot, seconds: float, worlds: int, seed: in
         number = tick // every
         for i, teller in enumerate(tellers):
             teller.tell(episodes[i].motions[number])
-        told = tuple(
-            MOTIONS[t.now].phrasings[0] if isinstance(t.now, int) else known[t.now].phrases[0] for t in tellers
-        )
+        told = tuple(MOTIONS[t.now].phrasings[0] if isinstance(t.now, int) else phrases[t.now] for t in tellers)
         since = np.array([teller.since for teller in tellers])
         state = fleet.observe()
         fleet.step(policy.act(state, fleet.applied, Instruction(np.zeros(3), texts=told, since=since)))
@@ -113,3 +120,17 @@ def follow(checkpoint: Path, robot: Robot, seconds: float, worlds: int, seed: in
                 found.count(motion, not fell[i] and all(task.verdicts(trace, [motion])), bool(fell[i]))
             rows, fell = [], np.zeros(worlds, bool)
     return found
+
+
+def _print(found: Followed) -> None:
+    for name in sorted(found.asked):
+        print(f"{name:20s} {found.done[name]:3d} of {found.asked[name]:3d} followed, fell in {found.fell[name]}")
+    walks = dict.fromkeys(NAMES)
+    skills = {name: 0 for name in found.asked if name not in walks}
+    fell, asked = sum(found.fell.values()), sum(found.asked.values())
+    shares = (found.share(), found.share(walks), found.share(skills))
+    print("followed {:.3f}, walks {:.3f}, skills {:.3f}".format(*shares) + f"; fell in {fell} of {asked}")
+
+
+if __name__ == "__main__":
+    _print(follow(Path(sys.argv[1]), load_robot(), float(sys.argv[3]), int(sys.argv[2]), 1))

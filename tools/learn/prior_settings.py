@@ -66,7 +66,7 @@ class ScoreSettings:
     ] = "data"
     random_level: Annotated[bool, "judge at one noise level drawn at random instead of at three"] = False
     generated: Annotated[float, "share of episodes that begin in a state drawn from the prior; others stand"] = 0.7
-    starts: Annotated[int, "generated windows that are kept"] = 1024
+    starts: Annotated[int, "states that are kept to begin in: generated windows, or bodies that lie"] = 1024
     renewals: Annotated[int, "times in a training that a quarter of them is replaced"] = 16
 
     def __post_init__(self) -> None:
@@ -88,14 +88,33 @@ class EpisodeSettings(ScoreSettings):
         float, "error of the prior, in multiples of held-out data's, at which an episode ends; 0: it never does so"
     ] = 0.0
     unlike_after: Annotated[float, "time before that can happen [s]: to start from standing takes a while"] = 1.0
-    rewards: Annotated[dict[str, float], "weights of task, manner, both (their product), change, effort and fall"] = (
-        field(default_factory=lambda: {"task": 0.5, "both": 0.5, "change": -0.01, "fall": -5.0})
+    hardest_push: Annotated[float, "hardest push [m/s]; pushes are uniform from zero and grow over the first half"] = (
+        0.0
     )
+    push_every: Annotated[Range, "time between pushes [s]"] = (0.6, 2.0)
+    eased: Annotated[
+        Range, "share of episodes of get-up that begin falling or along a clip, at the start and from half of it on"
+    ] = (0.7, 0.25)
+    lead_rate: Annotated[
+        Range, "pace of the clips that lead get-up-by-clips, of their own, at the start and from three fifths of it on"
+    ] = (1.4, 2.2)
+    decide_every: Annotated[int, "ticks between decisions, without a prior: one with a prior decides at its frames"] = 2
+    reach: Annotated[float, "joint target for an action of one [rad], without a prior"] = 0.5
+    rewards: Annotated[
+        dict[str, float],
+        "weights of task, manner, both (their product), change, jerk, effort, shock, blocked, beyond and fall",
+    ] = field(default_factory=lambda: {"task": 0.5, "both": 0.5, "change": -0.01, "fall": -5.0})
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.episode_seconds <= 0 or min(self.unlike, self.unlike_after) < 0:
             raise ValueError("episode_seconds must be positive; unlike and unlike_after must not be negative")
+        if self.hardest_push < 0 or not 0.0 < self.push_every[0] <= self.push_every[1]:
+            raise ValueError("hardest_push must not be negative, and push_every must be positive and rising")
+        if min(self.lead_rate) <= 0:
+            raise ValueError(f"lead_rate must be positive, not {self.lead_rate}")
+        if self.decide_every < 1 or self.reach <= 0:
+            raise ValueError("decide_every must be at least 1, and reach must be positive")
         if not 0.0 <= self.randomised <= 1.0:
             raise ValueError(f"randomised must be a share of 0 to 1, not {self.randomised:g}")
         unknown = sorted(set(self.rewards) - set(REWARDED))
@@ -105,7 +124,7 @@ class EpisodeSettings(ScoreSettings):
             raise ValueError("rewards must name one or more")
 
 
-REWARDED = ("task", "manner", "both", "change", "effort", "fall")
+REWARDED = ("task", "manner", "both", "change", "jerk", "effort", "shock", "blocked", "beyond", "fall")
 
 
 @dataclass(frozen=True)

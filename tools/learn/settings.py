@@ -120,10 +120,13 @@ class DiffusionTraining(DecayedOptimiser, TrainingObjective, DiffusionNetwork, D
     warmup_steps: Annotated[int, "steps over which the learning rate rises"] = 200
     average: Annotated[float, "decay of the averaged weights, which are the ones saved"] = 0.999
     precision: Annotated[Literal["bf16", "fp32"], "arithmetic of the network"] = "bf16"
+    distil_steps: Annotated[int, "network calls of the plans that --distil trains for, beside a lead"] = 2
 
     def __post_init__(self) -> None:
         for part in (DataRun, DenoiserShape, TrainingObjective, Optimiser):
             part.__post_init__(self)
+        if not 1 <= self.distil_steps <= self.levels // 2:
+            raise ValueError(f"distil_steps must be 1 to half of the {self.levels} levels, not {self.distil_steps}")
         if self.history < 2:
             raise ValueError(f"history must be at least 2, not {self.history}: what ran last is an action of the past")
         if self.inference_delay > self.horizon:

@@ -22,7 +22,8 @@ from servoid.stack.estimation.odometry import load_odometry
 from servoid.stack.safety.limits import limit
 from servoid.stack.tasks.skills.kick import SIDES, KickSettings
 
-LOOK_SECONDS = 0.2  # that the robot stands before it kicks
+READY_SECONDS = 0.7  # that the robot holds its home pose, as before a run: it sags and leans as its servos give
+LOOK_SECONDS = 0.5  # that the expert stands before the kick
 AFTER_SECONDS = 1.0  # that it stands after it
 _BLEND_SECONDS = 0.2  # from a kick's last pose to what stands
 _TAG = 2**31 - 61  # of the streams that robots are drawn from
@@ -69,7 +70,8 @@ class KickTrial:
         reference = ClipReference(robot, [_clip(each, len(robot.feet)) for each in goals], (n,))
         length = np.repeat([len(each) for each in goals], self.each)
         gain = np.repeat(gains, self.each, 0)
-        look, after = round(LOOK_SECONDS * robot.rate), round(AFTER_SECONDS * robot.rate)
+        ready, after = round(READY_SECONDS * robot.rate), round(AFTER_SECONDS * robot.rate)
+        look = ready + round(LOOK_SECONDS * robot.rate)
         fade = round(_BLEND_SECONDS * robot.rate)
         told, truth = Instruction(np.zeros((n, 3)), stand=True), worlds.truth
         applied, offset = np.tile(robot.home, (n, 1)), np.zeros((n, len(robot.joints)))
@@ -78,7 +80,8 @@ class KickTrial:
         ticks = look + int(length.max()) + after
         for tick in range(ticks):
             state = self._estimator.update(worlds.observe(), applied)
-            target = self._stands.act(state, applied, told)
+            stands = self._stands.act(state, applied, told)
+            target = np.tile(robot.home, (n, 1)) if tick < ready else stands
             if tick == look:
                 reference.play(np.repeat(np.arange(self.candidates), self.each))
                 reference.enter(applied)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -117,17 +118,17 @@ class DenoiserConfig(DenoiserShape):
         if self.clock and not self.text:
             raise ConfigError("denoiser: a clock goes with an encoder of instructions")
 
-    @property
+    @cached_property
     def state_ticks(self) -> Array:
         """Ticks of the state tokens, `(history + ticks to come,)`."""
         return np.concatenate([np.arange(1 - self.history, 1), self.future_ticks])
 
-    @property
+    @cached_property
     def future_ticks(self) -> Array:
         """Ticks to come that have state tokens: all up to the horizon, or those that are listed."""
         return np.array(self.ticks) if self.ticks else np.arange(1, self.horizon + 1)
 
-    @property
+    @cached_property
     def action_ticks(self) -> Array:
         """Ticks of the action tokens, `(history - 1 + action_horizon,)`."""
         return np.arange(1 - self.history, self.action_horizon)

@@ -15,6 +15,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import rotation_matrix
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
+from servoid.hw.robot.limbs import Limb
 from servoid.hw.robot.mirror import Mirror
 from servoid.hw.robot.mjcf import compiled, read_body
 
@@ -86,6 +87,24 @@ class KeyPoints:
             np.array([self.names.index(name) for name in other]), np.ones(len(self.names), dtype=np.float32)
         )
         return Mirror.vectors(points)
+
+    def limb(self, name: str) -> Limb:
+        """The chain from the base to a key point. Raises KeyError where there is none of that name."""
+        if name not in self.names:
+            raise KeyError(name)
+        point = self.names.index(name)
+        link, place = self._point_links[point], self._point_places[point]
+        rotations, positions = self._frames(np.zeros(1 + max(each.joint for each in self._links)))
+        tip, chain = positions[link] + rotations[link] @ place, list[int]()
+        while link >= 0:
+            chain.insert(0, link)
+            link = self._links[link].parent
+        anchors = [positions[k] + rotations[k] @ self._links[k].anchor for k in chain]
+        axes = []
+        for k in chain:
+            skew = self._links[k].turn.T @ self._links[k].sine
+            axes.append(rotations[k] @ [skew[2, 1], skew[0, 2], skew[1, 0]])
+        return Limb(tuple(self._links[k].joint for k in chain), np.array(anchors), np.array(axes), tip)
 
     # -- reading the model ---------------------------------------------------------------------------------------------
 

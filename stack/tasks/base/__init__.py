@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -18,7 +17,9 @@ from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot, shipped_robot
 from servoid.hw.setting import Setting, asks, check, rescaled
 from servoid.policy.references.gait import gait_of
-from servoid.stack.tasks.terms.guidance import FreeWeights, Weights, total_cost
+from servoid.stack.tasks.terms.body import Build
+from servoid.stack.tasks.terms.guidance import TotalCost
+from servoid.stack.tasks.terms.weights import FreeWeights, Weights
 
 T = TypeVar("T")
 
@@ -134,6 +135,11 @@ class BaseTask:
         return (self.robot or shipped_robot()).walking.scale
 
     @property
+    def build(self) -> Build | None:
+        """Of the robot's body, where a term of the cost is about parts of it."""
+        return None
+
+    @property
     def cycle(self) -> float:
         """Length of a cycle of the robot's gait [s]: within one, every walk sways."""
         return gait_of(self.robot or shipped_robot()).cycle
@@ -157,9 +163,9 @@ class BaseTask:
 
     @property
     def objective(self) -> Objective | None:
-        """The weighted sum of what an instruction holds (`guidance.total_cost`); None where it is always zero."""
+        """The weighted sum of what an instruction holds (`guidance.TotalCost`); None where it is always zero."""
         weights: Weights = self.settings.weights
-        return None if self.guided_by_velocity_alone and not weights.twist else partial(total_cost, weights=weights)
+        return None if self.guided_by_velocity_alone and not weights.twist else TotalCost(weights, self.build)
 
     def criteria(self, trace: Trace, episode: Any) -> Sequence[Criterion]:
         """All that a success needs: what a run is told when it fails."""
@@ -193,6 +199,9 @@ class BaseBehaviour:
 
     def done(self, state: State) -> bool:
         return False
+
+    def take_events(self) -> Sequence[str]:
+        return ()
 
     def lost(self) -> None:
         """Its robot has ended; nobody else waits for it."""

@@ -129,6 +129,7 @@ class PerformSkills(BaseTask):
             begins=tuple(begins[:-1]),
             ends=begins[-2] + self.ticks(self._lasts(before, asked[-1]) + (LEAVE_SECONDS if s.every else 0.0)),
             performs=last is not None and bool(steps(before, last, self.skills)),
+            told=tuple(name for name in asked if name),
             low=any(self.skills[name].low for name in asked if name in self.skills),
         )
 

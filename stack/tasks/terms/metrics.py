@@ -40,6 +40,18 @@ def top_speed(trace: Trace, window: float = 2.0) -> float:
     return float(_moving_average(trace.velocity[:, :1], ticks).max())
 
 
+def steady_speed(trace: Trace) -> float:
+    """Mean forward speed from 2 s on [m/s]; NaN for a shorter run."""
+    speeds = trace.velocity[round(SETTLING / trace.dt) :, 0]
+    return float(speeds.mean()) if len(speeds) else float("nan")
+
+
+def turning_rate(trace: Trace) -> float:
+    """How fast the robot turned from 2 s on, either way [rad/s]; NaN for a shorter run."""
+    yaw = np.unwrap(trace.yaw)[round(SETTLING / trace.dt) :]
+    return float(abs(yaw[-1] - yaw[0]) / ((len(yaw) - 1) * trace.dt)) if len(yaw) > 1 else float("nan")
+
+
 def path_length(trace: Trace, step: float) -> float:
     """Length of the planar path [m], its points taken `step` s apart, so that the gait's sway is not counted."""
     ticks = max(round(step / trace.dt), 1)

@@ -19,10 +19,11 @@ from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.denoiser import Denoiser
 from servoid.policy.diffusion.runtime import Runtime
 from servoid.policy.diffusion.settings import DiffusionSettings, GuidanceSettings, load_settings
-from servoid.policy.features import Normaliser, Trajectory, raw_layout
+from servoid.policy.features import Normaliser, raw_layout
 from servoid.policy.text.captions import MOTIONS, NAMES, caption
 from servoid.policy.text.encoder import code_size, load_encoder
 from servoid.policy.text.nearest_phrase import Phrasebook
+from servoid.policy.trajectory import Trajectory
 
 ROBOT = load_robot()
 SETTINGS = DiffusionSettings(steps=4, delay=2)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch_costs import by_torch
 
 from servoid.hw.config import ConfigError
 from servoid.policy.diffusion.guidance import Diverged, Guidance, classifier_free
@@ -162,7 +163,7 @@ def test_monte_carlo_guidance_moves_the_samples_of_a_window_by_their_mean_gradie
     sampler = Sampler(lambda s, a, ks, ka: (s, a), cosine_signal(LEVELS))
     matrix, known = full_sequence(LEVELS, 1, 2, 2), unknown(6, tokens=2)
     plain, _ = sampler.sample(matrix, known, generators(6))
-    guidance = Guidance(lambda s: 0.5 * s.square().sum((1, 2)), 0.1, clip=10.0, gradient=gradient, samples=3)
+    guidance = Guidance(by_torch(lambda s: 0.5 * s.square().sum((1, 2))), 0.1, clip=10.0, gradient=gradient, samples=3)
     guided, _ = sampler.sample(matrix, known, generators(6), guidance)
     mean = plain.unflatten(0, (2, 3)).mean(1).repeat_interleave(3, 0)  # of each sample's own gradient
     torch.testing.assert_close(plain - guided, 0.1 * mean, atol=1e-5, rtol=1e-4)
@@ -170,14 +171,14 @@ def test_monte_carlo_guidance_moves_the_samples_of_a_window_by_their_mean_gradie
 
 def test_a_weight_beyond_all_bounds_is_an_error_that_says_so() -> None:
     sampler = Sampler(lambda s, a, ks, ka: (s, a), cosine_signal(LEVELS))
-    guidance = Guidance(lambda s: s.square().sum((1, 2)), weight=1e39, clip=1.0)
+    guidance = Guidance(by_torch(lambda s: s.square().sum((1, 2))), weight=1e39, clip=1.0)
     with pytest.raises(Diverged, match=r"weight of 1e\+39 moves this trajectory out of all bounds; lower it"):
         sampler.sample(full_sequence(LEVELS, 1, 1, 1), unknown(1), generators(1), guidance)
 
 
 def test_frames_whose_turn_has_not_come_use_nothing_of_the_guidance_step_up() -> None:
     sampler = Sampler(lambda s, a, ks, ka: (torch.zeros_like(s), a), cosine_signal(LEVELS))
-    guidance = Guidance(lambda s: s.sum((1, 2)), weight=100.0, clip=0.5)
+    guidance = Guidance(by_torch(lambda s: s.sum((1, 2))), weight=100.0, clip=0.5)
     matrix = autoregressive(LEVELS, 1, np.arange(2), np.arange(2))
     states, _ = sampler.sample(matrix, unknown(1, tokens=2), generators(1), guidance)
     torch.testing.assert_close(states[0, :, 0], torch.tensor([-0.5, -0.5]))
@@ -189,10 +190,10 @@ def test_a_guidance_step_is_never_longer_than_its_clip(gradient: str) -> None:
     sampler = Sampler(lambda s, a, ks, ka: (s, a), cosine_signal(LEVELS))
     matrix, known = full_sequence(LEVELS, 1, 2, 2), unknown(3, tokens=2)
     plain, _ = sampler.sample(matrix, known, generators(3))
-    guidance = Guidance(lambda s: 1e6 * s.sum((1, 2)), weight=1.0, clip=0.25, gradient=gradient)
+    guidance = Guidance(by_torch(lambda s: 1e6 * s.sum((1, 2))), weight=1.0, clip=0.25, gradient=gradient)
     guided, _ = sampler.sample(matrix, known, generators(3), guidance)
     torch.testing.assert_close((guided - plain).flatten(1).norm(dim=1), torch.full((3,), 0.25))
-    gentle = Guidance(lambda s: 0.1 * s.sum((1, 2)), weight=1.0, clip=5.0, gradient=gradient)
+    gentle = Guidance(by_torch(lambda s: 0.1 * s.sum((1, 2))), weight=1.0, clip=5.0, gradient=gradient)
     guided, _ = sampler.sample(matrix, known, generators(3), gentle)
     torch.testing.assert_close(plain - guided, torch.full((3, 2, 1), 0.1))
 
@@ -201,7 +202,7 @@ def test_known_states_do_not_use_up_the_guidance_step() -> None:
     sampler = Sampler(lambda s, a, ks, ka: (torch.zeros_like(s), a), cosine_signal(LEVELS))
     known = unknown(1, tokens=2)
     known.state_mask[0] = True
-    guidance = Guidance(lambda s: s.sum((1, 2)), weight=100.0, clip=0.5)
+    guidance = Guidance(by_torch(lambda s: s.sum((1, 2))), weight=100.0, clip=0.5)
     states, _ = sampler.sample(full_sequence(LEVELS, 1, 2, 2), known, generators(1), guidance)
     torch.testing.assert_close(states[0, :, 0], torch.tensor([0.0, -0.5]))
 
@@ -211,7 +212,7 @@ def test_scaled_guidance_moves_the_mean_of_a_normal_distribution_to_where_theory
     """N(m, s^2) exp(-c x) is N(m - c s^2, s^2): whatever the levels, and whatever the spread of the data."""
     sampler = Sampler(mixture(torch.tensor([1.0]), torch.tensor([0.7]), deviation), cosine_signal(LEVELS))
     matrix, known, slope = full_sequence(LEVELS, 50, 1, 1), unknown(2000), 0.8
-    guidance = Guidance(lambda s: slope * s.sum((1, 2)), 1.0, clip=100.0, gradient="network", scaled=True)
+    guidance = Guidance(by_torch(lambda s: slope * s.sum((1, 2))), 1.0, clip=100.0, gradient="network", scaled=True)
     plain, _ = sampler.sample(matrix, known, generators(2000))
     guided, _ = sampler.sample(matrix, known, generators(2000), guidance)
     assert (plain - guided).mean().item() == pytest.approx(slope * deviation**2, rel=0.06)
@@ -228,37 +229,41 @@ def test_a_limited_step_does_not_go_beyond_where_the_cost_would_be_zero() -> Non
     def cost(s: Tensor) -> Tensor:
         return s.abs().sum((1, 2))  # zero at 0
 
-    assert fixed(1.0, Guidance(cost, 5.0, clip=100.0)).item() == pytest.approx(-4.0)
-    assert fixed(1.0, Guidance(cost, 5.0, clip=100.0, limited=True)).item() == pytest.approx(0.0, abs=1e-6)
-    assert fixed(1.0, Guidance(cost, 0.4, clip=100.0, limited=True)).item() == pytest.approx(0.6)
+    assert fixed(1.0, Guidance(by_torch(cost), 5.0, clip=100.0)).item() == pytest.approx(-4.0)
+    assert fixed(1.0, Guidance(by_torch(cost), 5.0, clip=100.0, limited=True)).item() == pytest.approx(0.0, abs=1e-6)
+    assert fixed(1.0, Guidance(by_torch(cost), 0.4, clip=100.0, limited=True)).item() == pytest.approx(0.6)
 
 
 def test_steps_repeated_at_a_level_follow_the_gradient_as_it_changes() -> None:
     def cost(s: Tensor) -> Tensor:
         return s.square().sum((1, 2))
 
-    assert fixed(1.0, Guidance(cost, 0.8, clip=100.0)).item() == pytest.approx(1.0 - 1.6)  # beyond the least cost
-    assert fixed(1.0, Guidance(cost, 0.8, clip=100.0, repeats=4)).item() == pytest.approx(0.6**4)
+    assert fixed(1.0, Guidance(by_torch(cost), 0.8, clip=100.0)).item() == pytest.approx(
+        1.0 - 1.6
+    )  # beyond the least cost
+    assert fixed(1.0, Guidance(by_torch(cost), 0.8, clip=100.0, repeats=4)).item() == pytest.approx(0.6**4)
 
 
 def test_even_gradients_move_each_token_as_far() -> None:
     def cost(s: Tensor) -> Tensor:
         return (s[..., 0] * torch.tensor([1.0, 3.0])).sum(1)
 
-    assert fixed(0.0, Guidance(cost, 1.0, clip=100.0), tokens=2).tolist() == pytest.approx([-1.0, -3.0])
-    assert fixed(0.0, Guidance(cost, 1.0, clip=100.0, even=True), tokens=2).tolist() == pytest.approx([-2.0, -2.0])
+    assert fixed(0.0, Guidance(by_torch(cost), 1.0, clip=100.0), tokens=2).tolist() == pytest.approx([-1.0, -3.0])
+    assert fixed(0.0, Guidance(by_torch(cost), 1.0, clip=100.0, even=True), tokens=2).tolist() == pytest.approx(
+        [-2.0, -2.0]
+    )
 
 
 def test_a_cost_without_a_finite_gradient_is_an_error() -> None:
     sampler = Sampler(lambda s, a, ks, ka: (torch.zeros_like(s), a), cosine_signal(LEVELS))
-    guidance = Guidance(lambda s: s.norm(dim=(1, 2)).sqrt(), weight=1.0, clip=1.0)
+    guidance = Guidance(by_torch(lambda s: s.norm(dim=(1, 2)).sqrt()), weight=1.0, clip=1.0)
     with pytest.raises(Diverged, match="no finite gradient"):
         sampler.sample(full_sequence(LEVELS, 1, 1, 1), unknown(1), generators(1), guidance)
 
 
 def test_an_unknown_gradient_is_refused() -> None:
     with pytest.raises(ConfigError, match="'numeric'"):
-        Guidance(lambda s: s.sum(), 1.0, 1.0, gradient="numeric")
+        Guidance(by_torch(lambda s: s.sum()), 1.0, 1.0, gradient="numeric")
 
 
 @pytest.fixture(scope="module")
@@ -298,7 +303,7 @@ def test_guiding_states_moves_the_actions(planner: tuple[Denoiser, Sampler], gra
     _, sampler = planner
     known = Known(torch.zeros(256, 5, 1), torch.zeros(256, 4, 1), torch.arange(5) < 1, torch.zeros(4, dtype=torch.bool))
     matrix = full_sequence(20, 5, 5, 4, lead=lead)
-    guidance = Guidance(lambda s: (s[:, 1:] - 1.5).square().sum((1, 2)), 0.3, 10.0, gradient)
+    guidance = Guidance(by_torch(lambda s: (s[:, 1:] - 1.5).square().sum((1, 2))), 0.3, 10.0, gradient)
     with torch.no_grad():
         states, actions = sampler.sample(matrix, known, generators(256))
         guided_states, guided_actions = sampler.sample(matrix, known, generators(256), guidance)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from test_runtime import model
 from torch import Tensor
+from torch_costs import by_torch
 
 from servoid.policy.diffusion import rolling
 from servoid.policy.diffusion.guidance import Guidance
@@ -65,7 +66,7 @@ def textbook(matrix: DenoisingMatrix, eta: float, weight: float) -> list[Tensor]
 @pytest.mark.parametrize("eta", [0.0, 0.6, 1.0])
 def test_samples_are_those_of_the_equations(eta: float) -> None:
     matrix = full_sequence(LEVELS, 5, 6, 5, lead=2)
-    guidance = Guidance(cost, 0.1, clip=1e6)
+    guidance = Guidance(by_torch(cost), 0.1, clip=1e6)
     ours = Sampler(predict, SIGNAL, eta).sample(matrix, known(), generators(), guidance)
     for a, b in zip(ours, textbook(matrix, eta, 0.1), strict=True):
         torch.testing.assert_close(a, b, atol=1e-6, rtol=1e-6)
@@ -81,7 +82,7 @@ def test_guidance_is_asked_only_while_states_can_move(gradient: str) -> None:
 
     matrix = full_sequence(LEVELS, 5, 6, 5, lead=3)
     assert matrix.calls == 8
-    Sampler(predict, SIGNAL).sample(matrix, known(), generators(), Guidance(counted, 0.1, 1e6, gradient))
+    Sampler(predict, SIGNAL).sample(matrix, known(), generators(), Guidance(by_torch(counted), 0.1, 1e6, gradient))
     assert len(asked) == 5
 
 

@@ -365,3 +365,29 @@ def test_it_walks_five_seconds_on_the_nominal_robot() -> None:
     assert y[2] - y[3] > 0.2
     assert turned[4] > 1.0
     assert turned[5] < -0.5
+
+
+def test_what_a_faster_gait_adds_is_nothing_to_one_that_does_not_ask_for_it() -> None:
+    walk = np.array([0.45, 0.0, 0.0])
+    lower = replace(SETTINGS, lift_loss=0.02)
+    for velocity, same in ((np.array([0.2, 0.0, 0.5]), True), (walk, False)):
+        poses = [
+            Gait(ROBOT, settings=each).pose(PHASES, np.tile(velocity, (48, 1)), np.ones(48))[0]
+            for each in (SETTINGS, lower)
+        ]
+        assert np.array_equal(*poses) == same, "steps are lower at speed alone"
+    gait = Gait(ROBOT)
+    assert gait.led(ROBOT.home) is ROBOT.home
+
+
+def test_joints_that_turn_the_feet_and_no_others_go_ahead_of_the_gait() -> None:
+    gait = Gait(ROBOT, settings=replace(SETTINGS, yaw_lead=0.05))
+    gait.command(np.array([0.0, 0.0, 1.0]))
+    for _ in range(60):
+        gait.advance()
+    frames = gait.frames(np.arange(2))
+    added = gait.led(frames.position[0]) - frames.position[0]
+    yaws = np.array([name.endswith("hip_yaw") for name in ROBOT.names])
+    assert added[~yaws] == pytest.approx(0.0)
+    assert added[yaws] == pytest.approx(0.05 * (frames.position[1] - frames.position[0])[yaws] / ROBOT.dt)
+    assert np.abs(added[yaws]).max() > 0.01

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.robot.description import load_robot
+from servoid.policy import checkpoint
+from servoid.policy.references.gait import load_gait
+from servoid.policy.tracker.network import gait_of_tracker, written
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.gait import GaitPolicy
+from servoid.stack.control.policies import make_policy, policy_fingerprint
 from servoid.stack.control.tracker import ExpertPolicy
 from servoid.stack.estimation.odometry import load_odometry
+from servoid.stack.tasks import load_task
 
 ROBOT = load_robot()
 
@@ -55,3 +61,24 @@ def test_the_shipped_expert_stays_up_on_robots_it_does_not_know() -> None:
         fleet.drive(policy, command)
         fallen |= fleet.truth.fallen
     assert fallen.mean() <= 0.12
+
+
+def test_a_tracker_that_learned_another_gait_walks_by_it(tmp_path: Path) -> None:
+    head, tensors = checkpoint.read(checkpoint.resolve("expert", ROBOT))
+    fast = replace(load_gait("gait-fast"), max_velocity=(0.7, 0.1, 2.0))
+    head["config"]["gait"] = dict(written(fast))
+    path = tmp_path / "fast.safetensors"
+    checkpoint.write(path, tensors, head)
+    assert gait_of_tracker(path, ROBOT) == fast
+    assert gait_of_tracker(checkpoint.resolve("expert", ROBOT), ROBOT) == load_gait()
+    assert policy_fingerprint(str(path))["gait"]["max_velocity"] == [0.7, 0.1, 2.0]
+    head["config"]["gait"] = {"cycle": 0.4}
+    checkpoint.write(path, tensors, head)
+    with pytest.raises(checkpoint.CheckpointError, match="its gait is not one of this program"):
+        ExpertPolicy(ROBOT, str(path))
+
+
+def test_a_file_of_a_gait_is_a_policy_that_walks_by_it() -> None:
+    policy = make_policy("gait-fast", ROBOT, load_task("walk", {}), realtime=False)
+    assert isinstance(policy, GaitPolicy)
+    assert policy_fingerprint("gait-fast")["gait"]["yaw_lead"] == load_gait("gait-fast").yaw_lead

@@ -90,7 +90,7 @@ def test_pushed_over_while_it_walks_it_gets_up_and_walks_on(bearing: str) -> Non
     assert len(trace.yaw) == result.ticks
     assert falls is not None
     assert falls.falls == 1
-    assert 2.0 < falls.seconds[0] < 10.0
+    assert 0.5 < falls.seconds[0] < 10.0
     assert_limits(watch.records)
     # By what it knows itself: upright, and its heading kept through all that rolling.
     last = next(r.state for r in reversed(watch.records) if r.phase is Phase.RUNNING)
@@ -110,7 +110,7 @@ def test_without_recover_the_same_fall_is_the_end() -> None:
 
 
 def test_time_that_is_over_while_it_lies_is_a_fall() -> None:
-    result, watch = fall(0.0, seconds=4.0)
+    result, watch = fall(0.0, seconds=2.8)
     assert result.outcome == "fell"
     assert result.trace.fallen
     assert watch.ground_truth.trace().fallen
@@ -205,7 +205,7 @@ def test_a_run_with_a_fall_is_repeated_to_the_bit(tmp_path: Any) -> None:
     )
     assert set(first) & set(then)
     assert all(np.abs(plan.path[0] - place_at(log, plan.adopted)).max() < 0.1 for plan in plans(log))
-    assert sorted(log.header["recovery"]) == ["get-up-back", "get-up-front", "tracker"]
+    assert sorted(log.header["recovery"]) == ["get-up-back", "get-up-front", "get_up", "tracker"]
     assert changes(log) == []
     assert replay(log)[1] is None
     log.header["recovery"]["get-up-back"] = "another"

@@ -12,15 +12,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from shipped_runs import ROBOT, Asked, Driven, drive, walked
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Plan, PlanRequest
-from servoid.policy.features import Trajectory, raw_layout, to_tokens
+from servoid.policy.features import raw_layout, to_tokens
 from servoid.policy.text.captions import caption
+from servoid.policy.trajectory import Trajectory
 from servoid.stack.runtime.run import RunSettings, run
-from servoid.stack.tasks.terms.guidance import Weights, obstacle_cost
+from servoid.stack.tasks.terms.places import obstacle_cost
+from servoid.stack.tasks.terms.weights import Weights
 
 pytestmark = pytest.mark.slow
 
@@ -47,9 +48,9 @@ def guided_turn(planner: Asked) -> float:
 def closeness(plan: Plan, request: PlanRequest) -> float:
     """Cost of what the plan predicts, by the obstacles that were told with the request."""
     tokens = to_tokens(plan.states.astype(float), request.states[-1].astype(float), len(ROBOT.joints))
-    trajectory: Any = Trajectory.of(torch.from_numpy(tokens[None]), len(ROBOT.joints), ROBOT.dt)
+    trajectory: Any = Trajectory.of(tokens[None], len(ROBOT.joints), ROBOT.dt)
     assert request.instruction.obstacles is not None
-    return float(obstacle_cost(trajectory, request.instruction.obstacles, Weights(repulsion=1.0)))
+    return obstacle_cost(trajectory, request.instruction.obstacles, Weights(repulsion=1.0))[0].item()
 
 
 def share_kept_clear(planner: Asked) -> float:

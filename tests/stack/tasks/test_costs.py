@@ -4,34 +4,34 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from task_bodies import DT, Drawn, moves, state
 
+from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import DistanceMap, Instruction, State
 from servoid.hw.geometry import to_heading
-from servoid.policy.features import Trajectory
+from servoid.hw.robot.description import load_robot
+from servoid.policy.features import token_layout
+from servoid.policy.trajectory import Slope, Trajectory, by_tokens, sloped
 from servoid.stack.navigation.potential_field import FieldSettings, PotentialField
 from servoid.stack.tasks import load_settings, load_task
-from servoid.stack.tasks.terms.guidance import (
-    Stopping,
-    Weights,
-    goal_cost,
-    ground_cost,
-    obstacle_cost,
-    path_cost,
-    total_cost,
-    way_cost,
-)
+from servoid.stack.tasks.body import build_of
+from servoid.stack.tasks.terms.guidance import Stopping, TotalCost
+from servoid.stack.tasks.terms.motion import ground_cost
+from servoid.stack.tasks.terms.places import goal_cost, obstacle_cost, path_cost, way_cost
+from servoid.stack.tasks.terms.weights import Weights
 
+NOTHING = Weights(velocity=0, yaw_rate=0, displacement=0, yaw=0, stand=0, path=0, repulsion=0)
+BUILD = build_of(load_robot())
 TWIST = tuple(f"cost.{name}" for name in ("velocity", "yaw_rate", "displacement", "yaw", "stand"))
 
 
-def value(cost: torch.Tensor) -> float:
-    return float(cost.detach())
+def value(cost: tuple[Array, Slope] | Array) -> float:
+    """Of one trajectory, with or without its slope."""
+    return (cost[0] if isinstance(cost, tuple) else cost).item()
 
 
 def test_obstacle_cost_is_the_papers_and_pushes_away() -> None:
@@ -39,7 +39,7 @@ def test_obstacle_cost_is_the_papers_and_pushes_away() -> None:
     obstacle = np.array([[0.3, 0.0, 0.05, 0.0, 0.0]])
     cost = obstacle_cost(here, obstacle, Weights(repulsion=2.0, sharpness=10.0))
     assert value(cost) == pytest.approx(2.0 * np.exp(-10.0 * 0.25), rel=1e-4)
-    (gradient,) = torch.autograd.grad(cost.sum(), here.displacement)
+    gradient = cost[1]["displacement"]
     assert (gradient[0, :, 0] > 0).all()  # a step down it goes back
     assert (gradient[0, :, 1] == 0).all()
     soft = obstacle_cost(here, obstacle, Weights(repulsion=0.0, avoidance=1.0, margin=0.25))
@@ -51,7 +51,7 @@ def test_obstacle_cost_meets_a_moving_obstacle_where_it_will_be() -> None:
     still = moves(np.zeros((horizon, 2)))
     coming, leaving = np.array([[0.5, 0, 0.1, -0.4, 0]]), np.array([[0.5, 0, 0.1, 0.4, 0]])
     weights = Weights(repulsion=1.0)
-    assert obstacle_cost(still, coming, weights) > 5 * obstacle_cost(still, leaving, weights)
+    assert value(obstacle_cost(still, coming, weights)) > 5 * value(obstacle_cost(still, leaving, weights))
     at_end = 0.5 - 0.4 * DT * horizon
     alone = obstacle_cost(moves(np.zeros((1, 2))), np.array([[at_end + 0.4 * DT, 0, 0.1, -0.4, 0]]), weights)
     assert value(alone) == pytest.approx(np.exp(-15 * (at_end - 0.1)), rel=1e-4)
@@ -65,9 +65,9 @@ def test_a_body_has_a_width_across_its_heading_and_is_thin_along_it() -> None:
     assert value(obstacle_cost(here, beside, weights)) == pytest.approx(np.exp(-10 * 0.08), rel=1e-3)
     assert value(obstacle_cost(turned, ahead, weights)) == pytest.approx(np.exp(-10 * 0.08), rel=1e-3)
     slanting = moves(np.zeros((2, 2)), yaw=0.3)
-    slanting.yaw.requires_grad_()
-    (gradient,) = torch.autograd.grad(obstacle_cost(slanting, beside, weights).sum(), slanting.yaw)
-    assert (gradient < 0).all()  # turned further, its side is further from what stands beside it
+    assert (
+        obstacle_cost(slanting, beside, weights)[1]["yaw"] < 0
+    ).all()  # turned further, its side is further from what stands beside it
     with pytest.raises(ValueError, match=r"depth: 0.2 must not be more than width \(0.1\)"):
         Weights(width=0.1, depth=0.2)
 
@@ -110,17 +110,16 @@ def pull(distance: float, weights: Weights, bearing: float = 1.0) -> tuple[float
     """The cost of a goal in sight, and the size of its gradient on the place."""
     here = moves(np.zeros((1, 2)))
     cost = goal_cost(here, distance * np.array([np.cos(bearing), np.sin(bearing)]), weights)
-    (gradient,) = torch.autograd.grad(cost.sum(), here.displacement)
-    return value(cost), float(gradient.norm())
+    return value(cost), float(np.linalg.norm(cost[1]["displacement"]))
 
 
 def test_each_robot_of_a_batch_may_have_a_goal_of_its_own() -> None:
     goals, weights = np.array([[1.0, 0.0], [0.0, 2.0]]), Weights(goal=2.0, facing=3.0)
     for ticks in (2, 3):  # as many as robots, or more
         one = moves(np.zeros((ticks, 2)))
-        two = replace(one, **{name: torch.cat([getattr(one, name)] * 2) for name in ("displacement", "yaw")})
+        two = replace(one, **{name: np.concatenate([getattr(one, name)] * 2) for name in ("displacement", "yaw")})
         alone = [value(goal_cost(one, goal, weights)) for goal in goals]
-        np.testing.assert_allclose(goal_cost(two, goals, weights).detach().numpy(), alone, rtol=1e-6)
+        np.testing.assert_allclose(goal_cost(two, goals, weights)[0], alone, rtol=1e-6)
 
 
 def test_facing_a_near_goal_does_not_outweigh_being_there() -> None:
@@ -152,23 +151,39 @@ def test_costs_take_the_times_of_the_states_that_they_are_given() -> None:
         Instruction(np.zeros(3), path=path),
     ):
         weights = Weights(goal=1.0, repulsion=1.0, sharpness=3.0)
-        assert value(total_cost(sparse, asked, weights)) == pytest.approx(
-            value(total_cost(dense, asked, weights)), rel=0.1
+        assert value(TotalCost(weights)(sparse, asked)) == pytest.approx(
+            value(TotalCost(weights)(dense, asked)), rel=0.1
         )
-    np.testing.assert_allclose(dense.mean(dense.velocity, -2).numpy(), [[0.3, 0.0]])
-    np.testing.assert_allclose(sparse.mean(sparse.velocity, -2).numpy(), [[0.3, 0.0]])
+    np.testing.assert_allclose(dense.mean(dense.velocity, -2), [[0.3, 0.0]])
+    np.testing.assert_allclose(sparse.mean(sparse.velocity, -2), [[0.3, 0.0]])
 
 
 def test_a_robot_that_shall_stand_is_guided_to_stand_whatever_the_task_wants() -> None:
     weights = replace(Weights(), velocity=0, yaw_rate=0, displacement=0, yaw=0, stand=0, goal=1.0)
     walking = moves(np.stack([0.1 * np.arange(5), np.zeros(5)], axis=-1), velocity=(0.3, 0.0))
     standing = moves(np.zeros((5, 2)))
-    cost = Stopping(partial(total_cost, weights=weights))
+    cost = Stopping(TotalCost(weights))
     asked = Instruction(np.zeros(3), goal=np.array([1.0, 0.0]))
     assert cost(walking, asked) < cost(standing, asked)
     asked = replace(asked, stand=True)
     assert cost(walking, asked) > cost(standing, asked)
     assert pickle.loads(pickle.dumps(cost))(walking, asked) == cost(walking, asked)
+
+
+def test_who_runs_may_slow_down_over_the_first_quarter_of_what_is_planned() -> None:
+    """A robot that shall stand at once falls on its face."""
+    ticks = np.array([1, 2, 4, 8, 16, 24, 32])
+    speeds = np.array([0.4, 0.4, 0.3, 0.1, 0.0, 0.0, 0.0])
+    braking = moves(np.zeros((7, 2)), ticks=ticks)
+    braking.velocity[..., 0] = speeds
+    asked = Instruction(np.zeros(3), stand=True)
+    cost = Stopping(TotalCost(NOTHING))
+    assert cost(braking, asked) == 0.0
+    running = moves(np.zeros((7, 2)), velocity=(0.4, 0.0), ticks=ticks)
+    value_, slope = cost.slope(running, asked)
+    assert value_.item() == pytest.approx(10.0 * 0.4**2)
+    assert (slope["velocity"][0, 4:, 0] > 0.0).all()
+    assert not slope["velocity"][0, :4].any()
 
 
 def test_a_waypoint_costs_the_square_of_its_distance() -> None:
@@ -194,10 +209,8 @@ def test_ground_cost_has_a_term_each_for_speed_direction_and_facing() -> None:
 
 def test_at_rest_the_ground_cost_pulls_toward_what_is_asked() -> None:
     rest = moves(np.zeros((5, 2)))
-    rest.velocity.requires_grad_()
     cost = ground_cost(rest, np.array([0.2, 0.0]), Weights(speed=1.0, steering=0.05, heading=0.1))
-    (gradient,) = torch.autograd.grad(cost.sum(), rest.velocity)
-    assert (gradient[..., 0] < 0).all()
+    assert (cost[1]["velocity"][..., 0] < 0).all()
 
 
 def test_path_cost_compares_tick_by_tick_as_far_as_both_go() -> None:
@@ -217,13 +230,12 @@ def test_weights_choose_the_terms_and_zero_leaves_the_planner_to_itself() -> Non
         path=np.ones((5, 2)),
         obstacles=np.ones((2, 5)),
     )
-    nothing = Weights(velocity=0, yaw_rate=0, displacement=0, yaw=0, stand=0, path=0, repulsion=0)
-    assert value(total_cost(trajectory, instruction, nothing)) == 0.0
+    assert value(TotalCost(NOTHING)(trajectory, instruction)) == 0.0
     for name in (
         "velocity", "displacement", "speed", "steering", "heading", "goal", "waypoint", "path", "repulsion",
         "avoidance",
     ):  # fmt: skip
-        assert value(total_cost(trajectory, instruction, replace(nothing, **{name: 1.0}))) > 1e-6, name
+        assert value(TotalCost(replace(NOTHING, **{name: 1.0}))(trajectory, instruction)) > 1e-6, name
     assert (
         load_settings("survive").cost
         == load_settings("text").cost
@@ -265,3 +277,91 @@ def test_a_task_whose_cost_is_zero_leaves_a_planner_without_guidance(
     task: str, settings: dict[str, str], guides: bool
 ) -> None:
     assert (load_task(task, settings).objective is not None) == guides
+
+
+EVERYTHING = Instruction(
+    velocity=np.array([0.2, 0.05, 0.3]),
+    ground=np.array([0.2, 0.1]),
+    goal=np.array([0.5, 0.2]),
+    path=0.02 * np.arange(60).reshape(30, 2),
+    obstacles=np.array([[0.3, 0.05, 0.05, -0.1, 0.0], [0.1, -0.3, 0.1, 0.0, 0.2]]),
+    distances=DistanceMap(np.array([-0.4, -0.3]), 0.4, 0.11, np.random.default_rng(5).uniform(0.5, 1.5, (8, 9))),
+    targets={"right hand": np.array([0.2, -0.1, 0.2]), "heading": np.zeros(())},
+    bars=np.array([[0.1, 0.0, 1.4, 0.5, 0.3]]),
+)
+
+
+@pytest.mark.parametrize(
+    "weights",
+    [
+        {"velocity": 1.0, "yaw_rate": 0.4, "displacement": 2.0, "yaw": 0.7},
+        {"speed": 1.0, "steering": 0.5, "heading": 0.3},
+        {"goal": 1.0, "facing": 0.6, "waypoint": 0.4},
+        {"way": 1.0},
+        {"path": 3.0},
+        {"repulsion": 1.0, "sharpness": 6.0},
+        {"repulsion": 1.0, "sharpness": 6.0, "avoidance": 0.5, "width": 0.17, "depth": 0.06},
+        {"repulsion": 1.0, "sharpness": 6.0, "width": 0.17, "depth": 0.06, "safe": 0.4},
+        {"reach": 2.0},
+        {"bar": 50.0},
+    ],
+    ids=lambda weights: "-".join(weights),
+)
+def test_a_slope_is_how_the_cost_changes_with_each_number_of_the_trajectory(weights: dict[str, float]) -> None:
+    """Guidance goes by the slope alone: a wrong one would pull a robot aside, and no cost would say so."""
+    rng, horizon = np.random.default_rng(1), 6
+    walk = Trajectory(
+        displacement=rng.uniform(-0.15, 0.25, (2, horizon, 2)),
+        yaw=rng.uniform(-1.0, 1.0, (2, horizon)),
+        velocity=rng.normal(0.0, 0.2, (2, horizon, 2)),
+        yaw_rate=rng.normal(0.0, 0.3, (2, horizon)),
+        height=rng.uniform(0.2, 0.3, (2, horizon)),
+        gravity=np.array([0.1, -0.05, -0.99]) + rng.normal(0.0, 0.03, (2, horizon, 3)),
+        joints=rng.normal(0.0, 0.3, (2, horizon, 20)),
+        ticks=np.array([1, 2, 4, 8, 16, 28]),
+        dt=DT,
+    )
+    cost = TotalCost(replace(NOTHING, **weights), BUILD)
+    before, slope = cost.slope(walk, EVERYTHING)
+    assert (before > 1e-3).all()
+    lean = {"gravity"} if "reach" in weights else set()  # nobody shall lean over to reach
+    for name in set(Trajectory.FIELDS) - lean:
+        values = getattr(walk, name)
+        for index in rng.integers(0, values.shape, (25, values.ndim)):
+            nudged = values.copy()
+            nudged[tuple(index)] += 1e-5
+            change = (cost(replace(walk, **{name: nudged}), EVERYTHING) - before) / 1e-5
+            told = slope.get(name, np.zeros_like(values))[tuple(index)]
+            assert change[index[0]] == pytest.approx(told, abs=2e-4 * (1.0 + abs(told))), (name, index)
+            assert change[1 - index[0]] == 0.0  # trajectories of a batch are apart
+
+
+def test_a_cost_written_with_torch_has_the_slope_that_torch_finds() -> None:
+    def cost(trajectory: Trajectory, instruction: Instruction) -> torch.Tensor:
+        return trajectory.mean((trajectory.displacement**2).sum(-1)) + trajectory.yaw.cos().sum(-1)
+
+    walk = moves(0.1 * np.arange(8).reshape(4, 2), yaw=0.5)
+    value_, slope = sloped(cost).slope(walk, Instruction(np.zeros(3)))
+    assert value_.shape == (1,)
+    np.testing.assert_allclose(slope["displacement"], 2.0 * walk.displacement / 4)
+    np.testing.assert_allclose(slope["yaw"], -np.sin(0.5))
+    assert "joints" not in slope
+    assert sloped(Stopping(cost)) is not None
+
+
+def test_the_gradient_on_tokens_is_that_of_the_cost_of_tokens() -> None:
+    """From a trajectory back to what the network predicts: headings are a cosine and a sine there."""
+    rng = np.random.default_rng(2)
+    tokens = rng.normal(0.0, 0.4, (1, 3, token_layout(20).size))
+    cost = TotalCost(replace(NOTHING, goal=1.0, facing=0.5, velocity=1.0, yaw_rate=0.2, yaw=0.3, reach=1.0), BUILD)
+
+    def of(tokens: Array) -> tuple[Array, Slope]:
+        return cost.slope(Trajectory.of(tokens, 20, DT), EVERYTHING)
+
+    before, slope = of(tokens)
+    gradient = by_tokens(slope, tokens, 20)
+    leaning = range(*token_layout(20).slice("gravity").indices(100))
+    for feature in set(range(tokens.shape[-1])) - set(leaning):
+        nudged = tokens.copy()
+        nudged[0, 1, feature] += 1e-6
+        assert (of(nudged)[0] - before).item() / 1e-6 == pytest.approx(gradient[0, 1, feature], abs=1e-4), feature

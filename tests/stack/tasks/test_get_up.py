@@ -25,7 +25,7 @@ def test_it_gets_up_from_how_it_lies(lying: str, backend: str) -> None:
     assert judged.row["success"]
     assert judged.row["falls"] == 1
     assert rose_in_time(judged.row)
-    assert 2.0 < judged.row["metrics"]["seconds_until_up"] < 9.0
+    assert 1.0 < judged.row["metrics"]["seconds_until_up"] < 9.0
     assert not judged.assignment.success(replace(judged.trace, fallen=True))
 
 

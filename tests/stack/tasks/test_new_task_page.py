@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from servoid.stack.tasks.terms.guidance import Weights
+from servoid.stack.tasks.terms.weights import Weights
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = (ROOT / "docs" / "new-task.md").read_text()

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from task_bodies import Drawn, moves, state
 
 from servoid.hw.config import ConfigError
@@ -347,8 +346,7 @@ def test_costs_can_be_sent_to_the_planner_with_gradients(name: str) -> None:
     now = state(0.1, 0.05, 0.3)
     instruction = task.instruct(0, now, task.percept(now))
     trajectory = moves(0.01 * np.arange(48).reshape(24, 2))
-    cost = pickle.loads(pickle.dumps(task.objective))(trajectory, instruction)
+    cost, slope = pickle.loads(pickle.dumps(task.objective)).slope(trajectory, instruction)
     assert cost.shape == (1,)
-    (gradient,) = torch.autograd.grad(cost.sum(), trajectory.displacement)
-    assert torch.isfinite(gradient).all()
-    assert (gradient != 0).any()
+    assert np.isfinite(slope["displacement"]).all()
+    assert (slope["displacement"] != 0).any()

@@ -384,6 +384,8 @@ def test_files_are_split_by_size_and_found_again(tmp_path: Path, monkeypatch: py
         ("--noise 1.3 0.5", "the lower one first"),
         ("--seconds 2", "at least 3 s"),
         ("--policy exprt", "no such checkpoint"),
+        ("--ray auto", "say in how many with --parts"),
+        ("--append --force", "drop one of them"),
     ],
 )
 def test_options_that_cannot_be(option: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,6 +14,7 @@ from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.recording import Recording, read_recording
 from servoid.policy.text.captions import MOTIONS
 from servoid.policy.text.encoder import code_size
+from servoid.policy.text.told import UNDER_WAY
 from servoid.stack.skills.skill import clip_of, load_skills
 from servoid.tools import cli
 from servoid.tools.learn.collect.told import images_of, skills_in, told_of
@@ -66,6 +67,9 @@ def test_windows_show_what_is_told_with_the_time_since_it_began(recording: Recor
     label, clock = told.label, told.clock
     assert (label[present] == label[present + 15]).all()  # none in which something else is told
     assert (clock[present + 15] >= clock[present]).all()
+    walks = told.label < len(MOTIONS)
+    assert clock[walks].min() == -UNDER_WAY
+    assert clock[walks].max() == 0.0
     codes = windows.captions.of(present, present < 0)
     assert codes.shape[1] == windows.captions.size == config.text_size
     waves = codes[:, -4:].square().sum(1)  # sines and cosines of two waves

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,8 +57,21 @@ def prior(synthetic_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     return write_prior(synthetic_dataset, tmp_path_factory.mktemp("prior"))
 
 
+def task_state(**known: Any) -> TaskState:
+    """Of a robot that stands, still, but for what is `known`."""
+    n = len(next(iter(known.values())))
+    at_rest = TaskState(
+        position=np.zeros((n, 2)), yaw=np.zeros(n), velocity=np.zeros((n, 2)),
+        height=np.full(n, ROBOT.standing_height), gravity=np.tile([0.0, 0.0, -1.0], (n, 1)),
+        angular_velocity=np.zeros((n, 3)), joints=np.tile(ROBOT.home, (n, 1)),
+        joint_velocity=np.zeros((n, len(ROBOT.joints))),
+    )  # fmt: skip
+    return replace(at_rest, **known)
+
+
 def made(prior: Path, task: str = "speed", settings: PolicyTraining = SETTINGS) -> TaskEnvironment:
-    return environment(task, load_prior(prior, ROBOT, limbs_of(ROBOT)), Style(), settings, settings.worlds, 0)
+    known = load_prior(prior, ROBOT, limbs_of(ROBOT))
+    return environment(load_learned_task(task, ROBOT), known, Style(), settings, settings.worlds, 0)
 
 
 @pytest.mark.slow
@@ -117,7 +131,7 @@ def test_generated_starts_move_and_stand_on_the_ground(prior: Path) -> None:
 
 def test_rewards_are_highest_for_what_is_asked() -> None:
     def state(position: tuple[float, float], yaw: float, velocity: tuple[float, float]) -> TaskState:
-        return TaskState(np.array([position]), np.array([yaw]), np.array([velocity]))
+        return task_state(position=np.array([position]), yaw=np.array([yaw]), velocity=np.array([velocity]))
 
     speed, steering, location = (LEARNED_TASKS[name](ROBOT) for name in ("speed", "steering", "location"))
     asked = np.array([[0.3]])
@@ -196,7 +210,7 @@ def test_a_discriminator_learns_along_and_rewards_frozen(prior: Path, synthetic_
     discriminator = Discriminator(known)
     adversary = Adversary(discriminator, PriorWindows(recordings, known.features, known.config), 0)
     rival = Rival(discriminator, adversary)
-    env = environment("speed", known, Style(), replace(SETTINGS, generated=0.0), 6, 0, rival)
+    env = environment(load_learned_task("speed", ROBOT), known, Style(), replace(SETTINGS, generated=0.0), 6, 0, rival)
     env.reset()
     for _ in range(6):
         env.step(np.ones((env.n, env.action_size)))
@@ -209,7 +223,7 @@ def test_a_discriminator_learns_along_and_rewards_frozen(prior: Path, synthetic_
     real = adversary._data.held_out(20)[0] * known.std + known.mean
     assert np.array_equal(frozen.reward(real), discriminator.reward(real))
     assert frozen.reward(real).mean() > frozen.reward(torch.cat(adversary._memory)).mean()
-    again = environment("speed", known, Style(), SETTINGS, 6, 0, Rival(frozen, None))
+    again = environment(load_learned_task("speed", ROBOT), known, Style(), SETTINGS, 6, 0, Rival(frozen, None))
     again.reset()
     again.step(np.zeros((6, again.action_size)))
     assert again.score.learn() == {}

@@ -8,35 +8,34 @@ With `--skills` the worlds also perform the skills of configs/skills that take n
 ticks, and go from any of them to any other and to walking, some in mid motion. Each tick says what was told, and how
 long a skill has lasted: what a model learns from that follows sentences about skills.
 
-The same options and the same seed make the same files.
+The same options and the same seed make the same files. With --parts the frames come from so many recordings, each with
+a seed of its own and done by itself: on the machines of a Ray cluster with --ray. Those that are done wait beside the
+dataset, and after an interruption the same command goes on. --append adds what another seed records to a dataset.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import math
 import time
-from collections.abc import Mapping
-from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
 from servoid.tools.common import exit_codes
+from servoid.tools.common.cluster import add_ray_argument, workplace
 from servoid.tools.common.folder_lock import locked
 from servoid.tools.common.output import add_json_argument, reporting
 from servoid.tools.common.parser import positive
+from servoid.tools.common.worker_pool import each
 
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
-    from servoid.tools.learn.collect.disturbances import DisturbanceSettings
-    from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
+    from servoid.tools.learn.collect.parts import FleetRecipe, Part, RecordingTally
     from servoid.tools.learn.collect.performances import Performances
+    from servoid.tools.learn.dataset.lerobot import DatasetWriter
     from servoid.tools.learn.dataset.schema import Feature
-
-LICENCE = "Apache-2.0"
-MIRRORING = "applied when read (servoid.policy.diffusion.dataset): each window also serves with left and right swapped"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,7 +82,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--threads", type=int, default=0, metavar="N", help="threads of the simulation (default: all cores)"
     )
+    parser.add_argument(
+        "--parts", type=int, default=1, metavar="N", help="recordings that make up the dataset (default: 1)"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=0, metavar="N", help="parts at once (default: 1, or the cores of a cluster)"
+    )
+    add_ray_argument(parser)
     parser.add_argument("--force", action="store_true", help="replace an existing dataset")
+    parser.add_argument("--append", action="store_true", help="add to an existing dataset")
     add_json_argument(parser)
 
 
@@ -104,7 +111,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    for name in ("frames", "worlds"):
+    for name in ("frames", "worlds", "parts"):
         if getattr(args, name) < 1:
             raise ConfigError(f"--{name} must be at least 1, not {getattr(args, name)}")
     if not 0.0 <= args.randomise <= 1.0:
@@ -113,76 +120,116 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(f"--noise {args.noise[0]:g} {args.noise[1]:g}: must not be negative, the lower one first")
     if args.skills and args.policy == "gait":
         raise ConfigError("--skills goes with --policy expert or a tracker: the gait cannot walk on from a skill")
+    if args.workers < 0:
+        raise ConfigError(f"--workers must not be negative, not {args.workers}")
+    if args.ray is not None and args.parts < 2:
+        raise ConfigError("--ray: one part has nothing to be spread: say in how many with --parts")
+    if args.append and args.force:
+        raise ConfigError("--append keeps what --force would replace: drop one of them")
     if args.seed < 0:
         raise ConfigError(f"--seed must not be negative, not {args.seed}")
 
 
 def collect(args: argparse.Namespace) -> dict[str, Any]:
     """Record a dataset into `args.out`; returns what `--json` prints. Raises ConfigError."""
-    from tqdm import tqdm
-
-    from servoid.hw.contracts.control import Policy
     from servoid.hw.robot.description import load_robot
-    from servoid.policy.checkpoint import resolve
-    from servoid.stack.control.fleet import Fleet
-    from servoid.stack.control.gait import GaitPolicy
-    from servoid.stack.control.tracker import ExpertPolicy
-    from servoid.stack.estimation.odometry import load_odometry
-    from servoid.stack.skills.skill import load_skills
-    from servoid.tools.learn.collect.disturbances import DisturbanceSettings
-    from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
-    from servoid.tools.learn.collect.performances import Performances
+    from servoid.tools.learn.collect.parts import FleetRecipe, RecordingTally
+    from servoid.tools.learn.collect.provenance import SOURCES, earlier, provenance
     from servoid.tools.learn.collect.skills import SKILLS
     from servoid.tools.learn.dataset.lerobot import DatasetWriter
     from servoid.tools.learn.dataset.schema import Schema
 
     begin = time.perf_counter()
     robot = load_robot(args.robot)
-    shape = (args.worlds,)
-    policy: Policy
-    performances = None
-    if args.skills:
-        skills = {name: skill for name, skill in load_skills(robot).items() if skill.alone}
-        policy = performances = Performances(robot, skills, args.worlds, expert=args.policy, tracker=args.tracker)
-    else:
-        policy = GaitPolicy(robot, shape) if args.policy == "gait" else ExpertPolicy(robot, args.policy, shape)
-    odometry = None if args.plain_odometry else load_odometry(robot)
-    sources = {
-        "policy": {"name": "gait"} if args.policy == "gait" else _source(resolve(args.policy, robot)),
-        "odometry": {"name": "legs"} if odometry is None else _source(resolve("odometry", robot)),
-    }
-    if performances is not None:
-        sources["tracker"] = _source(resolve(args.tracker, robot))
-    settings = DisturbanceSettings(scale=(args.noise[0], args.noise[1]))
+    how = FleetRecipe(
+        robot=args.robot,
+        policy=args.policy,
+        tracker=args.tracker,
+        skills=args.skills,
+        worlds=args.worlds,
+        seconds=args.seconds,
+        randomise=args.randomise,
+        noise=(args.noise[0], args.noise[1]),
+        plain_odometry=args.plain_odometry,
+        threads=args.threads or (1 if args.workers > 1 or args.ray is not None else 0),
+    )
+    performances, tally = how.performances(1), RecordingTally()
     texts = tuple(skill.text for skill in SKILLS) if performances is None else performances.texts
     schema = Schema(robot.name, robot.rate, _features(robot, performances), texts)
-    with locked(args.out), DatasetWriter(args.out, schema, args.force) as writer:
-        fleet = Fleet(robot, args.worlds, odometry, randomise=args.randomise, seed=args.seed, threads=args.threads)
-        cutter = EpisodeCutter(fleet, policy, settings, args.seconds, performances)
-        with tqdm(total=args.frames, desc="walking", unit="frame", mininterval=1.0) as bar:
-
-            def progress(total: int) -> None:
-                bar.update(min(total, args.frames) - bar.n)
-                bar.set_postfix_str(f"{cutter.fell} of {cutter.begun} fell", refresh=False)
-
-            for episode in cutter.episodes(args.frames, progress):
-                writer.add(episode.columns, episode.skill)
+    with locked(args.out), DatasetWriter(args.out, schema, args.force, args.append) as writer:
+        before = earlier(args, how)
+        episodes, frames = writer.episodes, writer.frames
+        if args.parts == 1:
+            _record_one(args, how, writer, tally)
+        else:
+            _record_parts(args, how, writer, tally)
         result = {
-            "episodes": writer.episodes,
-            "frames": writer.frames,
-            "begun": cutter.begun,
-            "fell": cutter.fell,
-            "fell_share": round(cutter.fell / cutter.begun, 4),
-            "walked_minutes": round(cutter.walked * robot.dt / 60, 2),
+            "episodes": writer.episodes - episodes,
+            "frames": writer.frames - frames,
+            "begun": tally.begun,
+            "fell": tally.fell,
+            "fell_share": round(tally.fell / tally.begun, 4),
+            "walked_minutes": round(tally.walked * robot.dt / 60, 2),
         }
-        writer.finish({"servoid.yaml": _provenance(args, robot, cutter, settings, sources, result)})
+        writer.finish({SOURCES: provenance(args, robot, how, result, before)})
     return result | {"out": str(args.out), "seconds": round(time.perf_counter() - begin, 1)}
+
+
+def _record_one(args: argparse.Namespace, how: FleetRecipe, writer: DatasetWriter, tally: RecordingTally) -> None:
+    from tqdm import tqdm
+
+    from servoid.tools.learn.collect.parts import Part, recorded
+
+    with tqdm(total=args.frames, desc="walking", unit="frame", mininterval=1.0) as bar:
+
+        def progress(total: int, walked: RecordingTally) -> None:
+            bar.update(min(total, args.frames) - bar.n)
+            bar.set_postfix_str(f"{walked.fell} of {walked.begun} fell", refresh=False)
+
+        for episode in recorded(Part(0, args.seed, args.frames, how), tally, progress):
+            writer.add(episode.columns, episode.skill)
+
+
+def _record_parts(args: argparse.Namespace, how: FleetRecipe, writer: DatasetWriter, tally: RecordingTally) -> None:
+    """On processes or machines, each part kept as it is done; then all of them, in order."""
+    from tqdm import tqdm
+
+    from servoid.tools.learn.collect.parts import KeptParts, record, what_records
+
+    parts = _parts(args, how)
+    made_of = {**what_records(how), "options": [args.seed, args.frames, args.parts, repr(how)]}
+    kept = KeptParts(args.out, made_of)
+    lacking = [part for part in parts if not kept.has(part.number)]
+    if lacking:
+        with (
+            workplace(args.ray, partial(what_records, how), tqdm.write) as place,
+            tqdm(total=args.parts, initial=args.parts - len(lacking), desc="recording", unit="part") as bar,
+        ):
+            workers = args.workers or (1 if place.here else place.size)
+            for done in each(record, lacking, min(workers, len(lacking)), place=place):
+                kept.add(done)
+                bar.update()
+    for part in parts:
+        found = kept.get(part.number)
+        tally.add(found.tally.begun, found.tally.fell, found.tally.walked)
+        for episode in found.episodes:
+            writer.add(episode.columns, episode.skill)
+    kept.remove()
+
+
+def _parts(args: argparse.Namespace, how: FleetRecipe) -> list[Part]:
+    from servoid.hw.seeds import episode_seed
+    from servoid.tools.learn.collect.parts import Part
+
+    frames = math.ceil(args.frames / args.parts)
+    return [Part(number, episode_seed(args.seed, number), frames, how) for number in range(args.parts)]
 
 
 def _features(robot: Robot, performances: Performances | None = None) -> dict[str, Feature]:
     """The dataset's columns and the names of their numbers."""
     from servoid.policy.features import recorded_names
     from servoid.policy.recording import CLOCK, SKILLS_NOTE
+    from servoid.tools.learn.collect.provenance import MIRRORING
     from servoid.tools.learn.dataset.schema import Feature
 
     notes = {
@@ -199,56 +246,3 @@ def _features(robot: Robot, performances: Performances | None = None) -> dict[st
         }
         found[CLOCK] = Feature(("seconds",), about)
     return found
-
-
-def _source(path: Path) -> dict[str, str]:
-    from servoid.policy.checkpoint import read_header
-
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return {"name": path.stem, "sha256": digest, "git_commit": str(read_header(path)["git_commit"])}
-
-
-def _provenance(
-    args: argparse.Namespace,
-    robot: Robot,
-    cutter: EpisodeCutter,
-    settings: DisturbanceSettings,
-    sources: Mapping[str, Any],
-    result: Mapping[str, Any],
-) -> str:
-    """meta/servoid.yaml: all that is needed to record the dataset again."""
-    import mujoco
-    import numpy as np
-    import yaml
-
-    from servoid.policy.checkpoint import git_commit
-    from servoid.tools.learn.collect.episode_cutter import FALL_SECONDS, SHORTEST_SECONDS
-    from servoid.tools.learn.collect.skills import skills_of
-
-    def plain(values: Mapping[str, Any]) -> dict[str, Any]:
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
-
-    skills = skills_of(robot)
-    options = {
-        name: getattr(args, name) for name in ("frames", "worlds", "seconds", "randomise", "plain_odometry", "skills")
-    }
-    content = {
-        "licence": LICENCE,
-        "git_commit": git_commit(),
-        "versions": {"mujoco": mujoco.__version__, "numpy": np.__version__},
-        "robot": robot.name,
-        "seed": args.seed,
-        "options": options,
-        **sources,
-        "mirroring": MIRRORING,
-        "episodes": {"ticks": cutter.ticks, "dropped_before_fall": FALL_SECONDS, "shortest": SHORTEST_SECONDS},
-        "commands": {
-            "segment_seconds": {skill.name: list(skill.seconds) for skill in skills},
-            "skills": [
-                {"name": s.name, "weight": s.weight, "boxes": [plain(asdict(box)) for box in s.boxes]} for s in skills
-            ],
-        },
-        "disturbances": plain(asdict(settings)),
-        "result": dict(result),
-    }
-    return yaml.safe_dump(content, sort_keys=False)

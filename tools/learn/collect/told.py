@@ -11,7 +11,7 @@ from servoid.hw.robot.description import Robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.recording import Recording
 from servoid.policy.text.captions import MOTIONS
-from servoid.policy.text.told import Told
+from servoid.policy.text.told import Told, walk_clock
 from servoid.stack.skills.skill import Skill, chosen, clip_of, load_skills
 
 MIRRORED = 0.05  # rad, root mean square, up to which one clip counts as the mirror image of another
@@ -29,9 +29,18 @@ def told_of(recording: Recording, robot: Robot, skills: Mapping[str, Skill]) -> 
         return None
     walks = Told.walks(recording.command, robot.walking.scale)
     phrasings = (*walks.phrasings, *(skill.phrases for skill in skills.values()))
+    first = np.maximum.accumulate(np.where(_begun(recording), np.arange(len(recording.told)), 0))
+    since = (np.arange(len(recording.told)) - first) * robot.dt
+    clock = np.where(recording.told < len(MOTIONS), walk_clock(since), recording.clock)
     images = images_of({name: clip_of(skill, robot).joints for name, skill in skills.items()}, robot)
     images = np.where(images >= 0, len(MOTIONS) + images, -1)
-    return Told(recording.told, recording.clock, phrasings, np.concatenate([walks.mirrored, images]))
+    return Told(recording.told, clock, phrasings, np.concatenate([walks.mirrored, images]))
+
+
+def _begun(recording: Recording) -> Array:
+    """Rows `(rows,)` bool at which something else is told than before."""
+    assert recording.told is not None
+    return np.r_[True, (np.diff(recording.told) != 0) | (np.diff(recording.episode) != 0)]
 
 
 def images_of(motions: Mapping[str, Array], robot: Robot) -> Array:

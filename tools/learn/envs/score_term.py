@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from servoid.policy.priors.adversarial.discriminator import Adversary, Discriminator
     from servoid.policy.priors.score_matching.model import Prior, Style
 
+SMALLEST_REACH, LARGEST_REACH = 0.05, 0.5  # rad of joint target for an action of one
+_REACH = 2.0  # deviations of the data: exploration goes where the data goes
 _SMOOTHING = 0.2  # of a decision's error in its running average by world
 
 
@@ -34,7 +36,45 @@ class Rival:
     adversary: Adversary | None
 
 
-class ScoreTerm(StatefulTerm[State]):
+class Manner(StatefulTerm[State]):
+    """How a policy moves, and how often it decides. This one judges nothing: without a prior all is as it should be."""
+
+    def __init__(self, n: int, stride: int, reach: Array) -> None:
+        """`stride`: ticks between decisions; `reach` `(n_joints,)`: rad of joint target for an action of one."""
+        self.stride, self.reach = stride, reach
+        self.prior: Prior | None = None
+        self.ratio = np.ones(n)  # of the error to that of held-out data, running average by world
+
+    @property
+    def measures(self) -> Mapping[str, float]:
+        """What is logged of it."""
+        return {}
+
+    def reset(self, where: Array) -> None:
+        """New episodes in the worlds `where` `(n,)` bool."""
+
+    def fill(self, where: Array, windows: Array) -> None:
+        """They begin at the ends of `windows`."""
+
+    def anneal(self, progress: float) -> None:
+        """Judge as at `progress` of a training, 0 to 1."""
+
+    def learn(self) -> Mapping[str, float]:
+        """Once an update of the policy; returns what is logged."""
+        return {}
+
+    def state(self) -> dict[str, Any]:
+        """What a training that goes on needs: plain numbers."""
+        return {}
+
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Inverse of `state`."""
+
+    def __call__(self, step: State) -> Array:
+        return np.ones(len(self.ratio))
+
+
+class ScoreTerm(Manner):
     """How like its data a prior finds the last frames of `n` worlds, by the estimate: 0 to 1.
 
     Called once a frame of the prior.
@@ -44,7 +84,10 @@ class ScoreTerm(StatefulTerm[State]):
         """Raises ConfigError for a style that the prior has not."""
         from servoid.policy.priors.score_matching.score import RunningMean, Score
 
-        self.prior, self._settings = prior, settings
+        deviation = prior.joint_deviation
+        super().__init__(n, prior.config.stride, np.clip(_REACH * deviation, SMALLEST_REACH, LARGEST_REACH))
+        self.prior: Prior = prior
+        self._settings = settings
         self._score = Score(prior, style, seed, settings.random_level)
         self._running = RunningMean(self._score.count)
         self.data_error = np.array([float(prior.header["results"]["error"])] * self._score.count)
@@ -56,7 +99,11 @@ class ScoreTerm(StatefulTerm[State]):
         self._yaw = np.zeros((n, config.frames))
         self._fresh = np.ones(n, bool)
         self.sharpness = settings.sharpness[0]
-        self.ratio = np.ones(n)  # of the error to that of held-out data, running average by world
+
+    @property
+    def measures(self) -> Mapping[str, float]:
+        """The prior's error in multiples of held-out data's, now."""
+        return {"prior_ratio": float(self.ratio.mean())}
 
     def reset(self, where: Array) -> None:
         """The first frame of the worlds `where` is taken to have lasted, unless `fill` says otherwise."""
@@ -94,10 +141,6 @@ class ScoreTerm(StatefulTerm[State]):
 
         scale = self._running(errors) if self._settings.scale == "running" else self.data_error
         return likeness(errors, scale, self.sharpness)
-
-    def learn(self) -> dict[str, float]:
-        """Once an update of the policy; returns what is logged. A frozen prior learns nothing."""
-        return {}
 
     def _windows(self, state: State) -> Tensor:
         """The windows `(n, frames, size)` that end in `state`, which they take in."""

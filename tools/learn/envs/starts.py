@@ -18,6 +18,9 @@ from servoid.sim.worlds import Worlds
 from servoid.stack.control.fleet import Fleet
 
 _SETTLE_SECONDS = 2.0
+_FALL_SECONDS = 1.2
+_BALANCING = 10  # ticks for which one that is pushed still holds its pose, as before a fall is known
+_TIPPED = 0.7  # rad from where it counts as falling
 _EVERY = 5  # ticks between states that are kept of a rollout
 _DEVIATION = 0.5  # squared error of gravity, seen from the base, that a rollout may have come to
 _HEIGHT_DEVIATION = 0.3  # of the standing height, likewise
@@ -118,3 +121,20 @@ def along(robot: Robot, clips: Sequence[Clip], each: int, seed: int) -> States:
         good &= ~((off | low) & running)
         reference.advance()
     return States.joined([states.only(good[rows]) for rows, states in kept])
+
+
+def falling(robot: Robot, n: int, seed: int) -> States:
+    """States of `n` nominal robots that stand, are pushed over from any side, and brake as they fall and lie."""
+    rng = np.random.default_rng([seed, n, 1])
+    worlds = Worlds(robot, n)
+    ids = np.arange(n)
+    worlds.reset(ids, [np.random.default_rng([seed, i, 1]) for i in range(n)], Start())
+    angle, size = rng.uniform(-np.pi, np.pi, n), rng.uniform(0.8, 1.6, n)
+    worlds.push(size[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1))
+    pose, gain = np.tile(robot.home, (n, 1)), np.ones((n, len(robot.joints)))
+    kept = []
+    for tick in range(round(_FALL_SECONDS * robot.rate)):
+        worlds.step(Command(pose, gain if tick < _BALANCING else 0.0 * gain, Mode.ACTIVE))
+        rows = np.flatnonzero(worlds.truth.tilt > _TIPPED) if tick % _EVERY == 0 else ids[:0]
+        kept.append(States.of(worlds.truth, rows, np.full(len(rows), -1), 0.0))
+    return States.joined(kept)

@@ -25,6 +25,7 @@ class Walks:
     ratio: Array  # (decisions, n) the prior's error in multiples of held-out data's
     joints: Array  # (decisions, n, n_joints) rad, the truth
     velocity: Array  # (decisions, n, 2) m/s over the ground
+    achieved: Array  # (decisions, n) whether the task was
 
 
 def walk(env: TaskEnvironment, actor: Actor, asked: Array | None = None) -> Walks:
@@ -36,7 +37,7 @@ def walk(env: TaskEnvironment, actor: Actor, asked: Array | None = None) -> Walk
         if asked is not None:
             env.ask(asked)  # an episode that has just begun asks for what it draws
         _, done, late = env.step(actor(env.observations))
-        rows.append((env.task_reward * alive, alive, env.score.ratio, env.joints, env.ground))
+        rows.append((env.task_reward * alive, alive, env.score.ratio, env.joints, env.ground, env.achieved))
         alive = alive & ~(done & ~late)
     return Walks(*(np.stack(column) for column in zip(*rows, strict=True)))
 
@@ -49,17 +50,23 @@ def measure(env: TaskEnvironment, actor: Actor) -> dict[str, float]:
     """
     walks = walk(env, actor)
     settled = round(_SETTLED / env.dt)
-    later = walks.alive[settled:]
+    later, prior = walks.alive[settled:], env.score.prior
     results = {
         "return": float(walks.reward.mean()),
         "falls": float(1.0 - walks.alive[-1].mean()),
         "survival": float(walks.alive[-1].mean()),
-        "prior_error": float(walks.ratio[settled:][later].mean()) if later.any() else float("nan"),
+        "prior_error": float(walks.ratio[settled:][later].mean())
+        if prior is not None and later.any()
+        else float("nan"),
     }
+    if env.task.achievable:
+        first = np.argmax(walks.achieved, 0)[walks.achieved.any(0)]
+        results["achieved"] = float(walks.achieved.any(0).mean())
+        results["seconds"] = float(np.median(first + 1) * env.dt - env.task.hold) if len(first) else float("nan")
     manners = []
     for share in (0.4, 0.6, 0.8):
         asked = env.task.steady(share * env.robot.walking.forward)
-        if asked is None:
+        if asked is None or prior is None:
             break
         walks = walk(env, actor, asked)
         up = walks.alive[-1]
@@ -68,7 +75,7 @@ def measure(env: TaskEnvironment, actor: Actor) -> dict[str, float]:
         joints = np.moveaxis(walks.joints[settled:, up], 0, 1)
         speed = float(np.linalg.norm(walks.velocity[settled:, up].mean(0), axis=-1).mean())
         robot = replace(env.robot, rate=round(1.0 / env.dt))  # what is seen at decisions
-        manners.append(beside(env.score.prior.manner, robot, joints, speed))
+        manners.append(beside(prior.manner, robot, joints, speed))
     for name in ("amplitude", "amplitude_error", "cadence"):
         results[name] = float(np.mean([manner[name] for manner in manners])) if manners else float("nan")
     return results

@@ -168,7 +168,7 @@ class Tracking:
     def step(self, action: Array) -> tuple[Array, Array, Array]:
         """Act for a tick with residuals `(n, n_joints)`. Returns reward a tick, done and time-out `(n,)`."""
         frames, residual = self.frames, RESIDUAL * action * self.acting
-        self.fleet.step(frames.position[:, 0] + residual)
+        self.fleet.step(self.reference.led(frames.position[:, 0] + residual))
         for past, now in ((self._targets, self.fleet.applied), (self._residuals, residual)):
             past[1:] = past[:-1].copy()
             past[0] = now

@@ -42,6 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--init", type=Path, metavar="CHECKPOINT", help="start from this diffusion model, with its normalisation"
     )
     run.add_argument(
+        "--distil",
+        type=Path,
+        metavar="CHECKPOINT",
+        help="start from this diffusion model and learn to take in one step what it takes in two (docs/diffusion.md)",
+    )
+    run.add_argument(
         "--latent",
         type=Path,
         metavar="CHECKPOINT",
@@ -86,7 +92,9 @@ def main(args: argparse.Namespace) -> int:
     windows = Windows(recording, robot, config, told, settings.emphasis, settings.seed, latents)
     trainer = DiffusionTrainer(windows, robot, settings, args.out, source_of(args.data, recording), judge)
     trainer.skills = {name: skill.phrases for name, skill in skills.items()}
-    trainer.start(args.resume, args.init)
+    if args.distil is not None:
+        trainer.teach(args.distil)
+    trainer.start(args.resume, args.init or args.distil)
     trainer.run()
     return 0
 
@@ -161,6 +169,7 @@ class DiffusionTrainer(Trainer):
             shares = ("followed", "followed_walks", "followed_skills")
             self.columns, self.panels = (*self.columns[:-1], *shares), (*self.panels[:-1], shares)
         self.network = Denoiser(self.config)
+        self.teacher: Denoiser | None = None  # where there is one, its steps are learned
         self.average = Average(self.network, settings.average)
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), settings.learning_rate, betas=(0.9, 0.99), weight_decay=settings.weight_decay
@@ -192,6 +201,16 @@ class DiffusionTrainer(Trainer):
         if model.config == self.config:
             windows.states, windows.actions = model.states, model.actions
 
+    def teach(self, path: Path) -> None:
+        """Learn from a diffusion model instead of from the windows alone. Raises ConfigError where it is of another
+        shape."""
+        from servoid.policy.diffusion.model.checkpoint import load
+
+        model = load(path, self.robot)
+        if model.config != self.config:
+            raise ConfigError(f"{path}: --distil takes a model of the same shape: give the settings of its training")
+        self.teacher = model.denoiser
+
     @property
     def title(self) -> str:
         size = f"{self.network.parameter_count:,} parameters, {self.config.tokens} tokens"
@@ -205,6 +224,7 @@ class DiffusionTrainer(Trainer):
     def learn(self) -> dict[str, float]:
         import torch
 
+        from servoid.policy.diffusion.distillation import distilled_losses
         from servoid.policy.diffusion.objective import losses
 
         settings = self.settings
@@ -212,9 +232,14 @@ class DiffusionTrainer(Trainer):
         rate = settings.learning_rate * warm * (0.5 + 0.5 * math.cos(math.pi * self.share))
         for group in self.optimiser.param_groups:
             group["lr"] = rate
-        states, actions, text = self.windows.draw(settings.batch, self.generator)
+        window = self.windows.draw(settings.batch, self.generator)
+        given = self.signal, self.generator, settings
         with torch.autocast("cpu", torch.bfloat16, enabled=settings.precision == "bf16"):
-            parts = losses(self.network, states, actions, text, self.signal, self.generator, settings)
+            parts = (
+                losses(self.network, *window, *given)
+                if self.teacher is None
+                else distilled_losses(self.network, self.teacher, window, *given, settings.distil_steps)
+            )
         total = parts[0] + parts[1]
         if not torch.isfinite(total):
             raise ConfigError(f"the loss is not finite at step {self.step}: try a lower --learning-rate, or fp32")

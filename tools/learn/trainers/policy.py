@@ -1,8 +1,9 @@
-"""Train a policy for a task with PPO, under a motion prior that rewards what is like its data (SMP).
+"""Train a policy for a task with PPO, under a motion prior that rewards what is like its data (SMP), or without one.
 
---task is speed, steering, location, dodgeball, or your own FILE.py:Class. The policy sees the estimate and its goal;
-it decides joint targets around the home pose as often as its prior has frames. --rewards weighs the task, the prior
-(manner) and their product (both); the paper adds the first two. With --demonstrations it begins as a network that
+--task is speed, steering, location, dodgeball, get-up, or your own FILE.py:Class. The policy sees the estimate and its
+goal; it decides joint targets around the home pose as often as its prior has frames. --rewards weighs the task, the
+prior (manner) and their product (both); the paper adds the first two. With --prior none manner is 1 everywhere, and
+--decide-every and --reach say what the prior would. With --demonstrations it begins as a network that
 does what a dataset shows, instead of at random.
 
 Ctrl-C saves, and the same command continues. The newest network is policy.safetensors.
@@ -13,27 +14,34 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.policy import checkpoint
 from servoid.policy.mlp import Mlp
 from servoid.policy.priors.task_policy import KIND, save_task_policy
+from servoid.policy.rising.policy import KIND as RISING
+from servoid.policy.rising.policy import save_rising_policy
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
 from servoid.tools.learn.envs.task_judge import measure
+from servoid.tools.learn.envs.tasks import LearnedTask, load_learned_task
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.ppo import PpoTrainer
 from servoid.tools.learn.trainers.trainer import add_run_arguments
 
 if TYPE_CHECKING:
-    from servoid.hw.robot.description import Robot
     from servoid.policy.priors.score_matching.model import Prior, Style
     from servoid.tools.learn.envs.score_term import Rival
 
-_JUDGED = 32  # worlds
+_JUDGED, _JUDGED_STARTS = 32, 256  # worlds; states that they begin in, where a task has its own
+_LED_SHARE = 0.05  # of what initial weights give, where a lead knows a way already
+NO_PRIOR = "none"
+_LICENCE = "Apache-2.0"  # of what learns from nothing but its own experience
 _DISCRIMINATOR = "discriminator.safetensors"  # beside the policy
 
 
@@ -41,7 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid train policy`."""
     run = add_run_arguments(parser, PolicyTraining(), threads=1)  # the worlds use the cores
     run.add_argument("--task", required=True, metavar="NAME|FILE.py:CLASS", help="what is learned")
-    run.add_argument("--prior", required=True, metavar="NAME|FILE", help="motion prior (`servoid train prior`)")
+    run.add_argument(
+        "--prior",
+        required=True,
+        metavar="NAME|FILE|none",
+        help="motion prior (`servoid train prior`); none: without one",
+    )
     run.add_argument(
         "--style",
         metavar="NAME|UPPER+LOWER",
@@ -83,11 +96,16 @@ def main(args: argparse.Namespace) -> int:
     torch.set_num_threads(args.threads)
     torch.manual_seed(settings.seed)
     robot = load_robot(args.robot)
-    found = checkpoint.resolve(args.prior, robot)
-    prior = load_prior(found, robot, limbs_of(robot))
     style = Style.parse(args.style, args.style_weight)
-    rival = _rival(args, prior, settings)
-    env = environment(args.task, prior, style, settings, settings.worlds, settings.seed, rival)
+    found, prior, rival = None, None, None
+    if args.prior == NO_PRIOR:
+        _refuse_what_needs_a_prior(args)
+    else:
+        found = checkpoint.resolve(args.prior, robot)
+        prior = load_prior(found, robot, limbs_of(robot))
+        rival = _rival(args, prior, settings)
+    task = load_learned_task(args.task, robot)
+    env = environment(task, prior, style, settings, settings.worlds, settings.seed, rival)
     trainer = PolicyTrainer(env, style, settings, args.out, found)
     trainer.rival = rival
     trainer.start(args.resume, args.init)
@@ -99,6 +117,15 @@ def main(args: argparse.Namespace) -> int:
         return 0
     trainer.run()
     return 0
+
+
+def _refuse_what_needs_a_prior(args: argparse.Namespace) -> None:
+    given = {
+        "--style": args.style, "--adversarial": args.adversarial, "--discriminator": args.discriminator
+    }  # fmt: skip
+    for flag, value in given.items():
+        if value is not None:
+            raise ConfigError(f"{flag} needs a prior: name one with --prior, or leave {flag} out")
 
 
 def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> Rival | None:
@@ -123,25 +150,30 @@ def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> 
 
 
 def environment(
-    task: str,
-    prior: Prior,
+    task: LearnedTask,
+    prior: Prior | None,
     style: Style,
     settings: PolicyTraining,
     worlds: int,
     seed: int,
     rival: Rival | None = None,
 ) -> TaskEnvironment:
-    """Worlds of a task under a prior, or under a rival of it. Raises ConfigError."""
+    """Worlds of a task under a prior, under a rival of it, or without one. Raises ConfigError."""
     from servoid.stack.estimation.odometry import load_odometry
-    from servoid.tools.learn.envs.score_term import AdversarialTerm, GeneratedStarts, ScoreTerm
-    from servoid.tools.learn.envs.tasks import load_learned_task
+    from servoid.tools.learn.envs.down import Down
+    from servoid.tools.learn.envs.score_term import AdversarialTerm, GeneratedStarts, Manner, ScoreTerm
 
-    robot: Robot = prior.features.robot
-    made = load_learned_task(task, robot)
-    given = prior, style, worlds, settings, seed
-    score = ScoreTerm(*given) if rival is None else AdversarialTerm(*given, rival)
-    starts = GeneratedStarts(prior, style, settings, seed)
-    return TaskEnvironment(made, score, starts, load_odometry(robot), settings, worlds, seed)
+    robot = task.robot
+    score = Manner(worlds, settings.decide_every, np.full(len(robot.joints), settings.reach))
+    starts: GeneratedStarts | Down | None = None
+    if prior is not None:
+        given = prior, style, worlds, settings, seed
+        score = ScoreTerm(*given) if rival is None else AdversarialTerm(*given, rival)
+    if task.lies:
+        starts = Down(robot, settings.eased, settings.starts, seed)
+    elif prior is not None:
+        starts = GeneratedStarts(prior, style, settings, seed)
+    return TaskEnvironment(task, score, starts, load_odometry(robot), settings, worlds, seed)
 
 
 class PolicyTrainer(PpoTrainer):
@@ -152,29 +184,48 @@ class PolicyTrainer(PpoTrainer):
     settings: PolicyTraining
     rival: Rival | None = None
 
-    def __init__(self, env: TaskEnvironment, style: Style, settings: PolicyTraining, out: Path, prior: Path) -> None:
+    def __init__(
+        self, env: TaskEnvironment, style: Style, settings: PolicyTraining, out: Path, prior: Path | None
+    ) -> None:
+        """`prior` is the file of the one that `env` judges by, None without one."""
         from servoid.stack.log.provenance import sha256
 
-        digest = sha256(prior)
-        self._prior = {"name": prior.name, "sha256": digest}
+        digest = None if prior is None else sha256(prior)
+        self._prior = None if prior is None else {"name": prior.name, "sha256": digest}
         self._style = {"upper": style.upper, "lower": style.lower, "weight": style.weight}
         style_text = f" in style {style.upper}+{style.lower} x {style.weight:g}" if style.lower else ""
-        source = (
-            f"closed-loop experience of task {env.task.name} under prior {prior.name} {str(digest)[:12]}{style_text}"
-        )
+        self._under = "without a prior" if prior is None else f"under prior {prior.name}"
+        told = "" if prior is None else f" {str(digest)[:12]}{style_text}"
+        source = f"closed-loop experience of task {env.task.name} {self._under}{told}"
         super().__init__(env, settings, out, source)
         self.critic_alone = settings.critic_alone
-        nominal = replace(settings, randomised=0.0, generated=0.0, starts=1, unlike=0.0)
-        judged = environment(env.task.name, env.score.prior, style, nominal, _JUDGED, settings.seed + 1)
+        self._kind = KIND if env.down is None else RISING  # of its checkpoint: what gets up acts while no task does
+        if env.lead is not None:
+            self.begin_small(_LED_SHARE)
+        if env.task.lies:  # no fall ends them: they would all end at once
+            env.ticks[:] = np.random.default_rng(settings.seed).integers(0, env.limit, env.n)
+        nominal = replace(
+            settings,
+            randomised=0.0,
+            generated=0.0,
+            starts=min(settings.starts, _JUDGED_STARTS),
+            unlike=0.0,
+            hardest_push=0.0,
+            eased=(0.0, 0.0),
+        )
+        judged = environment(env.task, env.score.prior, style, nominal, _JUDGED, settings.seed + 1)
         self._judged = judged
         self.judge = lambda _: self.measured()
-        measured = ("return", "falls", "prior_error", "amplitude", "amplitude_error", "cadence")
+        measured = ("return", "falls", "achieved", "seconds", "prior_error", "amplitude", "amplitude_error", "cadence")
         self.columns = (*self.columns, *measured)
-        self.panels = (*self.panels, ("return", "falls"), ("prior_error",), ("amplitude", "cadence"))
+        ours = ("achieved", "seconds") if env.task.achievable else ("falls",)
+        manner = () if prior is None else (("prior_error",), ("amplitude", "cadence"))
+        self.panels = (*self.panels, ("return", *ours), *manner)
 
     def measured(self) -> dict[str, float]:
         """What the newest actor does, from standing, on the nominal robot: see `measure`."""
         actor = self.actor()
+        self._judged.schedule(self.env.progress)
         return measure(self._judged, lambda seen: actor(seen["actor"]))
 
     def learn(self) -> dict[str, float]:
@@ -184,14 +235,14 @@ class PolicyTrainer(PpoTrainer):
 
     @property
     def title(self) -> str:
-        return f"a policy for task {self.env.task.name} in {self.env.n} worlds under {self._prior['name']}"
+        return f"a policy for task {self.env.task.name} in {self.env.n} worlds {self._under}"
 
     @property
     def following(self) -> str:
         return f"servoid rollout {self.env.task.run} --policy {self.best_path} --episodes 50"
 
     def adopt(self, path: Path) -> None:
-        network, _ = Mlp.load(path, KIND, self.env.robot, self.env.observations["actor"].shape[1])
+        network, _ = Mlp.load(path, self._kind, self.env.robot, self.env.observations["actor"].shape[1])
         hidden = list(network.sizes[1:-1])
         if hidden != list(self.settings.hidden):
             raise checkpoint.CheckpointError(
@@ -201,8 +252,6 @@ class PolicyTrainer(PpoTrainer):
 
     def imitate(self, folder: Path) -> None:
         """Begin with a network that does what the dataset in `folder` shows. Raises DatasetError."""
-        import numpy as np
-
         from servoid.policy.recording import read_recording
         from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
         from servoid.tools.learn.trainers.trainer import source_of
@@ -232,16 +281,18 @@ class PolicyTrainer(PpoTrainer):
             "stride": env.stride,
             "reach": [round(float(x), 6) for x in env.reach],
             "prior": self._prior,
+            "lead": None if env.lead is None else asdict(env.lead.pace),
             "style": self._style,
         }
         about: dict[str, Any] = {
             "data": self.source,
-            "licence": env.score.prior.header["licence"],
+            "licence": _LICENCE if env.score.prior is None else env.score.prior.header["licence"],
             "results": results,
             "training": plain(self.settings),
         }
-        if self.rival is not None and self.rival.adversary is not None:
+        if env.score.prior is not None and self.rival is not None and self.rival.adversary is not None:
             from servoid.policy.priors.adversarial.discriminator import save_discriminator
 
             save_discriminator(path.with_name(_DISCRIMINATOR), self.rival.discriminator, env.score.prior, about)
-        save_task_policy(path, self.actor(), env.robot, config, about)
+        save = save_rising_policy if self._kind == RISING else save_task_policy
+        save(path, self.actor(), env.robot, config, about)

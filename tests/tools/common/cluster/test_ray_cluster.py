@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from servoid.hw.config import ConfigError
+from servoid.tools import cli
 from servoid.tools.commands import rollout
 from servoid.tools.common.cluster import workplace
 from servoid.tools.common.worker_pool import MachineLost, each
@@ -26,7 +27,7 @@ ENOUGH = 80_000_000  # bytes of a node's object store
 def cluster() -> Iterator[Any]:
     """Two nodes of a core each."""
     pytest.importorskip("ray")
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}  # nothing else is to go before them
     from ray import cloudpickle
     from ray.cluster_utils import Cluster
 
@@ -92,6 +93,15 @@ def test_two_nodes_give_what_one_machine_gives(cluster: Any, tmp_path: Path, cap
         return [head, *sorted(episodes)]
 
     assert kept("alone") == kept("many")  # to the last bit
+
+
+@pytest.mark.slow
+def test_a_dataset_is_the_same_wherever_its_parts_are_recorded(cluster: Any, tmp_path: Path) -> None:
+    words = "collect --policy gait --plain-odometry --worlds 4 --frames 600 --seconds 4 --parts 2 --threads 1 --out"
+    assert cli.main([*words.split(), str(tmp_path / "alone")]) == 0
+    assert cli.main([*words.split(), str(tmp_path / "many"), "--ray", cluster.address]) == 0
+    for path in sorted((tmp_path / "alone").rglob("*.parquet")):
+        assert (tmp_path / "many" / path.relative_to(tmp_path / "alone")).read_bytes() == path.read_bytes()
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Tasks that policies learn under a motion prior, by name; or a user's own, `FILE.py:Class`."""
+"""Tasks that policies learn, by name; or a user's own, `FILE.py:Class`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from servoid.hw.plugins import load_plugin
 from servoid.hw.robot.description import Robot
 from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
 from servoid.tools.learn.envs.tasks.dodgeball import Dodgeball
+from servoid.tools.learn.envs.tasks.get_up import GettingUp, GettingUpByClips
 from servoid.tools.learn.envs.tasks.location import TargetLocation
 from servoid.tools.learn.envs.tasks.speed import TargetSpeed
 from servoid.tools.learn.envs.tasks.steering import TargetSteering
 
 GROUP = "servoid.learned_tasks"  # of entry points
 LEARNED_TASKS: Mapping[str, type[LearnedTask]] = {
-    cls.name: cls for cls in (TargetSpeed, TargetSteering, TargetLocation, Dodgeball)
+    cls.name: cls for cls in (TargetSpeed, TargetSteering, TargetLocation, Dodgeball, GettingUp, GettingUpByClips)
 }
 
 

@@ -1,10 +1,11 @@
-"""What a task is that a policy learns under a prior: what is asked, and a reward of 0 to 1. A task is a small file."""
+"""What a task is that a policy learns: what is asked, and a reward of 0 to 1. A task is a small file."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from servoid.hw.geometry import turned
 from servoid.hw.robot.description import Robot
 from servoid.policy.priors.goals import GOALS, SeenGoal
 
+if TYPE_CHECKING:
+    from servoid.policy.rising.lead import Rising
+
 
 @dataclass(frozen=True)
 class TaskState:
@@ -22,6 +26,11 @@ class TaskState:
     position: Array  # (n, 2) m of the base
     yaw: Array  # (n,) rad
     velocity: Array  # (n, 2) m/s over the ground, averaged over a cycle of the gait: within one, every walk sways
+    height: Array  # (n,) m of the base
+    gravity: Array  # (n, 3) unit vector, base frame
+    angular_velocity: Array  # (n, 3) rad/s, base frame
+    joints: Array  # (n, n_joints) rad
+    joint_velocity: Array  # (n, n_joints) rad/s
 
 
 class LearnedTask(ABC):
@@ -32,6 +41,8 @@ class LearnedTask(ABC):
     size: ClassVar[int]  # numbers that are drawn
     every: ClassVar[tuple[float, float]]  # s from one draw to the next
     run: ClassVar[str]  # the task that `servoid run` runs it in
+    lies: ClassVar[bool] = False  # whether episodes begin lying, and no fall ends them
+    hold: ClassVar[float] = math.inf  # s for which it is `achieved` until an episode is over, as when its time is up
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
@@ -51,6 +62,19 @@ class LearnedTask(ABC):
     @abstractmethod
     def reward(self, asked: Array, state: TaskState) -> Array:
         """How well it does what is asked `(n,)`, 0 to 1."""
+
+    @property
+    def achievable(self) -> bool:
+        """Whether its episodes are over once it is `achieved`."""
+        return math.isfinite(self.hold)
+
+    def lead(self, n: int) -> Rising | None:
+        """What leads the policy in `n` worlds: its targets are around that, not around home, and it sets its pace."""
+        return None
+
+    def achieved(self, state: TaskState) -> Array:
+        """Where all is done that the task is about `(n,)` bool: never, of one that goes on."""
+        return np.zeros(len(state.yaw), bool)
 
     def advance(self, asked: Array, seconds: float) -> Array:
         """What is asked `(n, size)` so much later [s]: a thing that moves has gone on."""
