@@ -11,7 +11,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.world import SceneObject
-from servoid.sim.objects import COLOURS, shape
+from servoid.sim.objects import COLOURS, shapes
 from servoid.sim.scene import PILLAR_COLOUR, PILLAR_HEIGHT, SPHERE_COLOUR
 
 Colour = tuple[float, float, float, float]
@@ -92,19 +92,19 @@ def _connect(
 
 def _put(scene: mujoco.MjvScene, thing: SceneObject, pose: Array) -> None:
     """Add an object in its pose."""
-    if scene.ngeom < scene.maxgeom:
-        kind, size = shape(thing)
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, np.asarray(pose[3:], dtype=float))
-        mujoco.mjv_initGeom(
-            scene.geoms[scene.ngeom],
-            type=kind,
-            size=np.array(size, dtype=float),
-            pos=np.asarray(pose[:3], dtype=float),
-            mat=turn,
-            rgba=np.array(COLOURS[thing.kind], dtype=np.float32),
-        )
-        scene.ngeom += 1
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, np.asarray(pose[3:], dtype=float))
+    for kind, size, place in shapes(thing):
+        if scene.ngeom < scene.maxgeom:
+            mujoco.mjv_initGeom(
+                scene.geoms[scene.ngeom],
+                type=kind,
+                size=np.array(size, dtype=float),
+                pos=np.asarray(pose[:3], dtype=float) + turn.reshape(3, 3) @ np.array(place),
+                mat=turn,
+                rgba=np.array(COLOURS[thing.kind], dtype=np.float32),
+            )
+            scene.ngeom += 1
 
 
 def _add(

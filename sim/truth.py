@@ -116,9 +116,13 @@ class SimulatedTruth:
     def fallen(self) -> Array:
         """Whether each body has fallen `(n,)`: too low, too tilted, or on the ground with anything but its feet."""
         low = self.position[:, 2] < FALL_HEIGHT * self._robot.standing_height
+        return low | (self.tilt > FALL_TILT) | self.grounded
+
+    @property
+    def grounded(self) -> Array:
+        """Whether each body touches the ground with anything but its feet `(n,)`."""
         all_contacts = self._sensors[:, self._at["floor"]][:, 0]
-        foot_contacts = self._feet("contact")[..., 0].sum(-1)
-        return low | (self.tilt > FALL_TILT) | (all_contacts > foot_contacts)
+        return np.asarray(all_contacts > self._feet("contact")[..., 0].sum(-1))
 
     @property
     def objects(self) -> Array:

@@ -105,6 +105,9 @@ VERBS: dict[str, Verb] = {
     "bench": Verb(
         "measure speed, and how faults are handled",
         verbs={
+            "text-to-motion": Verb(
+                "measure how well a planner's motions go with sentences", "servoid.tools.bench.text_to_motion"
+            ),
             "sim": Verb("compare the training world with raw MuJoCo", "servoid.tools.bench.sim"),
             "policy": Verb("time the diffusion policy's plans", "servoid.tools.bench.policy"),
             "loop": Verb("measure how late the control loop is", "servoid.tools.bench.loop"),

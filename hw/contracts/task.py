@@ -30,6 +30,7 @@ class Trace:
     command: Array  # (ticks, 3) instructed velocity
     fallen: bool
     joints: Array | None = None  # (ticks, n_joints) rad
+    orientation: Array | None = None  # (ticks, 4) quaternion w x y z of the base
     gravity: Array | None = None  # (ticks, 3) unit vector along gravity, base frame
     goal: Array | None = None  # (ticks, 2) m, where the robot saw it; None: where the task has it
     obstacles: Array | None = None  # (ticks, n, 3) m: x, y, radius
@@ -50,6 +51,7 @@ class Episode:
     reach: float | None = None  # m from the goal that count as there, where that is judged
     path: Array | None = None  # (n, 2) m to walk along, in the frame that the robot starts in
     start: Start | None = None  # how a simulated body begins, one row; None: standing at home
+    seated: bool = False  # the task has the robot sit on a seat: it may be low, but only its feet touch the ground
     told: tuple[str, ...] = ()  # skills that are asked for, by name or in sentences
     low: bool = False  # the task has the robot sit, lie or touch the ground: only its tilt tells a fall then
 
@@ -107,6 +109,10 @@ class Behaviour(Protocol):
 
     def done(self, state: State) -> bool:
         """Whether the episode may end before its time."""
+        ...
+
+    def take_events(self) -> Sequence[str]:
+        """What a person should know of, since the last call."""
         ...
 
     def lost(self) -> None:

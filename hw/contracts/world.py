@@ -139,6 +139,11 @@ class Truth(Protocol):
         ...
 
     @property
+    def grounded(self) -> Array:
+        """Whether each body touches the ground with anything but its feet `(n,)`."""
+        ...
+
+    @property
     def joints(self) -> Array:
         """Joint positions `(n, n_joints)` rad."""
         ...

@@ -17,13 +17,23 @@ COLOURS = {
 }  # fmt: skip
 POSE, RATE = 7, 6  # numbers of a free body's pose and velocity
 _FREE = mujoco.mjtJoint.mjJNT_FREE
+_PLATE = 0.03  # m, of a seat
 _ROLLING = 0.0005  # m: a ball of 0.07 m slows down by 0.1 m/s2
 
 
-def shape(thing: SceneObject) -> tuple[mujoco.mjtGeom, list[float]]:
-    """Kind and half sizes [m] of an object's geom."""
+def shapes(thing: SceneObject) -> list[tuple[mujoco.mjtGeom, list[float], list[float]]]:
+    """Kind, half sizes [m] and place in its own frame [m] of each of an object's geoms.
+
+    A seat is a plate with a block under its rear half: as under any chair, there is room for the heels.
+    """
     x, y, z = (part / 2 for part in thing.size)
-    return (mujoco.mjtGeom.mjGEOM_SPHERE, [x, 0, 0]) if thing.round else (mujoco.mjtGeom.mjGEOM_BOX, [x, y, z])
+    if thing.round:
+        return [(mujoco.mjtGeom.mjGEOM_SPHERE, [x, 0, 0], [0.0, 0.0, 0.0])]
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    if thing.kind != "seat":
+        return [(box, [x, y, z], [0.0, 0.0, 0.0])]
+    plate = min(_PLATE / 2, z)
+    return [(box, [x, y, plate], [0.0, 0.0, z - plate]), (box, [x / 2, y, z], [-x / 2, 0.0, 0.0])]
 
 
 def pose(thing: SceneObject) -> Array:
@@ -36,22 +46,23 @@ def add_object(model: mujoco.MjSpec, name: str, thing: SceneObject) -> None:
     """Add an object under a name. It meets all that collides with the floor, and other objects."""
     at = pose(thing)
     body = model.worldbody.add_body(name=name, pos=at[:3], quat=at[3:])
-    kind, size = shape(thing)
     more: dict[str, Any] = {"mass": thing.mass} if thing.movable else {}
     if thing.kind == "ball":  # rolling friction counts in contacts of six dimensions, and against the floor's own
         more |= {"condim": 6, "priority": 2, "friction": [0.8, 0.005, _ROLLING]}
     if thing.movable:
         body.add_freejoint(name=name)
     meets = int(thing.kind != "target")
-    body.add_geom(
-        type=kind,
-        size=size,
-        rgba=COLOURS[thing.kind],
-        contype=meets,
-        conaffinity=meets,
-        solref=[0.008, 1.0],
-        **more,
-    )
+    for kind, size, place in shapes(thing):
+        body.add_geom(
+            type=kind,
+            size=size,
+            pos=place,
+            rgba=COLOURS[thing.kind],
+            contype=meets,
+            conaffinity=meets,
+            solref=[0.008, 1.0],
+            **more,
+        )
 
 
 class ObjectsOf:

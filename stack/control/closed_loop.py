@@ -30,7 +30,7 @@ from servoid.policy.references.plan import PlanReference, row_layout
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.control.planning.plan_buffer import History, Pace, PlanBuffer
 from servoid.stack.control.planning.planner import Answer, InlinePlanner, Planner, ProcessPlanner
-from servoid.stack.control.tracker import Tracker
+from servoid.stack.control.tracker import Followers
 
 if TYPE_CHECKING:
     from servoid.policy.diffusion.prefix.runtime import PlannerRuntime
@@ -44,13 +44,14 @@ class ClosedLoopSettings(Planning):
 
     checkpoint: str = "planner"  # a shipped one, or the path of a .safetensors file
     tracker: str = ""  # likewise, of a tracker of any reference; empty: the plan's joints are the goals
+    walker: str = "expert"  # likewise, of a tracker of the gait, where a plan walks; empty: the tracker walks, too
 
 
 class ClosedLoopPolicy(BasePolicy):
     """Follows plans, of one robot or of worlds of any leading `shape`."""
 
     def __init__(
-        self, robot: Robot, planner: Planner, pace: Pace, stride: int, history: int, tracker: Tracker | None = None,
+        self, robot: Robot, planner: Planner, pace: Pace, stride: int, history: int, tracker: Followers | None = None,
         shape: tuple[int, ...] = (),
     ) -> None:  # fmt: skip
         """`stride` are the ticks of a frame, `history` those of states that the planner is given."""
@@ -155,7 +156,7 @@ def closed_loop_policy(
         wrong.append("delay 0 needs plans that take no time: in real time set it to a frame or more")
     if wrong:
         raise ConfigError(f"closed loop: {'; '.join(wrong)}")
-    tracker = Tracker(robot, settings.tracker, shape, clips=True) if settings.tracker else None
+    tracker = Followers(robot, settings.tracker, settings.walker, shape) if settings.tracker else None
     build = partial(_build, robot, str(path), settings)
     planner: Planner = ProcessPlanner(build) if process else InlinePlanner(build())
     pace = Pace(1, settings.frames * frames.stride, settings.delay, wait=not process)

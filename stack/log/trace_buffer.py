@@ -10,7 +10,9 @@ from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
 
 _LONGEST = 36_000  # ticks that room is made for at once; a longer run takes as much again
-_COLUMNS = {"displacement": 3, "yaw": 1, "velocity": 3, "yaw_rate": 1, "command": 3, "gravity": 3}  # and joints
+_COLUMNS = {
+    "displacement": 3, "yaw": 1, "velocity": 3, "yaw_rate": 1, "command": 3, "orientation": 4, "gravity": 3
+}  # and joints  # fmt: skip
 
 
 class TraceBuffer:
@@ -43,6 +45,7 @@ class TraceBuffer:
                 state.velocity,
                 [about_vertical],
                 instruction.velocity,
+                state.orientation,
                 state.gravity,
                 state.position,
             ]
@@ -66,6 +69,7 @@ class TraceBuffer:
             command=part["command"],
             fallen=fallen,
             joints=joints,
+            orientation=part["orientation"],
             gravity=part["gravity"],
             goal=self._stacked("goal"),
             obstacles=self._stacked("obstacles"),

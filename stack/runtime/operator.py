@@ -102,6 +102,9 @@ class Held:
         """Also when the person in control ends the task."""
         return self._behaviour.done(state) or self._operator.intent.ends
 
+    def take_events(self) -> Sequence[str]:
+        return self._behaviour.take_events()
+
     def lost(self) -> None:
         self._behaviour.lost()
 

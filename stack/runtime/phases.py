@@ -102,6 +102,8 @@ class Phases:
         try:
             percept = self._look(state)
             instruction = self._behaviour.instruct(self.task_ticks, state, percept)
+            for text in self._behaviour.take_events():
+                self._guard.note("act", text)
             if instruction.skill is not None:
                 instruction = replace(instruction, skill=self._possible(instruction.skill))
             else:

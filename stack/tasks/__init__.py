@@ -27,6 +27,7 @@ from servoid.stack.tasks.skills.kick import Kick
 from servoid.stack.tasks.skills.skill import PerformSkills
 from servoid.stack.tasks.stand import Stand
 from servoid.stack.tasks.steer import Steer
+from servoid.stack.tasks.stories.story import Story
 from servoid.stack.tasks.text import Text
 from servoid.stack.tasks.velocity import Velocity
 from servoid.stack.tasks.walk import Survive, Walk
@@ -46,13 +47,17 @@ class TaskEntry:
 
 _CLASSES: tuple[type[BaseTask], ...] = (
     Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Cross, ReachHand, CrouchUnder, Inbetween, Survive, Text, Steer,
-    PerformSkills, Kick, LieAndStand,
+    PerformSkills, Kick, LieAndStand, Story,
 )  # fmt: skip
 _OWN: dict[str, TaskEntry] = {
     **{cls.name: TaskEntry(cls.name, cls, cls.description) for cls in _CLASSES},
     # The same classes with other files of settings.
     "goal-near": TaskEntry("goal-near", Goal, "walk to a near point"),
     "goal-far": TaskEntry("goal-far", Goal, "walk to a far point"),
+    "reach": TaskEntry("reach", Story, "bring the base over a point"),
+    "strike": TaskEntry("strike", Story, "punch or kick a bag, as told, so that it falls"),
+    "sit": TaskEntry("sit", Story, "sit down on a seat, and stay there"),
+    "rise": TaskEntry("rise", Story, "sit down on a seat, and rise from it"),
     "perturb": TaskEntry("perturb", Walk, "walk ahead while being pushed once a second"),
 }
 

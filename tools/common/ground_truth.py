@@ -51,7 +51,9 @@ class GroundTruth:
     a fall whether the robot is down at the end.
     """
 
-    def __init__(self, simulation: Simulation, dt: float, *, recover: bool = False, low: bool = False) -> None:
+    def __init__(
+        self, simulation: Simulation, dt: float, *, recover: bool = False, low: bool = False, seated: bool = False
+    ) -> None:
         self._truth, self._surroundings, self._dt = simulation.truth, simulation.surroundings, dt
         self._rows: list[tuple[Array, float, Array, float, Array]] = []
         self._joints: list[Array] = []
@@ -59,7 +61,8 @@ class GroundTruth:
         self._obstacles: list[Array] = []
         self._robots: list[Array] = []
         self._objects: list[Array] = []
-        self._low = low
+        self._low, self._seated = low, seated
+        self._orientation: list[Array] = []
         self._fallen = self._touched = self.fell_ending = False
         self._ever = False  # whether it has fallen
         self.falls = Falls(dt) if recover else None
@@ -80,6 +83,7 @@ class GroundTruth:
         self.upright += not self._ever
         self._joints.append(truth.joints[0].copy())
         self._up.append(-truth.gravity[0])
+        self._orientation.append(truth.orientation[0].copy())
         if self._surroundings is not None:
             self._touched |= bool(truth.touching.any())
             self._obstacles.append(self._surroundings.obstacles)
@@ -92,8 +96,12 @@ class GroundTruth:
 
     @property
     def _down(self) -> Array:
-        """Whether each robot has fallen; one that may be `low` by its tilt alone."""
-        return -self._truth.gravity[:, 2] < math.cos(FALL_TILT) if self._low else self._truth.fallen
+        """Whether each robot has fallen; one that may be `low` by its tilt alone, one that may be `seated` also where
+        anything but its feet touches the ground."""
+        if not (self._low or self._seated):
+            return self._truth.fallen
+        tilted = -self._truth.gravity[:, 2] < math.cos(FALL_TILT)
+        return tilted if self._low else tilted | self._truth.grounded
 
     def trace(self) -> Trace:
         """The run by the truth; without rows if the guard never let the task begin."""
@@ -114,6 +122,7 @@ class GroundTruth:
             command=command,
             fallen=self._fallen,
             joints=np.array(self._joints),
+            orientation=headed(np.array(self._orientation), np.full(len(yaw), -heading)),
             gravity=-np.array(self._up),
             goal=goal,
             obstacles=turned(np.array(self._obstacles) - origin, -heading) if self._obstacles else None,

@@ -36,6 +36,7 @@ ABOUT = {
     "policy": "policy",
     "plan": "planner",
     "skill": "skill",
+    "act": "act",
     "record": "flight log",
     "interrupt": "interrupt",
     "system": "machine",

@@ -41,8 +41,8 @@ def judge(job: RunSettings) -> Judged:
     from servoid.tools.common.ground_truth import GroundTruth
 
     assignment, backend = prepare(job)
-    dt, low = load_robot(job.robot).dt, assignment.episode.low
-    ground_truth = GroundTruth(simulation(backend), dt, recover=job.recover, low=low)
+    dt, episode = load_robot(job.robot).dt, assignment.episode
+    ground_truth = GroundTruth(simulation(backend), dt, recover=job.recover, low=episode.low, seated=episode.seated)
     result = run(job, backend=backend, on_tick=ground_truth)
     _give_memory_back()
     if result.interrupted:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,8 +23,16 @@ LOST_GRAVITY = 0.5  # of the unit vector along gravity, from where on a take is 
 _BEFORE = 0.5  # s before that which are left out, too
 
 
-def execute(takes: Sequence[Take], fleet: Fleet, follow: Follow, frames: Frames) -> list[tuple[Array, Array]]:
-    """What the estimator saw while robots followed takes, one each: raw rows `(ticks, raw size)` and labels `(ticks,)`.
+@dataclass(frozen=True)
+class Executed:
+    """What the estimator saw at each tick, and what was to be reached by it."""
+
+    raw: Array  # (ticks, raw size)
+    take: Take
+
+
+def execute(takes: Sequence[Take], fleet: Fleet, follow: Follow, frames: Frames) -> list[Executed]:
+    """What the estimator saw while robots followed takes, one each.
 
     `follow` acts for the whole `fleet`, of as many worlds as there are takes. A take that is lost is cut before that;
     where nothing is left, it is left out.
@@ -52,7 +61,9 @@ def execute(takes: Sequence[Take], fleet: Fleet, follow: Follow, frames: Frames)
     for i, take in enumerate(takes):
         ticks = take.ticks if lost[i] >= take.ticks else max(int(lost[i]) - margin, 0)
         if ticks > 1:
-            kept.append((seen[:ticks, i], take.label[:ticks]))
+            by = np.maximum(np.arange(ticks) - 1, 0)  # the frame that was to be reached by each tick
+            goals = Take(take.place[by], take.orientation[by], take.joints[by], take.label[:ticks])
+            kept.append(Executed(seen[:ticks, i], goals))
     return kept
 
 

@@ -23,6 +23,8 @@ from servoid.tools.learn.collect.skills import Commands, skills_of
 NEXT = -1  # told as what comes next: what leads to a motion belongs to it
 _STAND = NAMES.index("stand")
 _UPRIGHT = "upright"
+LEAD_SECONDS = 1.0  # of standing before a walk: as long as a prefix, so that starting is learned
+REACTION_SECONDS = 0.3  # at most, that whoever is told needs to begin
 _PEAK = 1.875  # of a minimum-jerk blend's speed over its mean
 
 
@@ -74,7 +76,7 @@ class TakeMaker:
         asked = np.zeros((ticks, count, 3))
         rngs = list(self._rng.spawn(count))
         commands.begin(np.arange(count))
-        for tick in range(ticks):
+        for tick in range(self._ticks(LEAD_SECONDS), ticks):
             commands.advance(rngs)
             asked[tick] = commands.velocity
         return [replace(take, label=told(take.label)) for take in self._gait(asked)]
@@ -111,23 +113,24 @@ class TakeMaker:
         """Standing, whose last moments are told as what comes next: whoever is told needs a moment to begin."""
         (place, lean), ticks = self._standing, self._ticks(seconds)
         label = np.full(ticks, _STAND)
-        label[ticks - self._ticks(self._rng.uniform(0.0, 0.3)) :] = NEXT
+        label[ticks - self._ticks(self._rng.uniform(0.0, REACTION_SECONDS)) :] = NEXT
         joints = np.tile(self._robot.home, (ticks, 1))
         return Take(np.tile(place, (ticks, 1)), np.tile(lean, (ticks, 1)), joints, label)
 
     def _stopping(self, count: int) -> Array:
-        """Commands `(ticks, count, 3)` that walk, and then stop."""
-        walk, stop = self._ticks(2.4), self._ticks(1.0)
+        """Commands `(ticks, count, 3)` of standing, walking and standing again."""
+        lead, walk, stop = (self._ticks(seconds) for seconds in (LEAD_SECONDS, 2.4, 1.0))
         drills = skills_of(self._robot)[1:]  # the first one stands
         weights = np.array([drill.weight for drill in drills])
-        asked = np.zeros((walk + stop, count, 3))
+        asked = np.zeros((lead + walk + stop, count, 3))
         for world in range(count):
             drill = drills[int(self._rng.choice(len(drills), p=weights / weights.sum()))]
-            asked[:walk, world] = drill.draw(self._rng)
+            asked[lead : lead + walk, world] = drill.draw(self._rng)
         return asked
 
     def _gait(self, asked: Array) -> list[Take]:
-        """What the gait does when `asked` `(ticks, worlds, 3)`; a stop at the end is told as what comes next."""
+        """What the gait does when `asked` `(ticks, worlds, 3)`; a stop at the end is told as what comes next, and so
+        are the last moments of standing before it begins."""
         robot, (ticks, worlds) = self._robot, asked.shape[:2]
         gait, legs, now = Gait(robot, (worlds,)), Legs(robot), np.zeros(1, int)
         place, yaw = np.zeros((ticks, worlds, 3)), np.zeros(worlds)
@@ -146,6 +149,9 @@ class TakeMaker:
         label = motion_of(asked, robot.walking.scale)
         still = np.cumprod((asked == 0.0).all(-1)[::-1], 0)[::-1].astype(bool) & (asked != 0.0).any((0, 2))
         label = np.where(still, NEXT, label)
+        for world in range(worlds):
+            first = int((asked[:, world] != 0.0).any(-1).argmax())
+            label[first - min(first, self._ticks(self._rng.uniform(0.0, REACTION_SECONDS))) : first, world] = NEXT
         return [Take(place[:, i], orientation[:, i], joints[:, i], label[:, i]) for i in range(worlds)]
 
     def _joined(self, parts: Sequence[Take]) -> Take:

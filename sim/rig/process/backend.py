@@ -200,6 +200,11 @@ class VirtualTruth:
         return self._now().fallen
 
     @property
+    def grounded(self) -> Array:
+        """Whether the robot touches the ground with anything but its feet `(1,)`."""
+        return self._now().grounded
+
+    @property
     def joints(self) -> Array:
         """Joint positions `(1, n_joints)` rad."""
         return self._now().joints

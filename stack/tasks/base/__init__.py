@@ -200,6 +200,9 @@ class BaseBehaviour:
     def done(self, state: State) -> bool:
         return False
 
+    def take_events(self) -> Sequence[str]:
+        return ()
+
     def lost(self) -> None:
         """Its robot has ended; nobody else waits for it."""
 

@@ -16,7 +16,10 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Reference, State
 from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import read_header
+from servoid.policy.diffusion.prefix.config import PlannerShape
+from servoid.policy.diffusion.prefix.dataset import HELD_OUT, PlanWindows, Sequences, ToldSentences
 from servoid.policy.diffusion.prefix.frames import Frames, wrapped
+from servoid.policy.features import Normaliser
 from servoid.policy.motion.library import Library
 from servoid.policy.text.captions import MOTIONS, NAMES
 from servoid.policy.text.encoder import load_encoder
@@ -88,9 +91,10 @@ def test_takes_are_learned_from_as_they_are_executed_until_they_are_lost() -> No
     fleet = Fleet(ROBOT, 2, None, seed=0)
     kept = execute(takes, fleet, follow, frames)
     assert len(kept) == 2
-    assert len(kept[0][1]) == 150
-    assert 30 < len(kept[1][1]) < 120
-    executed = frames.of_states(kept[0][0])
+    assert kept[0].take.ticks == len(kept[0].raw) == 150
+    assert 30 < kept[1].take.ticks < 120
+    np.testing.assert_array_equal(kept[0].take.joints[1:], takes[0].joints[:149], "what was to be reached by a tick")
+    executed = frames.of_states(kept[0].raw)
     assert np.abs(executed.joints[20:] - takes[0].joints[20:150]).mean() < 0.08
     np.testing.assert_allclose(executed.place[:, 2], takes[0].place[:, 2], atol=0.03)
 
@@ -126,3 +130,23 @@ def test_a_training_learns_goes_on_and_says_what_it_measured(tmp_path: Path) -> 
     assert 0.0 < errors[1] < errors[0], "it learns"
     assert 0.0 < head["results"]["target_error_m"] < 3.0
     assert "3 clips" in head["data"]
+
+
+def test_what_follows_an_executed_prefix_is_what_was_wanted_and_starts_are_half_of_it() -> None:
+    """Servos smooth what they are asked: plans of what was executed walk smaller and smaller steps, until they fall."""
+    frames, shape, encoder = Frames(ROBOT), PlannerShape(prefix=6, frames=4), load_encoder("words")
+    made, size = Sequences(), frames.layout.size
+    for _ in range(HELD_OUT):
+        made.frames.append(np.zeros((200, size), np.float32))
+        made.wanted.append(np.ones((200, size), np.float32))
+        made.label.append(np.repeat([0, 1], 100))
+    told = {"stand": ("stand",), "wave": ("wave",)}
+    windows = PlanWindows(made, frames, shape, ToldSentences(told, encoder, 4), 0.0, 0)
+    windows.normaliser = Normaliser(np.zeros(size, np.float32), np.ones(size, np.float32)).to_torch()
+    batch = windows.draw(256, torch.Generator().manual_seed(0)).frames[:, :, frames.layout.slice("height")]
+    assert (batch[:, 6:] == 1.0).all()
+    assert (batch[:, :2] == 0.0).all()
+    seams = (batch[:, :6, 0] == 1.0).sum(1)
+    assert set(seams.tolist()) == {0, 1, 2, 3, 4}, "of the plan that runs meanwhile"
+    starts = [windows._training[1][1][i] % 200 + 6 for i in range(len(windows._training[1][1]))]
+    assert all(100 <= int(start) < 110 for start in starts)

@@ -27,16 +27,17 @@ from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments, req
 if TYPE_CHECKING:
     import torch
 
-    from servoid.hw.contracts.body import Array
     from servoid.hw.robot.description import Robot
     from servoid.policy.diffusion.prefix.dataset import PlanWindows
     from servoid.policy.diffusion.prefix.frames import Frames
     from servoid.policy.diffusion.prefix.planner import PrefixPlanner
     from servoid.policy.text.encoder import TextEncoder
+    from servoid.tools.learn.executed import Executed
     from servoid.tools.learn.takes import Take
 
 MEASURED = ("validation_loss", "shuffled_loss", "target_error_m", "plan_ms")
 _EXECUTED = 2**30  # sets the worlds in which takes are executed apart from others of the same seed
+WALKER = "expert"  # follows takes that walk, as in configs/policies/closd.yaml
 _PLANS = 64  # that the missing of targets is measured on
 
 
@@ -44,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid train planner`."""
     run = add_run_arguments(parser, PlannerTraining())
     run.add_argument("--data", type=Path, metavar="DIR", help="recorded walks (`servoid collect`) to learn from, too")
+    run.add_argument("--init", type=Path, metavar="CHECKPOINT", help="start from this planner, with its normalisation")
     run.add_argument(
         "--tracker",
         metavar="CHECKPOINT",
@@ -67,7 +69,7 @@ def main(args: argparse.Namespace) -> int:
     frames, encoder = Frames(robot), load_encoder(settings.text)
     windows, source, licence = learned_from(robot, frames, encoder, settings, args.data, args.tracker)
     trainer = PlannerTrainer(windows, encoder, replace(settings, licence=licence), args.out, source)
-    trainer.start(args.resume)
+    trainer.start(args.resume, args.init)
     trainer.run()
     return 0
 
@@ -99,8 +101,10 @@ def learned_from(
     if tracker is not None:
         followed = executed_by(tracker, takes, frames, settings.seed)
         source += f", {len(followed)} of these takes as executed by {Path(tracker).name}"
-        for raw, label in followed:
-            made.add(frames, frames.of_states(raw), label)
+        for each in followed:
+            take = each.take
+            wanted = frames.motion(take.place, take.orientation, take.joints)
+            made.add(frames, frames.of_states(each.raw), take.label, wanted)
     if data is not None:
         recording = read_recording(data, robot)
         source += f", {source_of(data, recording)}"
@@ -129,12 +133,13 @@ def _plan_ms(planner: PrefixPlanner, prefix: torch.Tensor, text: torch.Tensor, p
         return 1000.0 * (time.process_time() - start) / plans
 
 
-def executed_by(
-    tracker: str, takes: Sequence[Take], frames: Frames, seed: int, worlds: int = 256
-) -> list[tuple[Array, Array]]:
-    """Takes as a tracker executes them, so many at a time. Raises CheckpointError where it knows no clips."""
+def executed_by(tracker: str, takes: Sequence[Take], frames: Frames, seed: int, worlds: int = 256) -> list[Executed]:
+    """Takes as trackers execute them, so many at a time, as a closed loop does: the shipped expert where they walk.
+
+    Raises CheckpointError where the tracker knows no clips.
+    """
     from servoid.stack.control.fleet import Fleet
-    from servoid.stack.control.tracker import Tracker
+    from servoid.stack.control.tracker import Followers
     from servoid.stack.estimation.odometry import load_odometry
     from servoid.tools.learn.executed import execute
 
@@ -142,7 +147,7 @@ def executed_by(
     for first in range(0, len(takes), worlds):
         part = takes[first : first + worlds]
         fleet = Fleet(robot, len(part), load_odometry(robot), randomise=0.5, seed=seed, tag=_EXECUTED + first)
-        found += execute(part, fleet, Tracker(robot, tracker, (len(part),), clips=True), frames)
+        found += execute(part, fleet, Followers(robot, tracker, WALKER, (len(part),)), frames)
     return found
 
 
@@ -185,6 +190,17 @@ class PlannerTrainer(Trainer):
         )
         self.signal = torch.as_tensor(cosine_signal(self.config.levels), dtype=torch.float32)
         self.generator = torch.Generator().manual_seed(settings.seed)
+
+    def adopt(self, path: Path) -> None:
+        """Take weights and normalisation of a planner, to go on with other takes. Raises ConfigError."""
+        from servoid.policy.diffusion.prefix.model import load
+
+        model = load(path, self.windows.kinematics.robot, self.windows.kinematics)
+        if model.config != self.config:
+            raise ConfigError(f"{path}: not the network that the options ask for: {model.config}")
+        self.network.load_state_dict(model.network.state_dict())
+        self.average.weights = {name: p.detach().clone() for name, p in self.network.named_parameters()}
+        self.windows.normaliser = model.normaliser
 
     @property
     def title(self) -> str:

@@ -1,0 +1,72 @@
+"""What a story is drawn from, and what one is once it is drawn."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.task import Episode
+from servoid.hw.contracts.world import SceneObject
+from servoid.hw.setting import Range, Setting
+from servoid.stack.tasks.base import Settings
+from servoid.stack.tasks.stories.act import Act
+from servoid.stack.tasks.stories.layout import Things
+
+
+@dataclass(frozen=True)
+class StorySettings(Settings):
+    seconds: Annotated[float, Setting("length of an episode", "s", above=0)] = 150.0
+    plan: Annotated[str, Setting("acts, one after the other, separated by commas; any: drawn")] = "sit,rise,reach,punch"
+    times: Annotated[int, Setting("how often the plan is repeated", least=1)] = 1
+    by: Annotated[
+        Literal["skills", "words"],
+        Setting(
+            "skills: they perform the acts, and the policy walks; words: the policy is told a sentence and targets"
+        ),
+    ] = "skills"
+    reach: Annotated[Range, Setting("distance of a point", "m", least=0)] = (0.28, 0.83)
+    strike: Annotated[Range, Setting("distance of a bag", "m", above=0)] = (0.28, 0.41)
+    sit: Annotated[Range, Setting("distance of a seat's middle", "m", above=0)] = (0.28, 0.33)
+    bearing: Annotated[float, Setting("how far a thing may be off the way that the robot faces", "rad", least=0)] = (
+        math.pi
+    )
+    touch: Annotated[Range, Setting("height of a point for a hand", "m", above=0)] = (0.26, 0.31)
+    seat_height: Annotated[Range, Setting("height of a seat", "m", above=0)] = (0.14, 0.15)
+    seat_depth: Annotated[float, Setting("of a seat, from front to back", "m", above=0)] = 0.2
+    seat_width: Annotated[float, Setting("of a seat", "m", above=0)] = 0.3
+    bag_height: Annotated[float, Setting("of a bag", "m", above=0)] = 0.36
+    bag_width: Annotated[float, Setting("of a bag", "m", above=0)] = 0.06
+    bag_mass: Annotated[float, Setting("of a bag", "kg", above=0)] = 0.1
+    stale: Annotated[float, Setting("age of what is seen from which on it is not gone by", "s", above=0)] = 0.5
+
+    @property
+    def things(self) -> Things:
+        return Things(
+            self.reach, self.strike, self.sit, self.bearing, self.touch,
+            (self.bag_width, self.bag_width, self.bag_height), self.bag_mass,
+            (self.seat_depth, self.seat_width), self.seat_height,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoryEpisode(Episode):
+    acts: tuple[Act, ...]
+    things: tuple[int, ...]  # of each act: the number of its object in the scene, -1: a point
+    points: Array  # (acts, 3) m in the frame that the robot starts in
+
+    @property
+    def objects(self) -> tuple[SceneObject, ...]:
+        return () if self.scene is None else self.scene.objects
+
+    def seat(self, number: int) -> SceneObject | None:
+        """What an act is about, where it is a seat."""
+        index = self.things[number]
+        return self.objects[index] if index >= 0 and self.objects[index].kind == "seat" else None
+
+    def point(self, number: int) -> Array:
+        """That of an act, as a pose `(7,)`."""
+        return np.array([*self.points[number], 1.0, 0.0, 0.0, 0.0])

@@ -1,0 +1,174 @@
+"""Stories: acts by the truth, the state machine, what is seen no more, and plans that cannot be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from fake_body import StillEstimator, observation
+
+from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import State
+from servoid.hw.contracts.world import Percept
+from servoid.hw.robot.description import load_robot
+from servoid.stack.runtime.run import RunSettings
+from servoid.stack.tasks import load_task
+from servoid.stack.tasks.stories.layout import CLEAR
+from servoid.stack.tasks.stories.machine import Machine
+from servoid.stack.tasks.stories.story import Story
+from servoid.stack.tasks.stories.told import StoryEpisode
+from servoid.tools.evaluate.judge import judge
+
+ROBOT = load_robot()
+STANDING = StillEstimator(ROBOT).update(observation(ROBOT, 0, ROBOT.home), ROBOT.home)
+
+
+def _story(**chosen: str) -> tuple[Story, StoryEpisode, Machine]:
+    task = load_task("story", chosen, ROBOT.dt, ROBOT)
+    assert isinstance(task, Story)
+    episode = task.scenario(np.random.default_rng(0))
+    behaviour = task.behaviour(episode)
+    assert isinstance(behaviour, Machine)
+    return task, episode, behaviour
+
+
+def _poses(episode: StoryEpisode) -> Array:
+    return np.array([
+        [*thing.place, thing.height, np.cos(thing.heading / 2), 0.0, 0.0, np.sin(thing.heading / 2)]
+        for thing in episode.objects
+    ])  # fmt: skip
+
+
+def _at(place: Array, heading: float) -> State:
+    turn = np.array([np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)])
+    return replace(
+        STANDING, displacement=np.array([*place, ROBOT.standing_height]), yaw=np.array(heading), orientation=turn
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "chosen"), [("strike", {"plan": "punch-left"}), ("strike", {"plan": "kick-right"}), ("rise", {})]
+)
+def test_the_robot_does_what_it_is_asked_by_the_truth(task: str, chosen: dict[str, str]) -> None:
+    judged = judge(RunSettings(task, policy="expert", seed=1, set=chosen))
+    assert judged.row["success"], judged.assignment.criteria(judged.trace)
+    assert judged.row["metrics"]["acts_share"] == 1.0
+    assert judged.trace.objects is not None
+    nothing = replace(judged.trace, objects=np.repeat(judged.trace.objects[:1], len(judged.trace.objects), 0))
+    if task == "strike":
+        assert not judged.assignment.success(nothing), "the bag still stands"
+    else:
+        away = nothing.objects.copy()  # type: ignore[union-attr]
+        away[..., 0] += 0.3
+        assert not judged.assignment.success(replace(nothing, objects=away)), "it squatted, and not on the seat"
+    assert not judged.assignment.success(replace(judged.trace, fallen=True))
+
+
+def test_acts_begin_when_those_before_them_are_done_and_are_judged_in_their_order() -> None:
+    _, episode, machine = _story(plan="reach,reach")
+    first, second = (_at(point[:2], 0.0) for point in episode.points)
+    asked = [machine.instruct(tick, STANDING, Percept("task", 0.0)) for tick in range(5)]
+    assert np.linalg.norm(asked[-1].velocity) > 0.05
+    ticks = 5
+    for state in (first, second):
+        for _ in range(round(0.5 / ROBOT.dt) + 2):
+            instruction = machine.instruct(ticks, state, Percept("task", 0.0))
+            ticks += 1
+    told = [text.split(",")[0] for text in machine.take_events()]
+    assert told == ["'reach' is done", "'reach' is done"]
+    assert instruction.stand
+    assert not machine.done(second)
+    for _ in range(round(1.0 / ROBOT.dt) + 1):
+        machine.instruct(ticks, second, Percept("task", 0.0))
+        ticks += 1
+    assert machine.done(second)
+
+
+def test_an_act_that_is_not_done_in_time_ends_the_story_and_says_so() -> None:
+    _, _, machine = _story(plan="reach,sit")
+    seen = None
+    for tick in range(0, 1200):
+        seen = machine.instruct(tick, STANDING, Percept("task", 0.0))
+    assert machine.take_events() == ("'reach' is given up: not done within 20 s",)
+    assert seen is not None
+    assert seen.stand
+    assert machine.done(STANDING)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda seen: replace(seen, objects=None), "the bag is not seen any more: the robot stands and waits"),
+        (lambda seen: replace(seen, objects=seen.objects * np.nan), "the bag is not seen any more"),
+        (lambda seen: replace(seen, age=0.8), "what is seen of the bag is 0.8 s old: the robot stands and waits"),
+    ],
+)
+def test_what_is_not_seen_any_more_is_not_walked_to(change: object, said: str) -> None:
+    """Where a camera lost the bag, the robot would walk into it, or punch the air."""
+    _, episode, machine = _story(plan="punch")
+    seen = Percept("scene", 0.0, objects=_poses(episode))
+    assert not machine.instruct(0, STANDING, seen).stand
+    for tick in (1, 2):
+        lost = machine.instruct(tick, STANDING, change(seen))  # type: ignore[operator]
+        assert lost.stand
+        assert not lost.velocity.any()
+    (text,) = machine.take_events()
+    assert text.startswith(said)
+    again = machine.instruct(3, STANDING, seen)
+    assert not again.stand
+    assert machine.take_events() == ("it is seen again",)
+
+
+def test_words_ask_for_the_same_acts_by_a_sentence_and_by_where_parts_shall_be() -> None:
+    _, episode, machine = _story(plan="punch-left", by="words")
+    bag, seen = _poses(episode)[0], Percept("scene", 0.0, objects=_poses(episode))
+    far = machine.instruct(0, STANDING, seen)
+    assert far.skill is None
+    assert far.goal is not None
+    away = np.arctan2(bag[1], bag[0])
+    spot = bag[:2] - 0.15 * np.array([np.cos(away), np.sin(away)]) + 0.03 * np.array([np.sin(away), -np.cos(away)])
+    near = machine.instruct(1, _at(spot, float(away)), seen)
+    assert near.text == "punch with the left hand"
+    assert near.targets is not None
+    np.testing.assert_allclose(near.targets["left hand"], [0.15, 0.03, 0.33], atol=0.02)
+
+
+def test_things_are_not_in_each_others_way() -> None:
+    for seed in range(5):
+        task, *_ = _story(plan="sit,rise,reach,punch,any,any")
+        episode = task.scenario(np.random.default_rng(seed))
+        places = np.array([thing.place for thing in episode.objects])
+        apart = np.linalg.norm(places[:, None] - places[None], axis=-1)[np.triu_indices(len(places), 1)]
+        assert (apart >= CLEAR["bag"]).all()
+        assert (np.linalg.norm(places, axis=1) >= CLEAR["bag"]).all(), "nor where the robot starts"
+
+
+def test_a_drawn_story_rises_where_it_sat() -> None:
+    rng = np.random.default_rng(0)
+    names = []
+    task, *_ = _story(plan=",".join(["any"] * 6))
+    for _ in range(10):
+        names.append([act.name for act in task.scenario(rng).acts])
+    assert any("sit" in story for story in names)
+    for story in names:
+        assert all(after == "rise" for before, after in pairwise(story) if before == "sit")
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        ({"plan": "sit,punch"}, "'punch-(left|right)' begins standing: let rise come before it"),
+        ({"plan": "rise"}, "'rise' begins on the seat: let sit come before it"),
+        ({"plan": "fly"}, "unknown act 'fly'"),
+        ({"plan": " , "}, "names no act"),
+        ({"seat_height": "0.2,0.3"}, "a seat of 0.3 m is higher than the hip"),
+        ({"touch": "0.3,0.6"}, "no hand reaches a point 0.6 m up"),
+    ],
+)
+def test_a_story_that_cannot_be_is_refused(chosen: dict[str, str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_task("story", chosen, ROBOT.dt, ROBOT)
