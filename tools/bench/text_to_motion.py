@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tracker", metavar="CHECKPOINT", help="tracker of clips: measure the closed loop, too")
     parser.add_argument("--steps", type=int, default=1500, help="of the encoder's training (default: 1500)")
     parser.add_argument("--each", type=int, default=8, help="motions of each sentence (default: 8)")
-    parser.add_argument("--takes", type=int, default=120, help="takes of clips, and half as many walks (default: 120)")
+    parser.add_argument("--takes", type=int, default=400, help="takes of clips, and half as many walks (default: 400)")
     parser.add_argument("--text-weight", type=float, default=2.5, help="of guidance by the sentence (default: 2.5)")
     parser.add_argument("--seed", type=int, default=0, help="random seed (default: 0)")
     add_json_argument(parser)
@@ -56,7 +56,7 @@ def _run(args: argparse.Namespace, report: Report) -> None:
     from servoid.policy.diffusion.prefix.frames import Frames
     from servoid.policy.diffusion.prefix.model import load
     from servoid.policy.text.encoder import load_encoder
-    from servoid.tools.evaluate.retrieval import COLUMNS, measures
+    from servoid.tools.evaluate.retrieval import COLUMNS, POOL, measures
     from servoid.tools.learn.settings import PlannerTraining
     from servoid.tools.learn.trainers.planner import learned_from
 
@@ -71,6 +71,10 @@ def _run(args: argparse.Namespace, report: Report) -> None:
     )  # fmt: skip
     windows, _, _ = learned_from(robot, frames, encoder, settings, None, args.tracker)
     windows.normaliser = model.normaliser
+    if len(windows.labels) < POOL:
+        raise ConfigError(
+            f"only {len(windows.labels)} motions are among the takes held out, and {POOL} are compared: more --takes"
+        )
     network = trained(windows, shape.size, shape.text_size, args.steps, args.seed)
     labels = windows.labels
     report.line(f"{len(labels)} different motions; the encoder saw {windows.count:,} windows in {args.steps} steps")

@@ -89,16 +89,6 @@ def _operate(browser: Any, picture: Path, at: Path) -> None:
         page.close()
 
 
-def _steer(browser: Any, picture: Path, at: Path) -> None:
-    log = str(at / "steer.mcap")
-    with command("run", "steer", "--policy", "gait", "--seconds", "600", "--view", "--record", log) as url:
-        page = _open(browser, url)
-        _take_control(page)
-        page.wait_for_timeout(1e3 * DRAW_SECONDS)
-        page.screenshot(path=picture)
-        page.close()
-
-
 def _virtual(browser: Any, picture: Path, at: Path) -> None:
     with command("virtual", "--view", "--powered") as url:
         _shown(browser, url, picture)
@@ -129,7 +119,6 @@ PICTURES: dict[str, Take] = {
     "view": _view,
     "two": _two,
     "operate": _operate,
-    "steer": _steer,
     "virtual": _virtual,
     "bringup": _bringup,
     "keyframes": _keyframes,

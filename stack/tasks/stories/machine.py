@@ -113,24 +113,13 @@ class Machine(BaseBehaviour):
         """The thing's pose `(7,)` in the odometry frame, and why it is not gone by."""
         index = self.episode.things[self._number]
         if index < 0:
-            return self._point(percept), None
+            return self.episode.point(self._number, percept.objects), None
         kind, nothing = self.episode.objects[index].kind, np.full(7, np.nan)
         if percept.objects is None or len(percept.objects) <= index or not np.isfinite(percept.objects[index]).all():
             return nothing, f"the {kind} is not seen any more"
         if percept.age > self._settings.stale:
             return nothing, f"what is seen of the {kind} is {percept.age:.1f} s old"
         return percept.objects[index], None
-
-    def _point(self, percept: Percept) -> Array:
-        """Where the point was drawn; of a story with a seat, where that puts it: a seat stays, and odometry drifts."""
-        point, objects = self.episode.point(self._number), self.episode.objects
-        seat = next((i for i, thing in enumerate(objects) if thing.kind == "seat"), None)
-        if seat is None or percept.objects is None or not np.isfinite(percept.objects[seat]).all():
-            return point
-        now, (x, y), heading = percept.objects[seat], objects[seat].place, objects[seat].heading
-        turn = float(yaw_of(now[3:])) - heading
-        point[:2] = now[:2] + turned(point[:2] - np.array([x, y]), turn)
-        return point
 
     def _say(self, lost: str | None) -> None:
         what = None if lost is None else lost.split(" is ")[0]

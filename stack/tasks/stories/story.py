@@ -115,7 +115,7 @@ class Story(BaseTask):
         if index >= 0:
             lost = np.full((len(trace.yaw), 7), np.nan)
             return lost if trace.objects is None else trace.objects[:, index]
-        return np.tile(episode.point(number), (len(trace.yaw), 1))
+        return np.broadcast_to(episode.point(number, trace.objects), (len(trace.yaw), 7))
 
 
 def _count(done: Sequence[int | None]) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Episode
 from servoid.hw.contracts.world import SceneObject
+from servoid.hw.geometry import turned, yaw_of
 from servoid.hw.setting import Range, Setting
 from servoid.stack.tasks.base import Settings
 from servoid.stack.tasks.stories.act import Act
@@ -67,6 +68,15 @@ class StoryEpisode(Episode):
         index = self.things[number]
         return self.objects[index] if index >= 0 and self.objects[index].kind == "seat" else None
 
-    def point(self, number: int) -> Array:
-        """That of an act, as a pose `(7,)`."""
-        return np.array([*self.points[number], 1.0, 0.0, 0.0, 0.0])
+    def point(self, number: int, objects: Array | None) -> Array:
+        """That of an act, as poses `(..., 7)`: where it was drawn, as seen from a seat where `objects`, seen in poses
+        `(..., objects, 7)`, have one: a seat stays where it is, and odometry drifts."""
+        drawn = np.array([*self.points[number], 1.0, 0.0, 0.0, 0.0])
+        seat = next((i for i, thing in enumerate(self.objects) if thing.kind == "seat"), None)
+        if seat is None or objects is None:
+            return drawn
+        now, thing = objects[..., seat, :], self.objects[seat]
+        found = np.broadcast_to(drawn, now.shape).copy()
+        moved = turned(drawn[:2] - np.array(thing.place), yaw_of(now[..., 3:]) - thing.heading)
+        found[..., :2] = np.where(np.isfinite(now[..., :1]), now[..., :2] + moved, drawn[:2])
+        return found

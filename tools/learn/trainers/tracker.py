@@ -83,7 +83,11 @@ class TrackerTrainer(PpoTrainer):
 
     @property
     def following(self) -> str:
-        return f"servoid rollout walk --policy {self.best_path} --episodes 50"
+        file = Path(self.env.robot.folder).with_suffix(
+            ".yaml"
+        )  # of a robot other than what the command takes by itself
+        own = f" --robot {file}" if self.env.robot.name != "op3" and file.is_file() else ""
+        return f"servoid rollout walk --policy {self.best_path}{own} --episodes 50"
 
     def resume(self) -> bool:
         if (old := self.out / "state.pt").exists() and not (self.out / "resume.pt").exists():
