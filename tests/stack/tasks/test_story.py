@@ -179,7 +179,8 @@ def test_a_point_is_where_the_seat_puts_it() -> None:
     _, episode, _ = _story(plan="sit,rise,reach")
     seen = _poses(episode)
     np.testing.assert_allclose(episode.point(2, seen)[:2], episode.points[2, :2])
-    drifted = [*seen, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    drifted = seen.copy()
+    drifted[:, 0] += 0.3
     np.testing.assert_allclose(
         episode.point(2, np.stack([seen, drifted]))[:, 0] - episode.points[2, 0], [0, 0.3], atol=1e-9
     )
