@@ -172,3 +172,16 @@ def test_a_drawn_story_rises_where_it_sat() -> None:
 def test_a_story_that_cannot_be_is_refused(chosen: dict[str, str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_task("story", chosen, ROBOT.dt, ROBOT)
+
+
+def test_a_point_is_where_the_seat_puts_it() -> None:
+    """Odometry drifts while the robot sits: by it, the point after that would be missed."""
+    _, episode, _ = _story(plan="sit,rise,reach")
+    seen = _poses(episode)
+    np.testing.assert_allclose(episode.point(2, seen)[:2], episode.points[2, :2])
+    drifted = seen.copy()
+    drifted[:, 0] += 0.3
+    np.testing.assert_allclose(
+        episode.point(2, np.stack([seen, drifted]))[:, 0] - episode.points[2, 0], [0, 0.3], atol=1e-9
+    )
+    np.testing.assert_allclose(episode.point(2, None)[:2], episode.points[2, :2])
