@@ -10,6 +10,7 @@ import pytest
 
 from servoid.tools.commands.evaluate import QUICK_EPISODES, QUICK_MINUTES, add_arguments, options_of
 from servoid.tools.common.parser import Parser
+from servoid.tools.common.worker_pool import Place
 from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult
 from servoid.tools.evaluate.runner import Options, evaluate
 from servoid.tools.evaluate.spec import load_evaluation, select
@@ -58,7 +59,11 @@ def test_no_episode_begins_after_the_minutes_and_no_experiment_has_a_third(tmp_p
         return EpisodeResult(job, {"success": True, "fell": False, "outcome": "succeeded"})
 
     def pool(
-        work: Callable[[EpisodeJob], EpisodeResult], some: Iterable[EpisodeJob], workers: int, deadline: float | None
+        work: Callable[[EpisodeJob], EpisodeResult],
+        some: Iterable[EpisodeJob],
+        workers: int,
+        deadline: float | None,
+        place: Place[Any],
     ) -> Iterator[EpisodeResult]:
         assert deadline is not None
         deadlines.append(deadline)
