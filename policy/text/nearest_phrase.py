@@ -21,7 +21,9 @@ _CONFLICTS = (("left", "right"), ("forward", "back"), ("slow", "fast"))
 _SIDED = frozenset({"turn", "side-step", "diagonal", "arc"})  # flags of motions that need a side
 _SPEEDS = {"slow": "forward slowly", "fast": "forward fast"}  # what walking forward is called by these flags
 # Neither the order of words nor a number is in a code: without these checks they would be dropped without a word.
-_SEQUENCE = re.compile(r"\b(then|after(wards?)?|before(?! (us|me|them|him|her|you)\b)|first|until|next)\b|[;.!?]\s*\w")
+_SEQUENCE = re.compile(
+    r"\b(then|after(wards?)?|before(?! (us|me|them|him|her|you)\W*$)|first|until|next)\b|[;.!?]\s*\w"
+)
 _QUANTITY = re.compile(
     r"\d|\b(once|twice|times|half|quarter|full|(one|two|three|four|five|six|seven|eight|nine|ten)"
     r"( more)? (steps?|turns?|met(er|re)s?|degrees?|seconds?|circles?|rounds?|paces?|feet|foot))\b"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -33,7 +32,7 @@ class StorySettings(Settings):
     strike: Annotated[Range, Setting("distance of a bag", "m", above=0)] = (0.28, 0.41)
     sit: Annotated[Range, Setting("distance of a seat's middle", "m", above=0)] = (0.28, 0.33)
     bearing: Annotated[float, Setting("how far a thing may be off the way that the robot faces", "rad", least=0)] = (
-        math.pi
+        3.1416
     )
     touch: Annotated[Range, Setting("height of a point for a hand", "m", above=0)] = (0.26, 0.31)
     seat_height: Annotated[Range, Setting("height of a seat", "m", above=0)] = (0.14, 0.15)

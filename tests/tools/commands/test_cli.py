@@ -47,7 +47,7 @@ def test_help_loads_nothing_that_is_slow_to_load() -> None:
         (["tasks", "gaol"], "servoid: unknown task 'gaol': did you mean 'goal'?"),
         (["--jason"], "servoid: unknown option '--jason'"),
         (["rollout", "walk", "--robot=--"], "servoid rollout: argument --robot: '--' is no value"),
-        (["bench"], "servoid bench: command missing; known: sim, policy, loop"),
+        (["bench"], "servoid bench: command missing; known: text-to-motion, sim, policy, loop"),
         ([], "servoid: command missing; known: tasks"),
     ],
 )

@@ -150,5 +150,5 @@ def test_a_diffusion_model_learns_to_plan_latents_and_carries_their_decoder(
         tmp_path / "best.safetensors",
         *options[6:],
     ]
-    with pytest.raises(ConfigError, match="not the network that the options ask for"):
+    with pytest.raises(ConfigError, match="its actions are not those of --latent"):
         train(diffusion, *begun, "--steps", 2)

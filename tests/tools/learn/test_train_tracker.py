@@ -195,7 +195,7 @@ def test_an_interrupted_run_leaves_its_newest_network(tmp_path: Path) -> None:
 def test_commands_of_training_are_spread_over_what_is_asked() -> None:
     """Backward while turning is where the tracker fell most, and top speed what it lacked: both must be seen often."""
     rng = np.random.default_rng(0)
-    commands = np.array([_draw(rng, SETTINGS, ROBOT.walking) for _ in range(4000)])
+    commands = np.array([_draw(rng, SETTINGS, ROBOT.walking, ROBOT.walking) for _ in range(4000)])
     assert (commands >= ROBOT.walking.lower).all()
     assert (commands <= ROBOT.walking.upper).all()
     still = (commands == 0).all(1)

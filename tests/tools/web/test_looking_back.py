@@ -117,7 +117,8 @@ def test_two_logs_begin_their_task_together_and_stand_side_by_side(
     assert [event.text[:3] for event in info.events].count("2: ") == len(logs[1].events)
     assert any("1: How it ended: " in str(value) and " 2: How it ended: " in str(value) for value in told)
     line.ask("play", on=False)
-    line.ask("seek", at=4.0)
+    begins = [next(event.time for event in log.events if event.text == "running") for log in logs]
+    line.ask("seek", at=begins[0] + 1.0)
     player.look()
     shown = [value for _, value in line.told() if isinstance(value, Snapshot)][-1]
     assert shown.phase == "running"
@@ -125,7 +126,6 @@ def test_two_logs_begin_their_task_together_and_stand_side_by_side(
     assert shown.other.phase == "running"
     row = logs[1].at(shown.other.time)
     np.testing.assert_array_equal(shown.other.position, logs[1].record(row).observation.position)
-    begins = [next(event.time for event in log.events if event.text == "running") for log in logs]
     assert shown.time - begins[0] == pytest.approx(shown.other.time - begins[1], abs=0.03)
 
 
