@@ -101,7 +101,8 @@ def _add(args: argparse.Namespace, logs: Sequence[FlightLog], size: tuple[int, i
             films = {CAMERA: film(episode, Path(folder) / "film.mp4", size)} if args.film else {}
             writer.add(episode.columns, np.array([tasks.index(text) for text in episode.tasks]), films)
         writer.finish({SOURCES: yaml.safe_dump(about, sort_keys=False)})
-    report.line(f"{args.out}: {len(episodes)} episodes more, {writer.episodes} in all, {writer.frames} frames")
+    more = f"{len(episodes)} episode{'s' * (len(episodes) != 1)} more"
+    report.line(f"{args.out}: {more}, {writer.episodes} in all, {writer.frames} frames")
     report.line(f"next: servoid dataset show {args.out}")
     return {"out": args.out, "added": len(episodes), "episodes": writer.episodes, "frames": writer.frames}
 

@@ -44,7 +44,9 @@ def main(args: argparse.Namespace) -> int:
                 tasks[text] = tasks.get(text, 0) + 1
         ordered = sorted(tasks, key=lambda text: tasks[text], reverse=True)
         report.line(f"{args.dataset}: {info['robot_type']}, {info['fps']} frames/s, LeRobot {info['codebase_version']}")
-        which = f"{len(chosen)} episodes" if args.episode is None else f"episode {args.episode}"
+        which = (
+            f"{len(chosen)} episode{'s' * (len(chosen) != 1)}" if args.episode is None else f"episode {args.episode}"
+        )
         report.line(f"{which}: {sum(frames)} frames, {seconds:.1f} s; {min(frames)} to {max(frames)} frames each")
         report.table(("task", "episodes"), [(text, tasks[text]) for text in ordered])
         statistics = _statistics(args.dataset, chosen[0] if args.episode is not None else None, dataset.features)
