@@ -31,7 +31,6 @@ class Trace:
     fallen: bool
     joints: Array | None = None  # (ticks, n_joints) rad
     orientation: Array | None = None  # (ticks, 4) quaternion w x y z of the base
-    gravity: Array | None = None  # (ticks, 3) unit vector along gravity, base frame
     goal: Array | None = None  # (ticks, 2) m, where the robot saw it; None: where the task has it
     obstacles: Array | None = None  # (ticks, n, 3) m: x, y, radius
     robots: Array | None = None  # (ticks, n, 3) the others: x, y m and heading rad

@@ -10,9 +10,7 @@ from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
 
 _LONGEST = 36_000  # ticks that room is made for at once; a longer run takes as much again
-_COLUMNS = {
-    "displacement": 3, "yaw": 1, "velocity": 3, "yaw_rate": 1, "command": 3, "orientation": 4, "gravity": 3
-}  # and joints  # fmt: skip
+_COLUMNS = {"displacement": 3, "yaw": 1, "velocity": 3, "yaw_rate": 1, "command": 3, "orientation": 4}  # and joints
 
 
 class TraceBuffer:
@@ -23,12 +21,8 @@ class TraceBuffer:
         self._joints = joints
         self._rows: Array = np.full((min(ticks, _LONGEST) + 1, sum(_COLUMNS.values()) + joints), np.nan)
         self._length = 0
-        self._seen: dict[str, list[Array]] = {
-            "goal": [],
-            "obstacles": [],
-            "robots": [],
-            "objects": [],
-        }  # where there was something
+        # Where there was something.
+        self._seen: dict[str, list[Array]] = {"goal": [], "obstacles": [], "robots": [], "objects": []}
 
     def __len__(self) -> int:
         return self._length
@@ -46,7 +40,6 @@ class TraceBuffer:
                 [about_vertical],
                 instruction.velocity,
                 state.orientation,
-                state.gravity,
                 state.position,
             ]
         )
@@ -70,7 +63,6 @@ class TraceBuffer:
             fallen=fallen,
             joints=joints,
             orientation=part["orientation"],
-            gravity=part["gravity"],
             goal=self._stacked("goal"),
             obstacles=self._stacked("obstacles"),
             robots=self._stacked("robots"),

@@ -184,7 +184,11 @@ class _Shown:
     def __call__(self, record: TickRecord) -> None:
         import numpy as np
 
+        from servoid.stack.safety.guard import ENDED
+
         self.events += record.events
+        if record.phase in ENDED:
+            return  # what is limp sinks
         angle = float(record.observation.position[self._i])
         if angle == angle:  # it was read
             self.low, self.high = min(self.low, angle), max(self.high, angle)

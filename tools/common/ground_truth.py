@@ -123,7 +123,6 @@ class GroundTruth:
             fallen=self._fallen,
             joints=np.array(self._joints),
             orientation=headed(np.array(self._orientation), np.full(len(yaw), -heading)),
-            gravity=-np.array(self._up),
             goal=goal,
             obstacles=turned(np.array(self._obstacles) - origin, -heading) if self._obstacles else None,
             robots=turned(np.array(self._robots) - [*origin[:2], heading], -heading) if self._others() else None,

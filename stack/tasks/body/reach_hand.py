@@ -13,7 +13,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept, Scene, SceneObject
-from servoid.hw.geometry import to_heading
+from servoid.hw.geometry import to_heading, up_vector
 from servoid.hw.robot.description import Robot, shipped_robot
 from servoid.hw.setting import Range, Setting
 from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
@@ -101,10 +101,11 @@ class ReachHand(BaseTask):
 
     def _apart(self, trace: Trace) -> Array:
         """Distance of the hand from the ball's middle at each tick [m]; none for a run that never began."""
-        if trace.objects is None or trace.joints is None or trace.gravity is None or not len(trace.objects):
+        if trace.objects is None or trace.joints is None or trace.orientation is None or not len(trace.objects):
             return np.zeros(0)
         limb = self._build.limbs[self._part]
-        hand = limb_ends(limb, trace.displacement, trace.yaw, trace.gravity, trace.joints)
+        gravity = -up_vector(trace.orientation)
+        hand = limb_ends(limb, trace.displacement, trace.yaw, gravity, trace.joints)
         apart: Array = np.linalg.norm(hand - trace.objects[:, 0, :3], axis=1)
         return apart
 

@@ -37,7 +37,7 @@ def stands(places: Array, height: float, ball: Array, joints: Array = ROBOT.home
         command=zeros,
         fallen=False,
         joints=np.tile(joints, (ticks, 1)),
-        gravity=np.tile([0.0, 0.0, -1.0], (ticks, 1)),
+        orientation=np.tile([1.0, 0.0, 0.0, 0.0], (ticks, 1)),
         objects=np.tile([*ball, 1.0, 0.0, 0.0, 0.0], (ticks, 1, 1)),
         touched=False,
     )

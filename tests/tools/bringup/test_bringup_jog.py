@@ -47,7 +47,8 @@ def test_one_joint_moves_slowly_and_comes_back_and_all_others_stay(rig: RigProce
     assert code == 0, err
     assert answer["cause"] == "task"
     assert answer["highest"] - answer["start"] == pytest.approx(0.2, abs=0.05)
-    assert answer["others_moved"] < 0.06, "no more than the legs hang off their goals by"
+    assert answer["others_moved"] < 0.02
+    assert answer["lowest"] > answer["start"] - 0.02, "what it sinks by once torque is off does not count"
     sent = goals(rig)
     assert sent.shape[1] > 100
     assert np.ptp(np.delete(sent, KNEE, axis=0), axis=1).max() <= TICK * 1.01, "another joint was sent somewhere else"
