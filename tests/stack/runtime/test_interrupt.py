@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 
 import pytest
@@ -29,7 +28,7 @@ def test_a_signal_asks_to_end_and_its_handler_comes_back(number: signal.Signals)
     before = signal.signal(number, signal.SIG_DFL)
     try:
         with Interrupt() as interrupt:
-            os.kill(os.getpid(), number)
+            signal.raise_signal(number)
             assert interrupt.count == 1
         assert signal.getsignal(number) is signal.SIG_DFL
     finally:
@@ -51,7 +50,7 @@ def test_a_hang_up_and_what_comes_with_it_are_one_request(sent: list[signal.Sign
     """The kernel and the shell both send SIGHUP, and a session manager SIGTERM: a second request drops the robot."""
     with Interrupt() as interrupt:
         for number in sent:
-            os.kill(os.getpid(), number)
+            signal.raise_signal(number)
         assert interrupt.count == count
 
 
@@ -59,7 +58,7 @@ def test_a_program_that_was_told_to_survive_its_terminal_does() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # nohup
     try:
         with Interrupt() as interrupt:
-            os.kill(os.getpid(), signal.SIGHUP)
+            signal.raise_signal(signal.SIGHUP)
             assert interrupt.count == 0
     finally:
         signal.signal(signal.SIGHUP, before)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 
 import numpy as np
@@ -133,14 +132,14 @@ def test_a_record_that_cannot_be_written_ends_the_run_lowered_with_one_event():
 
 def test_one_ctrl_c_lowers_and_a_second_cuts_torque_at_once():
     def targets(tick):
-        os.kill(os.getpid(), signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
         return ROBOT.home
 
     body, guard, interrupt, loop, records = make(targets)
 
     def again(record):
         if record.phase is Phase.LOWERING and len(records) > 20:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
 
     loop._listeners = (*loop._listeners, again)
     with interrupt:
@@ -163,7 +162,7 @@ def test_a_stop_that_is_due_is_heeded_before_the_policy_is_asked_again():
 
     def terminate(record):
         if record.tick == 30:
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
 
     _, guard, interrupt, loop, records = make(targets, listeners=(terminate,))
     with interrupt:
@@ -180,7 +179,7 @@ def test_a_policy_that_hangs_is_broken_off_by_the_second_ctrl_c():
             signal.pause()
 
     body, guard, interrupt, loop, _ = make(targets)
-    before = signal.signal(signal.SIGALRM, lambda *_: [os.kill(os.getpid(), signal.SIGINT) for _ in range(2)])
+    before = signal.signal(signal.SIGALRM, lambda *_: [signal.raise_signal(signal.SIGINT) for _ in range(2)])
     try:
         with interrupt:
             loop.run()

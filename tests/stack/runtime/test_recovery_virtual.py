@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from typing import Any
 
@@ -72,7 +71,7 @@ def test_a_servos_error_or_ctrl_c_while_it_is_down_ends_with_torque_off(phase: P
         if record.phase is phase and not happened:
             happened.append(record.tick)
             if what == "interrupt":
-                os.kill(os.getpid(), signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
             else:
                 control.inject("overload", servo="l_knee")
 

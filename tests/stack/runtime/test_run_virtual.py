@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from typing import Any
 
@@ -85,7 +84,7 @@ def test_ctrl_c_at_any_phase_ends_with_torque_off(tick: int, count: int) -> None
     def interrupt(record: TickRecord) -> None:
         if record.tick == tick:
             for _ in range(count):
-                os.kill(os.getpid(), signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
 
     settings = RunSettings("walk", policy="gait", seconds=60.0, backend="virtual")
     result = run(settings, backend=body, on_tick=interrupt)
@@ -99,8 +98,8 @@ def test_a_policy_that_hangs_after_a_push_is_broken_off_with_torque_off() -> Non
 
     class Hangs(BasePolicy):
         def act(self, *_: Any) -> Array:
-            os.kill(os.getpid(), signal.SIGINT)
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
             raise AssertionError("not broken off")
 
     body = Watched(ROBOT)

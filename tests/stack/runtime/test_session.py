@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import itertools
-import os
 import signal
 
 import numpy as np
@@ -114,11 +113,11 @@ def test_it_homes_slowly_from_where_it_is():
 def test_a_second_signal_while_connecting_does_not_break_off_the_closing():
     class Slow(Simulated):
         def connect(self):
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
             raise AssertionError("the signal came too late")
 
         def close(self):
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
             super().close()
 
     body = Slow(ROBOT)
