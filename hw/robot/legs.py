@@ -16,6 +16,9 @@ from servoid.hw.geometry import cross
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
 
+ALONG = 0.7  # of a joint's axis along the base's, that it counts for
+_ANKLE = 0.4  # of a leg's length: joints this near the sole belong to the ankle
+
 
 def _skew(axis: Array) -> Array:
     x, y, z = axis
@@ -109,6 +112,26 @@ class Legs:
         height = -np.einsum("...lki,...i->...lk", corners, up).min((-1, -2))
         cr, sr, cp, sp = np.cos(roll / 2), np.sin(roll / 2), np.cos(pitch / 2), np.sin(pitch / 2)
         return height, np.stack([cp * cr, cp * sr, sp * cr, -sp * sr], -1)
+
+    def turning(self, joints: Array, axis: int, *, ankle: bool) -> tuple[Array, Array]:
+        """Each leg's joint that turns about this axis of the base, in a pose `(n_joints,)`: the last of its ankle, or
+        the first above that, of its hip.
+
+        Returns their numbers among the robot's joints and the signs of their axes along that one, both `(n,)`: none of
+        a leg that has no such joint.
+        """
+        q = self.pick(joints)
+        soles, (_, _, origins, axes) = self.soles(q)[0], self.forward(q)
+        length = np.linalg.norm(origins[:, 0] - soles, axis=-1)
+        numbers, signs = [], []
+        for leg, row in enumerate(self.index):
+            near = np.linalg.norm(origins[leg] - soles[leg], axis=-1) < _ANKLE * length[leg]
+            found = np.flatnonzero((near == ankle) & (np.abs(axes[leg, :, axis]) > ALONG))
+            if len(found):
+                joint = found[-1 if ankle else 0]
+                numbers.append(row[joint])
+                signs.append(np.sign(axes[leg, joint, axis]))
+        return np.array(numbers, int), np.array(signs)
 
 
 class LegInverse:

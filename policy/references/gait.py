@@ -17,10 +17,9 @@ from servoid.hw.contracts.control import Reference, ReferenceFrames
 from servoid.hw.geometry import headed, joined, turned
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.inverse import NumericInverse, leg_inverse, stance_at_home
-from servoid.hw.robot.legs import LegInverse, Legs
+from servoid.hw.robot.legs import ALONG, LegInverse, Legs
 
 _SMOOTH = 0.3  # of a smooth swing's easing that is left at full speed
-_ANKLE = 0.4  # of a leg's length: joints this near the sole belong to the ankle
 _FASTEST = 8.0  # rad/s of the reference that count for `yaw_lead`: where a swing begins and ends, there are jumps
 _NOW = np.array([0])
 _ACROSS = 5.0  # rad/s of turning that weigh as much as 1 m/s sideways
@@ -252,8 +251,9 @@ class GyroFeedback:
 
     def __init__(self, robot: Robot, settings: GaitSettings | None = None) -> None:
         settings = settings or gait_of(robot)
-        self._pitch, self._pitch_sign = _ankles(robot, 1)
-        self._roll, self._roll_sign = _ankles(robot, 0)
+        legs = Legs(robot)
+        self._pitch, self._pitch_sign = legs.turning(robot.home, 1, ankle=True)
+        self._roll, self._roll_sign = legs.turning(robot.home, 0, ankle=True)
         self._gains = settings.ankle_pitch_gain, settings.ankle_roll_gain
 
     def __call__(self, joints: Array, angular_velocity: Array) -> Array:
@@ -269,21 +269,5 @@ def _turning(robot: Robot) -> Array:
     legs = Legs(robot)
     axes = legs.forward(legs.pick(robot.home))[3]
     turns = np.zeros(len(robot.joints), bool)
-    turns[legs.index[np.abs(axes[..., 2]) > 0.7]] = True
+    turns[legs.index[np.abs(axes[..., 2]) > ALONG]] = True
     return turns
-
-
-def _ankles(robot: Robot, axis: int) -> tuple[Array, Array]:
-    """Numbers of the legs' last joints that turn a foot about this axis of the base at home, and their signs."""
-    legs = Legs(robot)
-    q = legs.pick(robot.home)
-    soles, (_, _, origins, axes) = legs.soles(q)[0], legs.forward(q)
-    length = np.linalg.norm(origins[:, 0] - soles, axis=-1)
-    numbers, signs = [], []
-    for leg, joints in enumerate(legs.index):
-        near = np.linalg.norm(origins[leg] - soles[leg], axis=-1) < _ANKLE * length[leg]
-        found = np.flatnonzero(near & (np.abs(axes[leg, :, axis]) > 0.7))
-        if len(found):
-            numbers.append(joints[found[-1]])
-            signs.append(np.sign(axes[leg, found[-1], axis]))
-    return np.array(numbers, int), np.array(signs)

@@ -12,7 +12,6 @@ from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
 
 Gains = tuple[float, float]  # rad for each rad/s that the base turns [s], and for each rad that it tilts from standing
-_ALONG = 0.7  # of a joint's axis along the base's, that it counts for
 
 
 @dataclass(frozen=True)
@@ -35,19 +34,9 @@ class Feedback:
 
     def __init__(self, robot: Robot) -> None:
         legs = Legs(robot)
-        _, _, _, axes = legs.forward(legs.pick(robot.home))
-        self._joints, self._signs = [], []
-        for last, axis in ((True, 1), (True, 0), (False, 1), (False, 0)):
-            numbers, signs = [], []
-            for leg, row in enumerate(legs.index):
-                found = np.flatnonzero(np.abs(axes[leg, :, axis]) > _ALONG)
-                if len(found) < (1 if last else 2):
-                    continue  # a leg with one such joint has an ankle, and no hip
-                joint = found[-1] if last else found[0]
-                numbers.append(row[joint])
-                signs.append(np.sign(axes[leg, joint, axis]))
-            self._joints.append(np.array(numbers, int))
-            self._signs.append(np.array(signs))
+        self._joints, self._signs = zip(
+            *(legs.turning(robot.home, axis, ankle=ankle) for ankle in (True, False) for axis in (1, 0)), strict=True
+        )
         self._upright = -up_vector(legs.stand(robot.home)[1])
 
     def __call__(self, target: Array, gravity: Array, rate: Array, gains: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,14 @@ def test_rolling_is_for_the_joints_that_roll_and_each_gain_for_its_own() -> None
 
 def test_standing_at_home_it_does_nothing() -> None:
     assert answered(Balance((1.0, 1.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0)), (0.0, 0.0), (0.0, 0.0, 0.0)) == {}
+
+
+def test_a_leg_that_rolls_at_its_hip_alone_has_no_ankle_to_roll() -> None:
+    """Its only joint that rolls was taken for an ankle, and turned by the ankle's gains, the wrong way for a hip."""
+    legs = {name: leg[:-1] for name, leg in ROBOT.legs.items()}
+    bare = replace(ROBOT, legs=legs)
+    rolls = Feedback(bare)._joints[1], Feedback(bare)._joints[3]
+    assert [[ROBOT.names[i] for i in one] for one in rolls] == [[], ["l_hip_roll", "r_hip_roll"]]
 
 
 def test_a_tracker_keeps_its_own_balance(tmp_path: Path) -> None:
