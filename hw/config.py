@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import enum
+import functools
 import json
 import math
 import re
@@ -150,6 +151,12 @@ def _required(cls: Any) -> list[str]:
     return [f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING]
 
 
+@functools.cache
+def hints_of(cls: Any) -> dict[str, Any]:
+    """Types of a dataclass's fields by their names, kept: to find them takes most of the time of reading a small file."""
+    return typing.get_type_hints(cls)
+
+
 class _Reader:
     """Builds values of the asked type from nodes, noting the line of every key."""
 
@@ -177,7 +184,7 @@ class _Reader:
 
     def dataclass(self, node: yaml.Node, cls: Any, key: str) -> Any:
         items = self.mapping(node, key)
-        known = typing.get_type_hints(cls)
+        known = hints_of(cls)
         hints = {f.name: known[f.name] for f in fields(cls) if f.init}
         for name in items:
             if name not in hints:

@@ -9,7 +9,7 @@ from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from servoid.hw.config import ConfigError, nearest, parse_number
+from servoid.hw.config import ConfigError, hints_of, nearest, parse_number
 
 T = TypeVar("T")
 
@@ -25,7 +25,7 @@ def override(base: T, settings: dict[str, str], where: str = "--set") -> T:
 
 def _set(base: Any, settings: list[tuple[str, str, str]], where: str) -> Any:
     """`base` with (key, key as typed, text) read, all at once: values that are good together come in any order."""
-    hints = typing.get_type_hints(type(base))
+    hints = hints_of(type(base))
     values: dict[str, Any] = {}
     inner: dict[str, list[tuple[str, str, str]]] = {}
     for key, full, text in settings:

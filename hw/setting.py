@@ -5,6 +5,7 @@ The range that is shown is the range that is checked. `overrides` changes settin
 
 from __future__ import annotations
 
+import functools
 import typing
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -126,6 +127,7 @@ def as_typed(value: Any) -> str:
     return "none" if value is None else f"{value:g}" if isinstance(value, (int, float)) else str(value)
 
 
+@functools.cache
 def _described(cls: Any) -> tuple[tuple[str, Setting, bool], ...]:
     """Name and setting of each field that has one, and whether its value is a range."""
     hints = typing.get_type_hints(cls, include_extras=True)

@@ -23,10 +23,10 @@ except KeyboardInterrupt:
     print(sys.modules["interrupted"].whole)
 """
 WHILE_DESTROYED = """
-import os, signal, time
+import signal, time
 from servoid.hw.signals import raise_interrupts
 class Destroyed:
-    def __del__(self): os.kill(os.getpid(), signal.SIGINT)
+    def __del__(self): signal.raise_signal(signal.SIGINT)
 raise_interrupts()
 try:
     Destroyed()
@@ -38,7 +38,7 @@ except KeyboardInterrupt:
 
 def test_an_interrupt_waits_for_the_import_that_it_falls_into(tmp_path: Path) -> None:
     """A compiled module would end it as "ImportError: initialization failed"."""
-    (tmp_path / "interrupted.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nwhole = True\n")
+    (tmp_path / "interrupted.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\nwhole = True\n")
     result = subprocess.run([sys.executable, "-c", WHILE_IMPORTING, tmp_path], capture_output=True, text=True)
     assert (result.stdout, result.stderr) == ("True\n", "")
 
