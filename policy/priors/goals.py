@@ -25,6 +25,7 @@ class SeenGoal:
     size: int
     mirror: Mirror
     observe: Callable[[Instruction, Walking], Array]
+    velocity: bool = False  # whether it is the velocity that is asked: none of it is to stand
     odometry: bool = True  # whether velocity and height by leg odometry are seen, too: they mean nothing while it lies
 
 
@@ -79,8 +80,8 @@ def nothing(instruction: Instruction, walking: Walking) -> Array:
 GOALS: Mapping[str, SeenGoal] = {
     goal.name: goal
     for goal in (
-        SeenGoal("velocity", 2, Mirror.PLANAR, _velocity),
-        SeenGoal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering),
+        SeenGoal("velocity", 2, Mirror.PLANAR, _velocity, velocity=True),
+        SeenGoal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering, velocity=True),
         SeenGoal("location", 2, Mirror.PLANAR, _location),
         SeenGoal("ball", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _ball),
         SeenGoal("stand", 0, Mirror(np.zeros(0, int), np.zeros(0, np.float32)), nothing, odometry=False),

@@ -84,9 +84,6 @@ class EpisodeSettings(ScoreSettings):
 
     episode_seconds: Annotated[float, "longest episode [s]"] = 10.0
     randomised: Annotated[float, "share of episodes on a robot drawn at random; the others are nominal"] = 0.5
-    stand: Annotated[
-        float, "share of what is asked that is to stand still: what walks must come to rest before it is lowered"
-    ] = 0.0
     unlike: Annotated[
         float, "error of the prior, in multiples of held-out data's, at which an episode ends; 0: it never does so"
     ] = 0.0
@@ -118,9 +115,8 @@ class EpisodeSettings(ScoreSettings):
             raise ValueError(f"lead_rate must be positive, not {self.lead_rate}")
         if self.decide_every < 1 or self.reach <= 0:
             raise ValueError("decide_every must be at least 1, and reach must be positive")
-        for name in ("randomised", "stand"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} must be a share of 0 to 1, not {getattr(self, name):g}")
+        if not 0.0 <= self.randomised <= 1.0:
+            raise ValueError(f"randomised must be a share of 0 to 1, not {self.randomised:g}")
         unknown = sorted(set(self.rewards) - set(REWARDED))
         if unknown:
             raise ValueError(f"rewards.{unknown[0]}: no such reward; {nearest(unknown[0], REWARDED)}")

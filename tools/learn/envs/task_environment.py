@@ -19,7 +19,7 @@ from servoid.stack.control.fleet import Fleet
 from servoid.stack.safety.limits import clamp
 from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.score_term import GeneratedStarts, Manner
-from servoid.tools.learn.envs.tasks import STAND, LearnedTask, TaskState, stillness
+from servoid.tools.learn.envs.tasks import LearnedTask, TaskState
 from servoid.tools.learn.prior_settings import EpisodeSettings
 from servoid.tools.learn.terms import Terms
 
@@ -89,7 +89,6 @@ class TaskEnvironment:
         self.task_reward = np.zeros(n)  # of the last decision, as are joints [rad] and velocity over the ground [m/s]
         self.joints, self.ground = np.zeros((n, len(robot.joints))), np.zeros((n, 2))
         self.asked = np.zeros((n, task.size))
-        self.standing = np.zeros(n, bool)  # whether that is to stand, instead
         self._next = np.zeros(n, int)
         self._cycle = round(gait_of(robot).cycle / self.dt)  # over which velocity is judged
         self._places = np.zeros((self._cycle + 1, n, 2))  # of the last cycle, newest first
@@ -157,13 +156,11 @@ class TaskEnvironment:
         for i in np.flatnonzero(self.ticks >= self._next):
             rng = self.fleet.rngs[i]
             self.asked[i] = self.task.draw(rng, truth.position[i, :2])
-            self.standing[i] = bool(self.settings.stand) and rng.random() < self.settings.stand
             self._next[i] = self.ticks[i] + round(rng.uniform(*self.task.every) / self.dt)
         if self.lead is not None:
             goal = self.lead.seen
         else:
             goal = self.task.seen.observe(self.task.instruct(self.asked, state), self.robot.walking)
-            goal = np.where(self.standing[:, None], self.task.seen.observe(STAND, self.robot.walking), goal)
         actor = self.observation(state, self.fleet.applied, goal)
         forward = self.robot.walking.forward
         known = [
@@ -200,7 +197,7 @@ class TaskEnvironment:
 
     def ask(self, asked: Array) -> None:
         """Ask for `(size,)` in every world from now on, until an episode ends."""
-        self.asked[:], self._next[:], self.standing[:] = asked, self.limit + 1, False
+        self.asked[:], self._next[:] = asked, self.limit + 1
 
     def step(self, action: Array) -> tuple[Array, Array, Array]:
         """Decide `(n, n_joints)`. Returns reward, done and time-out `(n,)`.
@@ -235,9 +232,7 @@ class TaskEnvironment:
             gravity=truth.gravity, angular_velocity=truth.angular_velocity, joints=truth.joints,
             joint_velocity=truth.joint_velocity,
         )  # fmt: skip
-        asked = ~self.standing
-        self.task_reward = np.where(asked, self.task.reward(self.asked, known), stillness(known, self.robot.home))
-        manner = np.where(asked, manner, 1.0)  # no prior of walking judges that
+        self.task_reward = self.task.reward(self.asked, known)
         change = action - self._action
         step = TaskStep(
             task=self.task_reward, manner=manner, change=change, jerk=change - self._change,
@@ -248,7 +243,7 @@ class TaskEnvironment:
         reward, self.terms = self.reward(step)
         unlike = (self.score.ratio > self.settings.unlike) if self.settings.unlike else np.zeros(self.n, bool)
         unlike &= self.ticks > self.settings.unlike_after / self.dt
-        over = asked & (unlike | self.task.ended(self.asked, known))
+        over = unlike | self.task.ended(self.asked, known)
         if not self.task.lies:
             over |= fallen
         self._held = np.where(self.task.achieved(known), self._held + 1, 0)

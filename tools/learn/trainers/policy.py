@@ -210,7 +210,6 @@ class PolicyTrainer(PpoTrainer):
             generated=0.0,
             starts=min(settings.starts, _JUDGED_STARTS),
             unlike=0.0,
-            stand=0.0,
             hardest_push=0.0,
             eased=(0.0, 0.0),
         )

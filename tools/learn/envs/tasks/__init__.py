@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from servoid.hw.config import ConfigError, nearest
 from servoid.hw.plugins import load_plugin
 from servoid.hw.robot.description import Robot
-from servoid.tools.learn.envs.tasks.base import STAND, LearnedTask, TaskState, stillness
+from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
 from servoid.tools.learn.envs.tasks.dodgeball import Dodgeball
 from servoid.tools.learn.envs.tasks.get_up import GettingUp, GettingUpByClips
 from servoid.tools.learn.envs.tasks.location import TargetLocation
@@ -34,4 +34,4 @@ def load_learned_task(name: str, robot: Robot) -> LearnedTask:
     return task
 
 
-__all__ = ["LEARNED_TASKS", "STAND", "LearnedTask", "TaskState", "load_learned_task", "stillness"]
+__all__ = ["LEARNED_TASKS", "LearnedTask", "TaskState", "load_learned_task"]

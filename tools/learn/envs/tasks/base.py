@@ -89,16 +89,6 @@ class LearnedTask(ABC):
         return None
 
 
-STAND = Instruction(np.zeros(3), stand=True)  # as a run asks before it lowers the robot
-_RESTLESS, _BENT = 0.5, 0.2  # rad/s and rad of all joints at which standing counts half
-
-
-def stillness(state: TaskState, home: Array) -> Array:
-    """How well robots stand that are asked to `(n,)`, 0 to 1: still, and in the pose `home` `(n_joints,)` rad."""
-    restless = np.mean(state.joint_velocity**2, -1) / _RESTLESS**2
-    return 1.0 / ((1.0 + restless) * (1.0 + np.mean((state.joints - home) ** 2, -1) / _BENT**2))
-
-
 def over_ground(velocity: Array, state: State) -> Instruction:
     """To move at `velocity` `(n, 2)` m/s of the odometry frame."""
     ahead = turned(velocity, -state.yaw)
