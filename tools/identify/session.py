@@ -76,8 +76,8 @@ class Excitation:
         return Proposal()
 
     def _stuck(self, observation: Observation) -> bool:
-        """End where a joint stands still away from its goal: it is at a stop that its file knows nothing of, or leans on
-        something, and would teach the fit a stiffness that it has not."""
+        """End where a joint stands still away from its goal: it is at a stop that its file knows nothing of, or leans
+        on something, and would teach the fit a stiffness that it has not."""
         away = np.abs(self._guard.applied - observation.position)
         held = (away > _SHORT) & (np.abs(observation.velocity) < _SHORT_SPEED)
         self._short = np.where(held, self._short + self._robot.dt, 0.0)

@@ -21,9 +21,9 @@ _EVEN = 0.1  # rad, of a range's middle, from which a knee has no side
 
 
 def bent_home(robot: Robot) -> Array | None:
-    """Joints `(n_joints,)` rad that stand lower than at home, soles turned as there, the centre of mass above the middle
-    of the soles; None where the legs are bent already, or do not reach such a pose. Knees that bend to either side bend
-    as a person's."""
+    """Joints `(n_joints,)` rad that stand lower than at home, soles turned as there, the centre of mass above their
+    middle; None where the legs are bent already, or do not reach such a pose. Knees that bend to either side bend as a
+    person's."""
     legs = Legs(robot)
     at, turn, _, _ = legs.forward(legs.pick(robot.home))
     down = np.array([0.0, 0.0, stance_at_home(robot, legs).height])
