@@ -299,4 +299,8 @@ def test_a_crowd_of_arguments_is_seen() -> None:
 
 
 def test_configs_hold_data_alone() -> None:
-    assert {path.suffix for path in (ROOT / "configs").rglob("*") if path.is_file()} <= {".yaml", ".xml", ".safetensors"}
+    assert {path.suffix for path in (ROOT / "configs").rglob("*") if path.is_file()} <= {
+        ".yaml",
+        ".xml",
+        ".safetensors",
+    }
