@@ -7,7 +7,7 @@ tests/stack/test_safety*.py:
    measured pose that was outside.
 2. From one accepted goal to the next a joint moves at most `joint_speed * dt` for each elapsed tick, and for no more
    ticks than `stale`: a servo holds its goal meanwhile, so a long gap does not earn a leap. While homing the limit is
-   `homing_speed`, for one tick however many were missed.
+   `homing_speed`, for one tick however many were missed; `joint_speed` for a goal that gives way (9).
 3. Nothing is sent before `home`; nothing that a policy proposes is sent before `start`, or while the robot falls or
    lies.
 4. A target that is not finite is never sent: the last goal holds, and after PATIENCE in a row the robot is damped.
@@ -21,9 +21,10 @@ tests/stack/test_safety*.py:
 8. Gains only go down within a run: below what was asked for where servos get hot, the supply low or a joint blocked.
    While a robot that is to recover falls and lies, they are zero, but for its arms as they come in.
 9. A fall is survived only where `recover` was asked for, and only from RUNNING, or READY: it may lie as it begins,
-   and is brought home lying. It falls as soon as that is certain (falling.py). The robot is moved again when it has
-   lain still, with the limits of 1 and 2, in at most so many tries and so much time (recovery.py); what ends a
-   run ends it then too, damped at once. It runs on when it has stood still, on flat soles, at the home pose.
+   and is brought home lying, its joints giving way to what they push against in vain. It falls as soon as that is
+   certain (falling.py). The robot is moved again when it has lain still, with the limits of 1 and 2, in at most so
+   many tries and so much time (recovery.py); what ends a run ends it then too, damped at once. It runs on when it has
+   stood still, on flat soles, at the home pose.
 
 Homing is the guard's own: from the pose that the robot is in, slowly, to the home pose.
 """
@@ -298,18 +299,20 @@ class Guard:
     def _home_on(self, observation: Observation, state: State | None) -> None:
         assert self._motion is not None
         self._accepted = self._tick
-        if self._motion.done:
+        lies = self.recovery is not None and tilt_of(observation, state) > self.robot.limits.tilt
+        if self._motion.done and (lies or np.allclose(self.applied, self.robot.home, rtol=0.0, atol=1e-9)):
             error = np.abs(observation.position - self.robot.home)
-            worst = int(error.argmax())
-            lies = self.recovery is not None and tilt_of(observation, state) > self.robot.limits.tilt
-            if error[worst] > HOME_TOLERANCE and not lies:  # one that lies may lie on an arm
-                name = self.robot.names[worst]
+            worst, name = int(error.argmax()), self.robot.names[int(error.argmax())]
+            if error[worst] > HOME_TOLERANCE and not lies:
                 self.fault("homing", f"{name} is {error[worst]:.2f} rad from home: is it blocked or unpowered?", name)
             else:
                 self._enter(Phase.READY, "ready")
             return
-        step = self.robot.limits.homing_speed * self.robot.dt
-        self.applied = np.clip(self._motion.next(), self.applied - step, self.applied + step)
+        before, rates = self.applied, self.robot.limits
+        slow, fast = rates.homing_speed * self.robot.dt, rates.joint_speed * self.robot.dt
+        self.applied = np.clip(self._motion.next(), before - slow, before + slow)
+        if lies:  # perhaps on a limb, which no strength of its own frees
+            self.applied = np.clip(self._health.eased(self.applied, observation.position), before - fast, before + fast)
 
     def _rests(self) -> bool:
         """Whether a robot that is stopping has come to rest, or had its time."""

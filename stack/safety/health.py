@@ -89,6 +89,12 @@ class Health:
             found += self._load(observation, applied, load)
         return sorted(found, key=lambda finding: ("now", "lowered", "").index(finding.ends))
 
+    def eased(self, goal: Array, position: Array) -> Array:
+        """A goal `(n_joints,)` rad towards `goal` that asks of no joint, at `position`, more than DERATED of all it
+        has."""
+        most = DERATED * self._full / self._weak
+        return position + np.clip(goal - position, -most, most)
+
     def _samples(self, observation: Observation, state: State | None) -> list[Finding]:
         stale = self._limits.stale
         oldest = stale * self._robot.dt + 1e-9

@@ -11,13 +11,13 @@ from fake_body import FakeBody
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Mode
-from servoid.hw.contracts.world import Scene
+from servoid.hw.contracts.world import Scene, Start
 from servoid.hw.robot.description import load_robot, save_robot
 from servoid.sim.backend import SimBackend
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.log.flightlog import FlightLog, read_log
 from servoid.stack.log.tick import TickRecord
-from servoid.stack.runtime.run import Result, RunSettings, Script, run
+from servoid.stack.runtime.run import Result, RunSettings, Script, prepare, run
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import DOWN, Phase
 from servoid.tools.commands.replay import changes, replay
@@ -54,8 +54,12 @@ class Watch:
     @property
     def phases(self) -> list[Phase]:
         """Each phase once, in the order in which they came."""
-        phases = [record.phase for record in self.records]
-        return [now for before, now in zip([None, *phases], phases, strict=False) if now is not before]
+        return passed(self.records)
+
+
+def passed(records: list[TickRecord]) -> list[Phase]:
+    phases = [record.phase for record in records]
+    return [now for before, now in zip([None, *phases], phases, strict=False) if now is not before]
 
 
 def fall(bearing: float, then: Any = None, seconds: float = 16.0, **more: Any) -> tuple[Result, Watch]:
@@ -136,26 +140,54 @@ def test_ctrl_c_while_it_is_down_damps_and_ends_at_once(fallen: list[TickRecord]
     assert len(after) <= (0.5 * ROBOT.rate if count == 1 else 1)
 
 
+class Table:
+    """A ball of a metre that nothing moves, and that comes down on the robot once it is told to."""
+
+    def __init__(self, start: Start | None = None) -> None:
+        self.radius, self.lowest, self._ticks = 1.0, 0.1, 0
+        scene = Scene(np.zeros((0, 3)), np.array([[5.0, 0.0, self.radius, 0.0]]))
+        self.body = SimBackend(ROBOT, seed=1, scene=scene, start=start)
+
+    def press(self) -> None:
+        self._ticks += 1
+        x, y, _ = self.body.truth.position[0]
+        height = self.radius + max(self.lowest, 0.3 - 0.02 * self._ticks)
+        self.body._worlds.move(0, np.array([[x, y, height]]))
+
+
 @pytest.mark.parametrize("bearing", ["front", "back"])
 def test_pressed_from_above_it_lies_still_and_says_why(bearing: str) -> None:
-    """As under a table: a ball of a metre that nothing moves comes down on it when it begins to get up."""
-    radius, lowest, down = 1.0, 0.1, list[int]()
-    body = SimBackend(ROBOT, seed=1, scene=Scene(np.zeros((0, 3)), np.array([[5.0, 0.0, radius, 0.0]])))
+    """As under a table: it comes down when the robot begins to get up."""
+    table, down = Table(), list[int]()
 
     def press(record: TickRecord) -> None:
         if record.phase is Phase.RECOVERING or down:
             down.append(record.tick)
-            x, y, _ = body.truth.position[0]
-            body._worlds.move(0, np.array([[x, y, radius + max(lowest, 0.3 - 0.02 * len(down))]]))
+            table.press()
 
-    watch = Watch(body, BEARINGS[bearing], press)
+    watch = Watch(table.body, BEARINGS[bearing], press)
     settings = RunSettings("walk", policy="gait", seed=1, set=STRAIGHT, seconds=16.0, recover=True)
-    result = run(settings, backend=body, on_tick=watch)
+    assert_left_lying(run(settings, backend=table.body, on_tick=watch), watch.records)
+
+
+def test_pressed_from_above_as_it_begins_it_is_left_lying_too() -> None:
+    """On the way home it gives way to what presses it, and is stopped when it pushes against that to get up."""
+    settings = RunSettings("get-up", policy="gait", seed=1, set={"lying": "anyhow"}, recover=True)
+    table, records = Table(prepare(settings)[0].episode.start), list[TickRecord]()
+
+    def press(record: TickRecord) -> None:
+        records.append(record)
+        table.press()
+
+    assert_left_lying(run(settings, backend=table.body, on_tick=press), records)
+
+
+def assert_left_lying(result: Result, records: list[TickRecord]) -> None:
     assert result.outcome == "stopped"
     assert result.trace.fallen
     assert any("does not move: is it blocked?" in event.text for event in result.events if event.kind == "overload")
-    assert watch.phases[-2:] == [Phase.RECOVERING, Phase.DAMPED], "no further try"
-    assert watch.records[-1].command.mode is Mode.OFF
+    assert passed(records)[-2:] == [Phase.RECOVERING, Phase.DAMPED], "no further try"
+    assert records[-1].command.mode is Mode.OFF
 
 
 class Limp(BasePolicy):

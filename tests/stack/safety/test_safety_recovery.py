@@ -14,7 +14,7 @@ from test_safety import HIGH, LOW, ROBOT, STEP, N, Rig, proposals
 from servoid.hw.contracts.body import Mode
 from servoid.hw.faults import OVERLOAD, STOP_BUTTON, STOP_BUTTON_AGAIN
 from servoid.stack.safety.guard import DAMP_SECONDS, DOWN, Guard, Phase
-from servoid.stack.safety.health import BLOCKED_SECONDS
+from servoid.stack.safety.health import BLOCKED_SECONDS, DERATED
 from servoid.stack.safety.recovery import (
     BRACE_GAIN,
     BRACE_SECONDS,
@@ -198,6 +198,58 @@ def test_9_a_joint_that_pushes_in_vain_ends_it_by_its_own_limit_and_keeps_its_st
     assert rig.guard.phase is Phase.DAMPED
     assert rig.guard.cause == "overload"
     assert [event.joint for event in rig.events if event.kind == "overload"] == ["l_knee"]
+
+
+def homed(away, *, recover=True, held=KNEE, spoil=failing):
+    """A guard that brings a robot home, one of whose joints does not move from `away` [rad] off home. Yields the guard,
+    and how far that joint is off the goal, at each tick."""
+    rig = Faller() if recover else Rig()
+    stuck = np.where(np.arange(N) == held, ROBOT.home + away, ROBOT.home)
+    rig.body.position = stuck.copy()
+    rig.guard.home(rig.body.read())
+    while rig.guard.phase is Phase.HOMING:
+        rig.step(spoil=spoil(held, position=stuck[held]))
+        yield rig, abs(rig.guard.applied[held] - stuck[held])
+
+
+def standing(joint, **what):
+    return lambda o: replace(failing(joint, **what)(o), **{k: getattr(o, k) for k in ("orientation", "specific_force")})
+
+
+def test_9_a_robot_that_lies_on_its_leg_as_it_begins_is_brought_home_without_pushing_with_all_it_has():
+    """It was stopped as blocked, or its leg went soft for the rest of the run, before it could begin to rise."""
+    servo = ROBOT.servos[KNEE]
+    ticks = list(homed(1.2))
+    rig, off = ticks[-1]
+    assert max(off for _, off in ticks) <= DERATED * servo.stall_torque / servo.stiffness + STEP
+    assert off > 0.1, "it does try"
+    assert rig.guard.phase is Phase.READY
+    np.testing.assert_array_equal(rig.step(spoil=failing(KNEE)).gain[LEGS], 0.0)
+    assert rig.guard.phase is Phase.FALLEN
+    rig.rising()
+    np.testing.assert_array_equal(rig.step(spoil=lying).gain, 1.0)
+    assert not {"derated", "overload", "homing"} & set(rig.kinds())
+
+
+@pytest.mark.parametrize(("recover", "spoil"), [(False, failing), (True, standing)])
+def test_9_one_that_does_not_get_up_by_itself_or_hangs_upright_is_still_stopped_by_a_blocked_joint(recover, spoil):
+    rig, _ = list(homed(1.2, recover=recover, spoil=spoil))[-1]
+    assert rig.guard.phase is Phase.DAMPED
+    assert rig.guard.cause == "overload"
+
+
+def test_9_a_goal_follows_a_joint_that_is_pushed_away_before_it_goes_soft_and_within_the_limit_of_rate():
+    """A robot that comes down on its leg as it begins bends it at once, by more than slow homing takes back in time."""
+    rig = Faller()
+    rig.body.position[0] += 1.0  # the head, which gives homing something to do
+    rig.guard.home(rig.body.read())
+    for _ in range(40):
+        before = rig.guard.applied
+        command = rig.step(spoil=failing(KNEE, position=ROBOT.home[KNEE] + 1.0))
+        assert np.abs(command.position - before).max() <= STEP + 1e-9
+        assert rig.guard.phase is Phase.HOMING
+    assert command.position[KNEE] > ROBOT.home[KNEE] + 0.5
+    np.testing.assert_array_equal(command.gain, 1.0)
 
 
 def test_9_it_gives_up_after_three_tries():
