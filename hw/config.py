@@ -153,7 +153,7 @@ def _required(cls: Any) -> list[str]:
 
 @functools.cache
 def hints_of(cls: Any) -> dict[str, Any]:
-    """Types of a dataclass's fields by their names, kept: to find them takes most of the time of reading a small file."""
+    """Types of a dataclass's fields by their names, kept: finding them takes most of the time of a small file."""
     return typing.get_type_hints(cls)
 
 

@@ -84,4 +84,4 @@ def asked(velocity: Array, goal: Array | None = None, text: str | None = None) -
         return f"goal {float(np.linalg.norm(goal)):5.2f} m"
     if text:
         return f"asked '{text}'"
-    return f"asked {velocity[0]:+.2f} {velocity[1]:+.2f} m/s {velocity[2]:+.2f} rad/s"
+    return f"asked {velocity[0]:+z.2f} {velocity[1]:+z.2f} m/s {velocity[2]:+z.2f} rad/s"

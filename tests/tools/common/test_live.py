@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from servoid.stack.runtime.run import RunSettings, run
-from servoid.tools.common.live import LiveLine
+from servoid.tools.common.live import LiveLine, asked
 from servoid.tools.common.output import Progress, Screen
 
 TIMING = SimpleNamespace(read=0, estimate=0, act=0, guard=0, write=0, record=0)
@@ -150,3 +150,7 @@ def test_progress_is_one_line_where_it_can_be_rewritten(term: str, shown: str) -
     assert stream.getvalue().startswith(shown)
     assert stream.getvalue().endswith("\n" if term == "dumb" else " \r")  # a line that was rewritten is taken away
     assert len(stream.getvalue().splitlines()) < 4
+
+
+def test_a_speed_that_rounds_to_nothing_has_no_minus() -> None:
+    assert asked(np.array([-0.001, 0.1, -0.5])) == "asked +0.00 +0.10 m/s -0.50 rad/s"
