@@ -160,15 +160,18 @@ class Machine(BaseBehaviour):
         """Whether the act was performed, and did not do it: what stays where it is, as on a seat, is given its time."""
         if self._acting is None or act.approach is None or act.skill is None or act.done.seated:
             return False
-        skill = self._skills[act.skill]
-        return self._tick - self._acting > self._ticks(skill.seconds + AGAIN_SECONDS)
+        return self._tick - self._acting > self._ticks(self._lasts(act, act.skill) + AGAIN_SECONDS)
+
+    def _lasts(self, act: Act, skill: str) -> float:
+        """s that an act takes by its skill, or by a planner."""
+        return act.lasts if act.lasts and not self._performs else self._skills[skill].seconds
 
     def _in_motion(self, act: Act) -> bool:
         """Whether a planner is in the middle of what it was told: it knows no way back from there, on one foot say, but
         to its end. A skill ends by itself."""
         if self._performs or self._acting is None or act.skill is None:
             return False
-        return self._tick - self._acting < self._ticks(self._skills[act.skill].seconds)
+        return self._tick - self._acting < self._ticks(self._lasts(act, act.skill))
 
     def _walk(self, act: Act, state: State, thing: Array) -> Instruction | None:
         """To where the act is performed; None where the robot is there."""
