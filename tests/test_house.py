@@ -35,6 +35,7 @@ HEAVY = {
     "mujoco": (
         "sim/",
         "tools/robots/compare.py",
+        "tools/robots/home.py",
         "tools/robots/draft.py",
     ),  # hw/robot/ reads the robot's body by it, when a robot is loaded
 }
@@ -298,4 +299,8 @@ def test_a_crowd_of_arguments_is_seen() -> None:
 
 
 def test_configs_hold_data_alone() -> None:
-    assert {path.suffix for path in (ROOT / "configs").rglob("*") if path.is_file()} <= {".yaml", ".xml"}
+    assert {path.suffix for path in (ROOT / "configs").rglob("*") if path.is_file()} <= {
+        ".yaml",
+        ".xml",
+        ".safetensors",
+    }

@@ -93,6 +93,7 @@ class DynamixelBackend:
             raise error
         bus.return_delay = max(servo.get("return_delay_time") for servo in found) * 2e-6
         units = Units(self._robot, [servo.table for servo in found])
+        units.anchor([servo.get("present_position") for servo in found])
         monitor = ServoMonitor(bus, found, units)
         group = present(found)
         ids = [servo.joint.id for servo in found]

@@ -11,7 +11,7 @@ from servoid.hw.contracts.body import Array, BackendError, Command, Mode
 from servoid.hw.dynamixel.guardian_client import Lifeline
 from servoid.hw.dynamixel.protocol import codec
 from servoid.hw.dynamixel.protocol.codec import SyncWriter
-from servoid.hw.dynamixel.protocol.units import Units
+from servoid.hw.dynamixel.protocol.units import EXTENDED_MAX, Units
 from servoid.hw.dynamixel.servos import arming
 from servoid.hw.dynamixel.servos.register_check import Found
 from servoid.hw.dynamixel.servos.servo_monitor import ServoMonitor
@@ -202,6 +202,8 @@ class DynamixelMotors:
         here = self._units.within_turn(np.array(turned))
         lower = np.array([servo.get("min_position_limit") for servo in self._found])
         upper = np.array([servo.get("max_position_limit") for servo in self._found])
+        lower = np.where(self._units.extended, -EXTENDED_MAX, lower)
+        upper = np.where(self._units.extended, EXTENDED_MAX, upper)
         outside = np.flatnonzero((here < lower - OUTSIDE) | (here > upper + OUTSIDE))
         if outside.size:
             raise BackendError(f"{self._names(outside.tolist())} is beyond its servo's limits: move it by hand")

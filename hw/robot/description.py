@@ -296,6 +296,12 @@ class Robot:
     def gears(self) -> Array:
         return np.array([joint.gear for joint in self.joints])
 
+    @cached_property
+    def extended(self) -> Array:
+        """Whether each joint's range is wider than the one turn that its servo has in position mode `(n_joints,)`."""
+        turn = np.array([servo.ticks_per_turn - 1 for servo in self.servos])
+        return (self.upper - self.lower) / self.tick_angles > turn
+
     @property
     def dt(self) -> float:
         """Length of a tick [s]."""

@@ -100,9 +100,8 @@ def _check_angles(robot: Robot, marks: Marks) -> None:
         raise marks.error(
             "limits.tilt", f"{limits.tilt:g} rad is more than lying down: the robot has fallen long before"
         )
-    for i, (joint, servo) in enumerate(zip(robot.joints, robot.servos, strict=True)):
-        turn = math.tau * (servo.ticks_per_turn - 1) / servo.ticks_per_turn / joint.gear
-        if joint.range[1] - joint.range[0] > turn:
+    for i, joint in enumerate(robot.joints):
+        if robot.extended[i] and joint.gear <= 1.0:
             raise marks.error(f"joints[{i}].range", f"{joint.name}: wider than the one turn that its servo has")
 
 

@@ -25,6 +25,7 @@ class SeenGoal:
     size: int
     mirror: Mirror
     observe: Callable[[Instruction, Walking], Array]
+    velocity: bool = False  # whether it is the velocity that is asked: none of it is to stand
     odometry: bool = True  # whether velocity and height by leg odometry are seen, too: they mean nothing while it lies
 
 
@@ -47,7 +48,10 @@ def _steering(instruction: Instruction, walking: Walking) -> Array:
 
 
 def _location(instruction: Instruction, walking: Walking) -> Array:
-    """The place in the heading frame `(..., 2)` m. Raises ConfigError where the task has none."""
+    """The place in the heading frame `(..., 2)` m: here, where it is to stand. Raises ConfigError where the task has
+    none."""
+    if instruction.stand:
+        return np.zeros((*np.shape(instruction.velocity)[:-1], 2))
     if instruction.goal is None:
         raise ConfigError("this policy walks to a place, and the task gives none: run goal, goal-near or goal-far")
     goal = np.asarray(instruction.goal, float)
@@ -57,7 +61,9 @@ def _location(instruction: Instruction, walking: Walking) -> Array:
 
 def _ball(instruction: Instruction, walking: Walking) -> Array:
     """Where the nearest thing to keep clear of is [m], and where it goes in shares of the top speed, in the heading
-    frame `(..., 4)`. Raises ConfigError where the task has none."""
+    frame `(..., 4)`: nothing near, where it is to stand. Raises ConfigError where the task has none."""
+    if instruction.stand:
+        return np.broadcast_to([FARTHEST, 0.0, 0.0, 0.0], (*np.shape(instruction.velocity)[:-1], 4))
     if instruction.obstacles is None or not np.size(instruction.obstacles):
         raise ConfigError("this policy gets out of a ball's way, and the task has none: run obstacle")
     things = np.asarray(instruction.obstacles, float)
@@ -74,8 +80,8 @@ def nothing(instruction: Instruction, walking: Walking) -> Array:
 GOALS: Mapping[str, SeenGoal] = {
     goal.name: goal
     for goal in (
-        SeenGoal("velocity", 2, Mirror.PLANAR, _velocity),
-        SeenGoal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering),
+        SeenGoal("velocity", 2, Mirror.PLANAR, _velocity, velocity=True),
+        SeenGoal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering, velocity=True),
         SeenGoal("location", 2, Mirror.PLANAR, _location),
         SeenGoal("ball", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _ball),
         SeenGoal("stand", 0, Mirror(np.zeros(0, int), np.zeros(0, np.float32)), nothing, odometry=False),

@@ -18,12 +18,15 @@ from servoid.policy.priors.goals import GOALS
 from servoid.policy.priors.observation import TaskObservation
 
 KIND = "task_policy"  # of a checkpoint
+SLOWING, FADING = 0.5, 0.6  # s for which it slows down when it is asked to stand, and then goes over into the home pose
 
 
 class TaskPolicy:
     """Drives one robot, or worlds of any leading `shape`. Implements Policy.
 
     It decides once in `stride` ticks, as often as its prior has frames, and its targets hold until it decides again.
+    Asked to stand or for no velocity, which its prior does not know, it slows down, and its motion about the home pose
+    fades.
     """
 
     def __init__(self, robot: Robot, path: Path, shape: tuple[int, ...] = ()) -> None:
@@ -38,7 +41,8 @@ class TaskPolicy:
         self._observation = TaskObservation(robot, self._goal, shape)
         self._network, _ = Mlp.load(path, KIND, robot, self._observation.size)
         self._reach, self._stride = np.array(config["reach"]), int(config["stride"])
-        self._tick = np.zeros(shape, int)
+        self._tick, self._dt = np.zeros(shape, int), robot.dt
+        self._stood = np.zeros(shape)  # s for which it was asked to stand
         self._target = np.zeros((*shape, len(robot.joints)))
 
     @property
@@ -57,7 +61,10 @@ class TaskPolicy:
             decided = self._home + self._reach * self._network(observation)
             self._target = np.where(due[..., None], decided, self._target)
         self._tick = self._tick + 1
-        return self._target
+        stand = instruction.stand | (self._goal.velocity & ~np.any(instruction.velocity, axis=-1))
+        self._stood = np.where(stand, self._stood + self._dt, 0.0)
+        left = np.clip(1.0 - (self._stood - SLOWING) / FADING, 0.0, 1.0)[..., None]
+        return self._home + left * (self._target - self._home)
 
     def take_events(self) -> tuple[str, ...]:
         return ()

@@ -84,9 +84,10 @@ def _clip(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[in
 
 
 def _task_policy(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
+    from servoid.policy.checkpoint import resolve
     from servoid.policy.priors.task_policy import TaskPolicy
 
-    policy: Policy = TaskPolicy(robot, Path(source), shape)
+    policy: Policy = TaskPolicy(robot, resolve(source, robot), shape)
     return policy
 
 
@@ -106,7 +107,13 @@ def _loop_settings(source: str) -> ClosedLoopSettings:
 
 
 # Policies of Servoid's own; besides there are the planner's other settings in configs/policies/.
-POLICIES: dict[str, Maker] = {"diffusion": _diffusion, "expert": _expert, "fast": _expert, "gait": _gait}
+POLICIES: dict[str, Maker] = {
+    "diffusion": _diffusion,
+    "expert": _expert,
+    "fast": _expert,
+    "gait": _gait,
+    "speed": _task_policy,
+}
 _KINDS: dict[str, Maker] = {  # of .safetensors files
     "diffusion": _diffusion,
     "tracker": _expert,

@@ -83,6 +83,7 @@ class Watched:
         found = find_servos(bus, robot)
         bus.return_delay = max(servo.get("return_delay_time") for servo in found) * 2e-6
         units = Units(robot, [servo.table for servo in found])
+        units.anchor([servo.get("present_position") for servo in found])
         self._sensors = DynamixelSensors(bus, robot, units, ServoMonitor(bus, found, units), present(found), imu)
         self._bus, self._robot, self._hold = bus, robot, SampleHold()
         self._clock = line.clock if isinstance(line.clock, WallClock) else RealTime(line.clock)

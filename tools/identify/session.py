@@ -25,12 +25,14 @@ from servoid.stack.runtime.clock import Schedule
 from servoid.stack.runtime.interrupt import Interrupt, Stops
 from servoid.stack.runtime.loop import ControlledRobot, Loop
 from servoid.stack.safety.guard import Guard, Phase
+from servoid.stack.safety.health import BLOCKED
 from servoid.stack.safety.min_jerk import MIN_JERK_PEAK, MinJerk
 from servoid.tools.identify.excitation import Exercise, middle_pose
 from servoid.tools.identify.recording import END, PIECE
 
 _WAIT_SECONDS = 1.0  # for a first sample of everything
 _STILL_SECONDS = 1.0  # in the middle pose, before the first motion
+_SHORT, _SHORT_SPEED, _SHORT_SECONDS = 0.15, 0.1, 0.4  # rad from its goal, rad/s, s: something is in a joint's way
 _SLOW_READS = 0.5  # s of torque before anything moves, so that temperatures and the supply are known
 
 
@@ -55,6 +57,7 @@ class Excitation:
         self._held, self._first = 0, 0
         self._told = -1  # of the motions' ticks, the newest that was looked at
         self._way: MinJerk | None = None
+        self._short = np.zeros(len(robot.names))  # s that each joint has been held short of its goal
 
     def act(self, tick: int, observation: Observation, state: State | None) -> Proposal:
         guard, dt = self._guard, self._robot.dt
@@ -68,9 +71,27 @@ class Excitation:
             self._held += 1
             if self._held * dt >= _SLOW_READS:
                 guard.start()
-        elif guard.phase is Phase.RUNNING:
+        elif guard.phase is Phase.RUNNING and not self._stuck(observation):
             return Proposal(self._goal(tick))
         return Proposal()
+
+    def _stuck(self, observation: Observation) -> bool:
+        """End where a joint stands still away from its goal: it is at a stop that its file knows nothing of, or leans
+        on something, and would teach the fit a stiffness that it has not."""
+        away = np.abs(self._guard.applied - observation.position)
+        held = (away > _SHORT) & (np.abs(observation.velocity) < _SHORT_SPEED)
+        self._short = np.where(held, self._short + self._robot.dt, 0.0)
+        if self._short.max() < _SHORT_SECONDS:
+            return False
+        worst = int(self._short.argmax())
+        name = self._robot.names[worst]
+        self._guard.fault(
+            BLOCKED,
+            f"{name} stands still {away[worst]:.2f} rad short of where it was sent: is it at a stop, or in the way of "
+            "something? Give it a narrower range, or a smaller --amplitude",
+            name,
+        )
+        return True
 
     def _goal(self, tick: int) -> Array | None:
         """By the clock, whatever was missed: a motion is as fast as it was planned."""

@@ -235,11 +235,15 @@ class Ppo(Layers, SampleRun):
     epochs: Annotated[int, "passes over each batch of samples"] = 3
     mini_batches: Annotated[int, "updates per epoch"] = 6
     mirror: Annotated[float, "weight of the squared difference between an action and that of the mirrored state"] = 1.0
+    mirrored: Annotated[bool, "learn from the mirror images of samples, too"] = True
+    actor_rate: Annotated[
+        float, "share of the learning rate at which the actor learns: less where it begins with what it must not forget"
+    ] = 1.0
 
     def __post_init__(self) -> None:
         SampleRun.__post_init__(self)
         Layers.__post_init__(self)
-        for name in ("learning_rate", "horizon", "epochs", "mini_batches"):
+        for name in ("learning_rate", "horizon", "epochs", "mini_batches", "actor_rate"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive, not {getattr(self, name):g}")
         if min(self.noise) <= 0:

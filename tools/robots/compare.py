@@ -19,6 +19,8 @@ _MIRRORED = 0.005  # m that joints may be beside their mirror images
 _LOPSIDED = 0.015  # m more that a body's centre of mass may be: no robot is quite alike on both sides
 _LOADED = 0.6  # share of its stall torque that a servo may need to hold the robot at home
 _LEVEL = 0.05  # rad that soles may lean at home
+_STIFF = 1.5  # times the stiffness at which a robot topples at home by its weight alone
+_WHIP = 4.0  # times the speed that a goal may have, that the gait's joints may ask for: servos lag behind
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ def findings(robot: Robot) -> list[Comparison]:
         _soles(robot),
         _balance(robot, model, data, joints),
         _load(robot, model, data, joints),
+        _stiffness(robot, model, data, joints),
         _steps(robot),
     ]
 
@@ -138,6 +141,38 @@ def _load(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Arra
     return Comparison(share < _LOADED, "servos at home", f"{name} needs most: {100 * share:.0f} % of its stall torque")
 
 
+def _stiffness(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
+    """How far the servos' springs are from those on which the robot topples forward, as an inverted pendulum does.
+
+    Over the joints that pitch, both legs alike and the feet on the ground, the potential energy has the Hessian K + G,
+    of springs and weight. It stands while that is positive: of K alone the least share that is enough is an eigenvalue.
+    """
+    legs, (index, sign) = Legs(robot), robot.mirror
+    _, rotation, _, axes = legs.forward(legs.pick(robot.home))
+    pitching = [int(legs.index[0, j]) for j in np.flatnonzero(np.abs(axes[0] @ rotation[0, :, 1]) > 0.7)]
+    base, weight = model.body(robot.base).id, 9.81 * float(model.body_mass[1:].sum())
+
+    def energy(bend: Array) -> float:
+        pose = robot.home.copy()
+        pose[pitching] += bend
+        image = [int(index[joint]) for joint in pitching]
+        pose[image] = pose[pitching] * sign[pitching]
+        _put(model, data, joints, pose)
+        mujoco.mj_comPos(model, data)
+        _, rotation, _, _ = legs.forward(legs.pick(pose))
+        soles, _ = legs.soles(legs.pick(pose))
+        return weight * float((data.subtree_com[base] - soles[0]) @ rotation[0, :, 2])
+
+    n, step = len(pitching), 0.02 * np.eye(len(pitching))
+    curved = [[energy(a + b) - energy(a - b) - energy(b - a) + energy(-a - b) for a in step] for b in step]
+    root = np.sqrt(2.0 * np.array([robot.servos[joint].stiffness for joint in pitching]))  # two legs
+    share = np.linalg.eigvalsh(-np.array(curved).reshape(n, n) / (4 * 0.02**2) / np.outer(root, root)).max(initial=0.0)
+    times = 1.0 / max(float(share), 1e-3)
+    good = times > _STIFF
+    hint = "" if good else ": it sinks and topples; raise the servos' P gain, and their stiffness with it"
+    return Comparison(good, "stiffness at home", f"{times:.1f} times what it takes to stand{hint}")
+
+
 def _steps(robot: Robot) -> Comparison:
     """The gait's steps are within the joints' ranges."""
     gait, phase = Gait(robot), np.linspace(0.0, 1.0, 24, endpoint=False)
@@ -148,5 +183,9 @@ def _steps(robot: Robot) -> Comparison:
     legs = set(Legs(robot).index.ravel().tolist())  # others may rest at an end, and are held off it
     wrong = [name for i, name in enumerate(robot.names) if np.asarray(beyond)[i] and i in legs]
     speed = float(np.abs(np.diff(pose, axis=0, append=pose[:1])).max() * 24 / gait.settings.cycle)
+    fast = speed > _WHIP * robot.limits.joint_speed
     text = f"beyond the ranges of {', '.join(wrong)}" if wrong else f"within the ranges, joints up to {speed:.1f} rad/s"
-    return Comparison(not wrong, "steps of the gait", text)
+    hint = (
+        ": no servo follows; bend the knees at home, or search for other steps with servoid tune gait" if fast else ""
+    )
+    return Comparison(not (wrong or fast), "steps of the gait", text + hint)

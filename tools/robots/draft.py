@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
@@ -72,7 +72,13 @@ class Draft:
     joints: tuple[DraftedJoint, ...]
     passive: tuple[str, ...]
     origin: tuple[float, float, float]  # m, of the base in its body: the model's own may be on the ground
+    posed: bool  # whether the model has a home pose, as a keyframe
     notes: tuple[str, ...]
+
+    def at_home(self, pose: Array) -> Draft:
+        """The same with another home pose `(n_joints,)` rad."""
+        joints = (replace(joint, home=round(float(at), 4) + 0.0) for joint, at in zip(self.joints, pose, strict=True))
+        return replace(self, joints=tuple(joints))
 
     def text(self, out: Path) -> str:
         """The robot's file, which is to be at `out`."""
@@ -133,8 +139,6 @@ def draft(path: Path, choices: Choices) -> Draft:
     drafted = tuple(_joint(model, j, joints, places, axes, notes) for j in joints)
     if loose := [model.joint(j).name for j in joints if not model.jnt_limited[j]]:
         notes.append(f"range of {', '.join(loose)}: the model has none")
-    if not model.nkey:
-        notes.append("home of every joint: the model has no keyframe; on straight knees no robot can walk")
     name = path.stem.replace(" ", "-")
     soles = min(_bottom(model, data, model.geom(geom).id, base) for geoms in feet.values() for geom in geoms)
     bodies = [int(model.geom(geoms[0]).bodyid[0]) for geoms in feet.values()]
@@ -151,6 +155,7 @@ def draft(path: Path, choices: Choices) -> Draft:
         joints=drafted,
         passive=tuple(_each(model, passive)),
         origin=origin,
+        posed=bool(model.nkey),
         notes=tuple(notes),
     )
 

@@ -1,17 +1,22 @@
 """Draft a robot's file from its MJCF or URDF, draw the robot, and list what a person must fill in.
 
 Joints, ranges and mirror pairs are read from the model by its geometry; feet are the lowest bodies at the ends of its
-limbs. What no model says, such as servos and their IDs, is guessed and marked with TODO.
+limbs. Where the model has no keyframe, knees are bent for the home pose. What no model says, such as servos and their
+IDs, is guessed and marked with TODO.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from servoid.hw.config import ConfigError
 from servoid.tools.common.output import add_json_argument, reporting
 from servoid.tools.common.pictures.drawing import choose_drawing
+
+if TYPE_CHECKING:
+    from servoid.tools.robots.draft import Draft
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,6 +35,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_json_argument(parser)
 
 
+def _write(found: Draft, out: Path) -> None:
+    try:
+        out.write_text(found.text(out))
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be written: {error.strerror}") from error
+
+
 def main(args: argparse.Namespace) -> int:
     """Draft, and draw where this machine can; returns 0. Raises ConfigError."""
     with reporting(args.json) as report:
@@ -42,27 +54,33 @@ def main(args: argparse.Namespace) -> int:
                 draws = False
         from servoid.hw.robot.description import load_robot
         from servoid.tools.robots.draft import Choices, draft
+        from servoid.tools.robots.home import bent_home
         from servoid.tools.robots.pictures import poses
 
         out = args.out or Path(f"{args.model.stem}.yaml")
         if out.exists() and not args.force:
             raise ConfigError(f"{out}: is there already: give another --out, or --force")
         found = draft(args.model, Choices(args.servo, args.base, args.imu))
-        try:
-            out.write_text(found.text(out))
-        except OSError as error:
-            raise ConfigError(f"{out}: cannot be written: {error.strerror}") from error
+        _write(found, out)
+        robot, notes = load_robot(out), list(found.notes)
+        if not found.posed:
+            home = bent_home(robot)
+            if home is None:
+                notes.append("home of every joint: the model has no keyframe; on straight knees no robot can walk")
+            else:
+                notes.append("home of every joint: the model has no keyframe; its knees were bent by geometry")
+                _write(found.at_home(home), out)
+                robot = load_robot(out)
         report.line(
             f"wrote {out}: {len(found.joints)} joints, feet {', '.join(found.feet) or 'none'}, base {found.base}"
         )
-        for note in found.notes:
+        for note in notes:
             report.line(f"  to do: {note}")
-        robot = load_robot(out)
         report.line(
             f"{robot.name} stands {robot.standing_height:.3f} m high at home; legs of "
             f"{', '.join(link.joint for link in next(iter(robot.legs.values())))} and their mirrors"
         )
         pictures = poses(robot, out.with_suffix(".png"), report) if draws else None
         report.line(f"next: fill in what is marked TODO, then: servoid robot check {out}")
-        report.result({"out": str(out), "picture": pictures, "todo": list(found.notes), "joints": list(robot.names)})
+        report.result({"out": str(out), "picture": pictures, "todo": notes, "joints": list(robot.names)})
     return 0

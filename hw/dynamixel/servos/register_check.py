@@ -15,7 +15,7 @@ from servoid.hw.dynamixel.transport.bus import Bus
 from servoid.hw.dynamixel.transport.openers import openers
 from servoid.hw.robot.description import Joint, Robot, Servo
 
-POSITION_MODE = 3
+POSITION_MODE, EXTENDED_MODE = 3, 4
 # EEPROM that is not compared.
 UNCOMPARED = {
     "id": "the servo would not have answered",
@@ -129,21 +129,22 @@ def compare(robot: Robot, found: Sequence[Found]) -> list[Difference]:
     lows, highs = units.limits()
     margins = (robot.limits.margin / robot.tick_angles).astype(int)  # ticks that the guard keeps off
     differences: list[Difference] = []
-    for servo, model, low, high, margin in zip(
-        found, robot.servos, lows.tolist(), highs.tolist(), margins.tolist(), strict=True
+    for servo, model, low, high, margin, extended in zip(
+        found, robot.servos, lows.tolist(), highs.tolist(), margins.tolist(), units.extended.tolist(), strict=True
     ):
         wanted = _factory(servo.table) | {
-            "operating_mode": POSITION_MODE,
-            "min_position_limit": low,
-            "max_position_limit": high,
+            "operating_mode": EXTENDED_MODE if extended else POSITION_MODE,
             "return_delay_time": 0,
             "temperature_limit": round(model.max_temperature),
             "status_return_level": 2,
         }
-        narrow = {
-            "min_position_limit": servo.get("min_position_limit") > low + margin,
-            "max_position_limit": servo.get("max_position_limit") < high - margin,
-        }
+        narrow = {}
+        if not extended:  # in that mode the servo heeds no limits of its own
+            wanted |= {"min_position_limit": low, "max_position_limit": high}
+            narrow = {
+                "min_position_limit": servo.get("min_position_limit") > low + margin,
+                "max_position_limit": servo.get("max_position_limit") < high - margin,
+            }
         for register, value in wanted.items():
             found_there = servo.get(register)
             if found_there == value or (register == "secondary_id" and found_there > MAX_ID):

@@ -12,6 +12,7 @@ from servoid.hw.config import ConfigError, nearest
 from servoid.hw.dynamixel.protocol.tables import ControlTable, table
 from servoid.hw.robot.description import Robot
 from servoid.hw.seeds import Stream, generator
+from servoid.sim.rig.servo.firmware import EXTENDED
 
 Assembly = Literal["file", "random"]
 ASSEMBLIES: tuple[str, ...] = get_args(Assembly)
@@ -74,7 +75,7 @@ class FactoryState:
         turned = (rng.random(len(robot.joints)) < _REVERSED).tolist()
         joints = []
         for joint, zero, reverse in zip(robot.joints, off, turned, strict=True):
-            room = math.pi - max(abs(joint.range[0] - joint.zero), abs(joint.range[1] - joint.zero))
+            room = max(math.pi - max(abs(joint.range[0] - joint.zero), abs(joint.range[1] - joint.zero)), 0.0)
             zero = max(-room, min(room, zero))  # the range stays on one side of the servo's seam
             joints.append(
                 replace(joint, zero=joint.zero + zero, direction=-joint.direction if reverse else joint.direction)
@@ -96,8 +97,11 @@ class FactoryState:
             if self.assembly == "file":
                 tick = 2 * math.pi / servo.ticks_per_turn / joint.gear
                 ends = [servo.center_tick + joint.direction * (end - joint.zero) / tick for end in joint.range]
-                set_up["min_position_limit"] = max(math.floor(min(ends)), 0)
-                set_up["max_position_limit"] = min(math.ceil(max(ends)), servo.ticks_per_turn - 1)
+                if robot.extended[len(values)]:
+                    set_up["operating_mode"] = EXTENDED
+                else:
+                    set_up["min_position_limit"] = max(math.floor(min(ends)), 0)
+                    set_up["max_position_limit"] = min(math.ceil(max(ends)), servo.ticks_per_turn - 1)
             values.append(set_up)
         return values
 

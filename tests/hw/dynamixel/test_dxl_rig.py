@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from servoid.hw.contracts.body import Command, Mode, Observation
+from servoid.hw.contracts.body import BackendError, Command, Mode, Observation
 from servoid.hw.dynamixel.backend import DynamixelBackend, DynamixelSensors
 from servoid.hw.dynamixel.motors import DynamixelMotors
 from servoid.hw.faults import LATE, TORQUE_LOST, WATCHDOG
@@ -160,3 +161,30 @@ def test_an_interrupt_at_any_instant_still_lets_torque_off(standing: Standing, c
     standing.motors.write(Command(ROBOT.home, np.ones(20), Mode.DAMP))
     standing.motors.write(Command(ROBOT.home, np.ones(20), Mode.OFF))
     assert standing.torque() == 0
+
+
+def test_a_geared_joint_is_driven_through_turns_of_its_servo() -> None:
+    """In extended position mode, which is written before it is driven, and from wherever the servo counts itself."""
+    joints = tuple(
+        replace(joint, gear=4.0, range=(-1.5, 1.5), zero=0.3) if joint.name == "head_pan" else joint
+        for joint in ROBOT.joints
+    )
+    robot = replace(ROBOT, joints=joints)
+    rig = Rig(robot)
+    rig.servos[0].put("operating_mode", 3)  # as it comes from the factory
+    line = InProcessLine(rig)
+    backend = DynamixelBackend(robot, port=line, clock=line)
+    with pytest.raises(BackendError, match="registers differ"):
+        backend.connect()
+    assert {(d.joint, d.register, d.wanted) for d in backend.differences} == {("head_pan", "operating_mode", 4)}
+    sensors, motors = DynamixelBackend(robot, port=line, clock=line, fix=True).connect()
+    goal = robot.home.copy()
+    for target in (0.0, 1.4, -1.4):
+        for _ in range(150 if target else 5):
+            line.sleep_until((line.now_ns() // TICK_NS + 1) * TICK_NS)
+            seen = sensors.read()
+            goal[0] += np.clip(target - goal[0], -0.03, 0.03)
+            motors.write(Command(goal, np.ones(20), Mode.ACTIVE))
+        assert seen.position[0] == pytest.approx(target, abs=0.05)
+    assert abs(float(rig.motors.angle[0])) > 3.2, "more than half a turn of the servo's horn"
+    motors.off()

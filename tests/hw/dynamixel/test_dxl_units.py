@@ -85,3 +85,20 @@ def test_a_goal_that_is_not_finite_is_named() -> None:
 def test_gains_are_the_firmwares() -> None:
     np.testing.assert_array_equal(units().gain(np.full(20, 0.5)), 400)
     np.testing.assert_array_equal(units().gain(np.full(20, 100.0)), 16383)
+
+
+def test_behind_a_gear_a_joint_goes_further_than_a_turn_of_its_servo() -> None:
+    """Which turn the servo is in is known by the home pose, however often it was turned before."""
+    robot = with_joint(0, gear=4.0, range=(-1.5, 1.5), home=0.2, direction=-1)
+    here = units(robot)
+    assert here.extended.tolist() == [True] + [False] * 19
+    assert here.across_the_seam() == []
+    for turned in (-3, 0, 2):
+        start = units(robot).goal(np.where(here.extended, 0.35, ROBOT.home)) + here.extended * 4096 * turned
+        here.anchor(start.tolist())
+        assert here.position(start)[0] == pytest.approx(0.35, abs=TICK)
+        for q in (-1.5, 1.5):
+            there = here.goal(np.where(here.extended, q, ROBOT.home))
+            assert there[0] - start[0] == pytest.approx(-(q - 0.35) * 4 / TICK, abs=1)
+            assert here.position(there)[0] == pytest.approx(q, abs=TICK)
+        assert here.within_turn(start)[0] == start[0]

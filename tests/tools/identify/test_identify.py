@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
+import signal
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Observation, Sensors
 from servoid.hw.robot.description import Robot, load_robot, load_servo, save_servo
 from servoid.sim.friction import Friction
 from servoid.sim.rig.in_process import InProcessBackend
 from servoid.sim.rig.rig import Rig
+from servoid.stack.log.flightlog import read_log
 from servoid.tools.bench.identify import record_rig
 from servoid.tools.cli import main
 from servoid.tools.identify.excitation import HELD_OUT, middle_pose, plan
@@ -196,3 +199,53 @@ def test_a_log_of_something_else_and_of_another_robot_is_refused(tmp_path: Path,
     run(RunSettings("stand", policy="gait", seconds=0.2, record=tmp_path / "stand.mcap"))
     with pytest.raises(ConfigError, match=r"stand.mcap: a log of stand: servoid identify records what it needs"):
         read_pieces([tmp_path / "stand.mcap"], stilts)
+
+
+@dataclass
+class PressedLater:
+    """A body's sensors, at one of whose readings a person presses Ctrl-C."""
+
+    sensors: Sensors
+    at: int
+    count: int = 0
+
+    def read(self) -> Observation:
+        self.count += 1
+        if self.count == self.at:
+            signal.raise_signal(signal.SIGINT)
+        return self.sensors.read()
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_the_middle_leaves_the_robot_off_and_keeps_whole_motions(tmp_path: Path, stilts: Robot) -> None:
+    motions = plan(stilts, [stilts.names])
+    body = InProcessBackend(Rig(stilts))
+    body.rig.auto_release = False
+    sensors, motors = body.connect()
+    at = round(3.0 * stilts.rate) + len(motions[0].goals) + len(motions[1].goals) // 2  # in the second motion
+    log = tmp_path / "cut.mcap"
+    recorded = record(body, (PressedLater(sensors, at), motors), stilts, motions, 1.0, log)
+    assert recorded.cause == "interrupt"
+    assert any("interrupted" in text for text in recorded.texts)
+    assert not any(state["torque"] for state in body.rig.servo_states())
+    names = [piece.name for piece in read_pieces([log], stilts)]
+    assert names[0] == motions[0].name
+    assert motions[2].name not in names
+
+
+@pytest.mark.slow
+def test_a_joint_that_meets_its_stop_ends_the_recording_and_is_named(tmp_path: Path, stilts: Robot) -> None:
+    """A file that gives a knee more room than the robot has: the motor would push against metal for a minute."""
+    stop = '<geom type="box" size="0.02 0.02 0.05" pos="-0.04 0.05 -0.25"/><site name="imu"'
+    text = Path(stilts.mjcf).read_text().replace('<site name="imu"', stop)
+    (tmp_path / "stopped.xml").write_text(text)
+    body = InProcessBackend(Rig(replace(stilts, mjcf=str(tmp_path / "stopped.xml"))))
+    body.rig.auto_release = False
+    log = tmp_path / "stopped.mcap"
+    recorded = record(body, body.connect(), stilts, plan(stilts, [stilts.names]), 1.0, log)
+    assert recorded.cause == "overload", recorded.texts
+    assert re.search(
+        r"l_(hip|knee) stands still 0\.\d+ rad short of where it was sent: is it at a stop", recorded.texts[-1]
+    )
+    assert not any(state["torque"] for state in body.rig.servo_states())
+    assert read_log(log).complete

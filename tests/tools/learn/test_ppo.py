@@ -110,3 +110,20 @@ def test_a_second_environment_is_learned_in_the_same_loop(tmp_path: Path) -> Non
     assert env.progress[-1] == 1.0
     assert {"term/near", "term/dawdling"} <= set((tmp_path / "log.csv").read_text().splitlines()[0].split(","))
     assert (tmp_path / "resume.pt").exists()
+
+
+def test_an_actor_that_begins_with_something_learns_more_slowly_than_its_critic(tmp_path: Path) -> None:
+    moved = {}
+    for rate in (1.0, 0.01):
+        torch.manual_seed(0)
+        settings = Ppo(samples=64 * 40, worlds=64, horizon=20, hidden=(8,), actor_rate=rate, mirrored=False)
+        trainer = BeadTrainer(Beads(64), settings, tmp_path / str(rate), "beads")
+        parts = trainer.ppo.actor.mlp, trainer.ppo.critic.mlp
+        before = [[p.detach().clone() for p in part.parameters()] for part in parts]
+        trainer.learn()
+        moved[rate] = [
+            max(float((p.detach() - q).abs().max()) for p, q in zip(part.parameters(), old, strict=True))
+            for part, old in zip(parts, before, strict=True)
+        ]
+    assert moved[0.01][0] < 0.05 * moved[1.0][0]
+    assert moved[0.01][1] == pytest.approx(moved[1.0][1], rel=0.3)

@@ -117,6 +117,12 @@ def test_an_episode_that_is_unlike_the_data_ends(prior: Path) -> None:
     assert not late.any()
 
 
+def test_a_place_and_a_ball_are_not_asked_for_where_it_is_to_stand() -> None:
+    stand = Instruction(np.zeros(3), stand=True)
+    assert np.array_equal(GOALS["location"].observe(stand, ROBOT.walking), [0.0, 0.0])
+    assert np.hypot(*GOALS["ball"].observe(stand, ROBOT.walking)[:2]) >= 1.0
+
+
 def test_generated_starts_move_and_stand_on_the_ground(prior: Path) -> None:
     env = made(prior, settings=replace(SETTINGS, generated=1.0))
     env.reset()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from shutil import copy
 
@@ -11,10 +12,12 @@ import numpy as np
 import pytest
 
 from servoid.hw.config import CONFIGS, available
-from servoid.hw.robot.description import load_robot
+from servoid.hw.robot.description import load_robot, load_servo, save_servo
 from servoid.hw.robot.legs import Legs
+from servoid.stack.estimation.odometry import odometry_of
 from servoid.tools.cli import main
 from servoid.tools.robots.compare import findings
+from servoid.tools.robots.home import bent_home
 
 ROBOTS = CONFIGS / "robots"
 
@@ -30,8 +33,15 @@ def test_what_geometry_says_is_drafted_as_it_is_written_by_hand(
 ) -> None:
     code, said = imported(capsys, str(ROBOTS / f"{name}.xml"), "--out", str(tmp_path / "own.yaml"))
     assert code == 0
-    assert "home of every joint: the model has no keyframe; on straight knees no robot can walk" in said["todo"]
+    assert "home of every joint: the model has no keyframe; its knees were bent by geometry" in said["todo"]
     ours, drafted = load_robot(name), load_robot(tmp_path / "own.yaml")
+    knees = [i for i, joint in enumerate(ours.names) if "knee" in joint]
+    assert drafted.home[[drafted.names.index(ours.names[i]) for i in knees]] == pytest.approx(ours.home[knees], abs=0.2)
+    looked = {one.what: one for one in findings(drafted)}
+    assert [what for what, one in looked.items() if not one.good and what != "stiffness at home"] == []
+    assert looked["steps of the gait"].good
+    straight = replace(drafted, joints=tuple(replace(joint, home=0.0) for joint in drafted.joints))
+    assert "bend the knees at home" in findings(straight)[-1].found
     mirrors = [{joint.name: (joint.mirror, joint.mirror_sign) for joint in robot.joints} for robot in (ours, drafted)]
     assert mirrors[1] == mirrors[0]
     assert (drafted.base, drafted.imu_site) == (ours.base, ours.imu_site)
@@ -60,12 +70,32 @@ def test_what_does_not_fit_its_model_is_shown(tmp_path: Path, capsys: pytest.Cap
     assert knee in text
     text = text.replace("mirror: r_sho_pitch, mirror_sign: 1", "mirror: r_sho_pitch, mirror_sign: -1")
     text = text.replace("mirror: l_sho_pitch, mirror_sign: 1", "mirror: l_sho_pitch, mirror_sign: -1")
-    (tmp_path / "wren.yaml").write_text(text.replace(knee, knee.replace("2.1", "1.0")))
+    (tmp_path / "wren.yaml").write_text(text.replace(knee, knee.replace("2.1", "1.5")))
     assert main(["robot", "check", str(tmp_path / "wren.yaml"), "--json"]) == 1
     found = {one["what"]: one for one in json.loads(capsys.readouterr().out)["findings"]}
     assert "l_knee, r_knee" in found["ranges"]["found"]
     assert "most l_sho_pitch" in found["mirrors"]["found"] or "most r_sho_pitch" in found["mirrors"]["found"]
     assert [what for what, one in found.items() if not one["good"]] == ["mirrors", "ranges"]
+
+
+@pytest.mark.parametrize(("hip", "way"), [((-1.5, 0.5), 1), ((-0.5, 1.5), -1), ((-1.5, 1.5), 1)])
+def test_a_knee_of_no_side_bends_where_its_hip_has_room(hip: tuple[float, float], way: int) -> None:
+    """A bird's knees bend the other way."""
+    wren = load_robot("wren")
+    ranges = {"hip_pitch": hip, "knee": (-2.0, 2.0), "ank_pitch": (-1.5, 1.5)}
+    joints = [replace(j, home=0.0, range=ranges.get(j.name[2:], j.range)) for j in wren.joints]
+    home = bent_home(replace(wren, joints=tuple(joints)))
+    assert home is not None
+    assert home[[wren.names.index(f"{side}_knee") for side in "lr"]] * way == pytest.approx(0.75, abs=0.15)
+    assert bent_home(replace(wren, joints=tuple(replace(j, home=h) for j, h in zip(joints, home, strict=True)))) is None
+
+
+def test_servos_too_soft_to_stand_on_are_shown(tmp_path: Path) -> None:
+    """A robot of 1.7 kg on servos of 2.5 N m/rad sank and fell over within 10 s, and everything had fitted."""
+    save_servo(replace(load_servo("xl330-m288"), stiffness=0.3), tmp_path / "soft.yaml")
+    wren = load_robot("wren")
+    soft = replace(wren, joints=tuple(replace(joint, servo=str(tmp_path / "soft.yaml")) for joint in wren.joints))
+    assert [one.what for one in findings(soft) if not one.good] == ["stiffness at home"]
 
 
 @pytest.mark.parametrize("name", available("robots"))
@@ -101,26 +131,27 @@ def test_a_robots_file_is_not_written_over(tmp_path: Path, capsys: pytest.Captur
     assert (tmp_path / "own.yaml").read_text() == "precious"
 
 
-@pytest.mark.parametrize("name", ["wren", "heron"])
 def test_a_robot_without_networks_stands_and_says_what_it_goes_by(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`run stand` needed the odometry of an OP3."""
-    words = [
-        "--policy",
-        "gait",
-        "--fast",
-        "--seconds",
-        "1",
-        "--robot",
-        name,
-        "--record",
-        str(tmp_path / "log.mcap"),
-        "--json",
-    ]
-    assert main(["run", "stand", *words]) == 0
+    for kind in ("xml", "yaml"):
+        copy(ROBOTS / f"heron.{kind}", tmp_path)
+    copy(ROBOTS / "heron" / "xm430-w350.yaml", tmp_path)
+    own = tmp_path / "heron.yaml"
+    own.write_text(own.read_text().replace("heron/xm430", "xm430"))
+    words = ["--policy", "gait", "--fast", "--seconds", "1", "--robot", str(own)]
+    assert main(["run", "stand", *words, "--record", str(tmp_path / "log.mcap"), "--json"]) == 0
     events = json.loads(capsys.readouterr().out)["events"]
     assert any("odometry goes by the legs alone" in event["text"] for event in events)
+
+
+@pytest.mark.parametrize("name", ["wren", "heron"])
+def test_shipped_robots_go_by_odometry_of_their_own(name: str) -> None:
+    """Without it, distances that their legs measure are off by a quarter."""
+    network, warning = odometry_of(load_robot(name))
+    assert network is not None
+    assert warning is None
 
 
 FOREIGN = [Path(path) for path in os.environ.get("SERVOID_FOREIGN_MODELS", "").split(os.pathsep) if path]

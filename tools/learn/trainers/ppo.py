@@ -135,8 +135,8 @@ class PpoTrainer(Trainer):
         self.env.schedule(progress)
         self.ppo.actor.distribution.log_std_param.fill_(np.log(np.interp(progress, [0.0, 1.0], s.noise)))
         self.ppo.learning_rate = s.learning_rate * (1.0 - 0.85 * progress)
-        for group in self.ppo.optimizer.param_groups:
-            group["lr"] = self.ppo.learning_rate
+        actor, critic = self.ppo.optimizer.param_groups
+        actor["lr"], critic["lr"] = s.actor_rate * self.ppo.learning_rate, self.ppo.learning_rate
 
     def learn(self) -> dict[str, float]:
         """Collect `horizon` ticks in every world, and update."""
@@ -248,6 +248,7 @@ def _with_mirrored(env: Any, obs: Any, actions: Any) -> tuple[Any, Any]:
 
 
 def _algorithm(env: Environment, s: Ppo) -> Any:
+    import torch
     from rsl_rl.algorithms import PPO
 
     class Shape:  # what rsl-rl reads of an environment, and `_with_mirrored` after it
@@ -272,7 +273,7 @@ def _algorithm(env: Environment, s: Ppo) -> Any:
             # Mirrored samples alone teach an uneven policy little: they are far from what it would do, and clipped.
             "symmetry_cfg": {
                 "data_augmentation_func": _with_mirrored,
-                "use_data_augmentation": True,
+                "use_data_augmentation": s.mirrored,
                 "use_mirror_loss": True,
                 "mirror_loss_coeff": s.mirror,
             },
@@ -280,4 +281,7 @@ def _algorithm(env: Environment, s: Ppo) -> Any:
         },
     }
     with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks' layers
-        return PPO.construct_algorithm(tensors(env), Shape, config, "cpu")
+        ppo = PPO.construct_algorithm(tensors(env), Shape, config, "cpu")
+    # Each with a rate of its own.
+    ppo.optimizer = torch.optim.Adam([{"params": list(part.parameters())} for part in (ppo.actor, ppo.critic)])
+    return ppo

@@ -1,0 +1,73 @@
+"""A home pose with bent knees, by geometry, for a model that says none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from servoid.hw.contracts.body import Array
+from servoid.hw.robot.description import Robot
+from servoid.hw.robot.inverse import NumericInverse, stance_at_home
+from servoid.hw.robot.legs import Legs
+from servoid.sim.model import build
+
+_LOWER = 0.07  # of a leg's length that the base comes down: knees of equal halves bend by 0.75 rad
+_HIGHER = 0.02  # of it, that a leg reaches down further where its knee is bent already
+_REACHED = 0.25  # of that
+_ROUNDS = 4  # of shifting the feet under the centre of mass
+_EVEN = 0.1  # rad, of a range's middle, from which a knee has no side
+
+
+def bent_home(robot: Robot) -> Array | None:
+    """Joints `(n_joints,)` rad that stand lower than at home, soles turned as there, the centre of mass above their
+    middle; None where the legs are bent already, or do not reach such a pose. Knees that bend to either side are given
+    one."""
+    legs = Legs(robot)
+    at, turn, _, _ = legs.forward(legs.pick(robot.home))
+    down = np.array([0.0, 0.0, stance_at_home(robot, legs).height])
+    inverse = NumericInverse(_with_knees(robot, legs), legs)
+
+    def misses(q: Array, goal: Array) -> bool:
+        return bool(np.linalg.norm(legs.forward(q)[0] - goal, axis=-1).max() > _REACHED * _HIGHER * down[2])
+
+    if not misses(inverse(lower := at - _HIGHER * down, turn), lower):
+        return None
+    model = build(robot)
+    data = mujoco.MjData(model)
+    joints = [int(model.joint(name).qposadr[0]) for name in robot.names]
+    pose, goal = robot.home.copy(), at + _LOWER * down
+    for _ in range(_ROUNDS):
+        pose[legs.index] = inverse(goal, turn)
+        if misses(legs.pick(pose), goal):
+            return None
+        data.qpos[:] = np.eye(1, model.nq, 3)[0]
+        data.qpos[joints] = pose
+        mujoco.mj_fwdPosition(model, data)
+        base = model.body(robot.base).id
+        ahead = float((data.subtree_com[base] - data.xpos[base])[0])
+        soles, _ = legs.soles(legs.pick(pose))
+        goal = goal + np.array([ahead - float(soles[:, 0].mean()), 0.0, 0.0])
+    index, sign = robot.mirror
+    return (pose + pose[index] * sign) / 2
+
+
+def _with_knees(robot: Robot, legs: Legs) -> Robot:
+    """The robot with each knee, the second joint of a leg that pitches, kept to one side where its range has none: to
+    that which leaves the hip more room, as it turns the other way, or else to that of a person's."""
+    _, _, _, axes = legs.forward(legs.pick(robot.home))
+    joints = list(robot.joints)
+    for index, axis in zip(legs.index, axes, strict=True):
+        pitching = np.flatnonzero(np.abs(axis[:, 1]) > 0.7)
+        if len(pitching) < 2:
+            continue
+        hip, knee = joints[int(index[pitching[0]])], joints[int(index[pitching[1]])]
+        low, high = knee.range
+        if abs(low + high) / 2 > _EVEN:
+            continue
+        same = np.sign(axis[pitching[0]] @ axis[pitching[1]])
+        more = -same * (hip.range[0] + hip.range[1] - 2 * hip.home)  # of the hip's room, where the knee's angle grows
+        onwards = more > 0 if abs(more) > _EVEN else axis[pitching[1], 1] > 0
+        joints[int(index[pitching[1]])] = replace(knee, range=(0.0, high) if onwards else (low, 0.0))
+    return replace(robot, joints=tuple(joints))
