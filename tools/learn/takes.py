@@ -54,8 +54,8 @@ def labels(clips: Sequence[Clip]) -> Mapping[str, tuple[str, ...]]:
         for text in clip.about.captions:
             if other := next((name for name, texts in told.items() if text in texts), None):
                 raise ConfigError(
-                    f"clip '{clip.name}': '{text}' is what '{other}' is called, too, and a planner that is told so cannot "
-                    "tell which: give one of them another caption"
+                    f"clip '{clip.name}': '{text}' is what '{other}' is called, too, and a planner that is told so "
+                    "cannot tell which: give one of them another caption"
                 )
         told[clip.name] = clip.about.captions
     return told
