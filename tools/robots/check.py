@@ -1,7 +1,7 @@
 """Compare a robot's file with its model in all that can be compared, and draw the robot.
 
 Kinematics are compared with MuJoCo's at random poses, mirrors and ranges with the model's geometry, and the home pose
-with what its servos can hold.
+with what its servos can hold: their torque, and whether they are stiff enough that the robot does not topple.
 """
 
 from __future__ import annotations

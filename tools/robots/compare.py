@@ -185,5 +185,7 @@ def _steps(robot: Robot) -> Comparison:
     speed = float(np.abs(np.diff(pose, axis=0, append=pose[:1])).max() * 24 / gait.settings.cycle)
     fast = speed > _WHIP * robot.limits.joint_speed
     text = f"beyond the ranges of {', '.join(wrong)}" if wrong else f"within the ranges, joints up to {speed:.1f} rad/s"
-    hint = ": no servo follows; bend the knees at home, or make the gait slower" if fast else ""
+    hint = (
+        ": no servo follows; bend the knees at home, or search for other steps with servoid tune gait" if fast else ""
+    )
     return Comparison(not (wrong or fast), "steps of the gait", text + hint)

@@ -22,8 +22,8 @@ _EVEN = 0.1  # rad, of a range's middle, from which a knee has no side
 
 def bent_home(robot: Robot) -> Array | None:
     """Joints `(n_joints,)` rad that stand lower than at home, soles turned as there, the centre of mass above their
-    middle; None where the legs are bent already, or do not reach such a pose. Knees that bend to either side bend as a
-    person's."""
+    middle; None where the legs are bent already, or do not reach such a pose. Knees that bend to either side are given
+    one."""
     legs = Legs(robot)
     at, turn, _, _ = legs.forward(legs.pick(robot.home))
     down = np.array([0.0, 0.0, stance_at_home(robot, legs).height])
@@ -54,16 +54,20 @@ def bent_home(robot: Robot) -> Array | None:
 
 
 def _with_knees(robot: Robot, legs: Legs) -> Robot:
-    """The robot with each knee, the second joint of a leg that pitches, kept to one side where its range has none."""
+    """The robot with each knee, the second joint of a leg that pitches, kept to one side where its range has none: to
+    that which leaves the hip more room, as it turns the other way, or else to that of a person's."""
     _, _, _, axes = legs.forward(legs.pick(robot.home))
     joints = list(robot.joints)
     for index, axis in zip(legs.index, axes, strict=True):
         pitching = np.flatnonzero(np.abs(axis[:, 1]) > 0.7)
         if len(pitching) < 2:
             continue
-        knee = int(index[pitching[1]])
-        low, high = joints[knee].range
-        if abs(low + high) / 2 < _EVEN:
-            side = (0.0, high) if axis[pitching[1], 1] > 0 else (low, 0.0)
-            joints[knee] = replace(joints[knee], range=side)
+        hip, knee = joints[int(index[pitching[0]])], joints[int(index[pitching[1]])]
+        low, high = knee.range
+        if abs(low + high) / 2 > _EVEN:
+            continue
+        same = np.sign(axis[pitching[0]] @ axis[pitching[1]])
+        more = -same * (hip.range[0] + hip.range[1] - 2 * hip.home)  # of the hip's room, where the knee's angle grows
+        onwards = more > 0 if abs(more) > _EVEN else axis[pitching[1], 1] > 0
+        joints[int(index[pitching[1]])] = replace(knee, range=(0.0, high) if onwards else (low, 0.0))
     return replace(robot, joints=tuple(joints))

@@ -1,7 +1,8 @@
 """Draft a robot's file from its MJCF or URDF, draw the robot, and list what a person must fill in.
 
 Joints, ranges and mirror pairs are read from the model by its geometry; feet are the lowest bodies at the ends of its
-limbs. What no model says, such as servos and their IDs, is guessed and marked with TODO.
+limbs. Where the model has no keyframe, knees are bent for the home pose. What no model says, such as servos and their
+IDs, is guessed and marked with TODO.
 """
 
 from __future__ import annotations

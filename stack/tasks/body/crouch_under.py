@@ -73,7 +73,7 @@ class CrouchUnder(BaseTask):
         """Never fallen, the bar never touched, and at the goal, which lies behind it; not past an end of the bar."""
         return [
             Criterion.never("fell", trace.fallen),
-            Criterion.never("touched the bar", bool(trace.touched)),
+            Criterion.never("touched the bar", self._touched(trace)),
             Criterion.never("went around the bar", self._around(trace)),
             Criterion("final distance from the goal", self._left(trace, episode), "m", most=self.settings.radius),
         ]
@@ -82,7 +82,7 @@ class CrouchUnder(BaseTask):
         beneath = self._beneath(trace)
         return {
             "final_distance_m": self._left(trace, episode),
-            "touched": float(bool(trace.touched)),
+            "touched": float(self._touched(trace)),
             "base_beneath_m": float(trace.displacement[beneath, 2].max()) if beneath.any() else math.nan,
             "path_m": measures.path_length(trace, self.cycle),
             "seconds_to_goal": len(trace.yaw) * trace.dt if self.success(trace, episode) else math.nan,
@@ -101,6 +101,14 @@ class CrouchUnder(BaseTask):
         """Whether the robot's middle was right beneath the bar `(ticks,)`."""
         beneath: Array = np.abs(self._from_bar(trace)[:, 0]) < _THICK
         return beneath
+
+    def _touched(self, trace: Trace) -> bool:
+        """Whether the robot touched the bar. One that cannot feel it believes so where its top was beneath too high."""
+        if trace.touched is not None or trace.objects is None:
+            return bool(trace.touched)
+        edges = trace.objects[:, 0, 2] - _THICK / 2
+        over = trace.displacement[:, 2] + self._build.top > edges
+        return bool((over & self._beneath(trace)).any())
 
     def _around(self, trace: Trace) -> bool:
         """Whether the robot came to the other side beyond an end of the bar."""

@@ -104,6 +104,18 @@ def test_who_goes_around_a_bar_or_touches_it_has_not_passed_under() -> None:
     assert not task.success(stands(under[:40], 0.25, middle))
 
 
+def test_a_robot_that_cannot_feel_a_bar_believes_that_it_hit_it_where_it_was_too_tall_beneath() -> None:
+    task = Drawn(load_task("crouch-under", {}, DT))
+    (bar,) = task.scene.objects
+    middle, top = np.array([*bar.place, bar.height]), build_of(ROBOT).top
+    under = np.column_stack([np.linspace(0.0, 1.0, 60), np.zeros(60)])
+    tall, low = (replace(stands(under, bar.lift - top + off, middle), touched=None) for off in (0.005, -0.005))
+    assert task.metrics(tall)["touched"] == 1.0
+    assert not task.success(tall)
+    assert task.metrics(low)["touched"] == 0.0
+    assert task.success(low)
+
+
 def test_a_bar_costs_height_beneath_it_and_nothing_elsewhere() -> None:
     task = Drawn(load_task("crouch-under", {"way": "cost", "alone.goal": "0", "alone.facing": "0"}, DT))
     here = state()

@@ -17,6 +17,7 @@ from servoid.hw.robot.legs import Legs
 from servoid.stack.estimation.odometry import odometry_of
 from servoid.tools.cli import main
 from servoid.tools.robots.compare import findings
+from servoid.tools.robots.home import bent_home
 
 ROBOTS = CONFIGS / "robots"
 
@@ -75,6 +76,18 @@ def test_what_does_not_fit_its_model_is_shown(tmp_path: Path, capsys: pytest.Cap
     assert "l_knee, r_knee" in found["ranges"]["found"]
     assert "most l_sho_pitch" in found["mirrors"]["found"] or "most r_sho_pitch" in found["mirrors"]["found"]
     assert [what for what, one in found.items() if not one["good"]] == ["mirrors", "ranges"]
+
+
+@pytest.mark.parametrize(("hip", "way"), [((-1.5, 0.5), 1), ((-0.5, 1.5), -1), ((-1.5, 1.5), 1)])
+def test_a_knee_of_no_side_bends_where_its_hip_has_room(hip: tuple[float, float], way: int) -> None:
+    """A bird's knees bend the other way."""
+    wren = load_robot("wren")
+    ranges = {"hip_pitch": hip, "knee": (-2.0, 2.0), "ank_pitch": (-1.5, 1.5)}
+    joints = [replace(j, home=0.0, range=ranges.get(j.name[2:], j.range)) for j in wren.joints]
+    home = bent_home(replace(wren, joints=tuple(joints)))
+    assert home is not None
+    assert home[[wren.names.index(f"{side}_knee") for side in "lr"]] * way == pytest.approx(0.75, abs=0.15)
+    assert bent_home(replace(wren, joints=tuple(replace(j, home=h) for j, h in zip(joints, home, strict=True)))) is None
 
 
 def test_servos_too_soft_to_stand_on_are_shown(tmp_path: Path) -> None:
