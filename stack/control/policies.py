@@ -113,6 +113,7 @@ POLICIES: dict[str, Maker] = {
     "fast": _expert,
     "gait": _gait,
     "speed": _task_policy,
+    "steering": _task_policy,
 }
 _KINDS: dict[str, Maker] = {  # of .safetensors files
     "diffusion": _diffusion,

@@ -1,5 +1,6 @@
 """Draw a recorded run: its path from above, velocities, tilt, joints, supply and tick timing. Several logs are drawn
-over each other. `--joints` draws the targets and positions of joints instead, `--video` a film.
+over each other. `--joints` draws the targets and positions of joints instead, `--video` a film, and `--strip` pictures
+of the second in its middle, from two sides.
 """
 
 from __future__ import annotations
@@ -11,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from servoid.hw.config import ConfigError, nearest
+from servoid.hw.robot.description import load_robot
 from servoid.stack.log.flightlog import FlightLog, read_log
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import Progress, add_json_argument, reporting
 from servoid.tools.common.pictures import panels
 from servoid.tools.common.pictures.caption import heading
-from servoid.tools.common.pictures.drawing import prepare
+from servoid.tools.common.pictures.drawing import choose_filming, prepare
 from servoid.tools.common.pictures.panels import Panel, Shown, new_figure, save_figure
 from servoid.tools.common.summary import OUTCOMES
 
@@ -30,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="FILE", help="picture to write, PNG (default: beside the first log)"
     )
     parser.add_argument("--video", type=Path, metavar="FILE", help="film a log instead: MP4")
+    parser.add_argument("--strip", type=Path, metavar="FILE", help="draw moments of a log side by side instead: PNG")
     parser.add_argument(
         "--video-size", default="1280x720", metavar="WxH", help="size of the film (default: %(default)s)"
     )
@@ -42,6 +45,8 @@ def main(args: argparse.Namespace) -> int:
         made: dict[str, Any] = {}
         if args.video is not None:
             made["video"] = _film(logs, args)
+        elif args.strip is not None:
+            made["strip"] = _strip(logs, args.strip)
         else:
             out = args.out or args.log[0].with_name("-".join(path.stem for path in args.log) + ".png")
             plot_runs(logs, out, None if args.joints is None else args.joints.split(","))
@@ -67,6 +72,24 @@ def _film(logs: Sequence[FlightLog], args: argparse.Namespace) -> Path:
             make_video(logs[0], path, size, progress)
     except VideoError as error:
         raise ConfigError(f"--video: {error}") from None
+    return path
+
+
+def _strip(logs: Sequence[FlightLog], path: Path) -> Path:
+    if len(logs) > 1:
+        raise ConfigError("--strip: a strip shows one run: name one log")
+    if path.suffix != ".png":
+        raise ConfigError(f"--strip {path}: give a name that ends in .png")
+    choose_filming("--strip")
+    from servoid.sim.render import RenderError
+    from servoid.tools.common.pictures.video import middle_frames
+    from servoid.tools.motions.film import COLUMNS, strip, write_picture
+
+    robot = load_robot(logs[0].header["settings"]["robot"])
+    try:
+        write_picture(path, strip(middle_frames(logs[0], COLUMNS), robot))
+    except (RenderError, OSError) as error:
+        raise ConfigError(f"--strip: {error}") from None
     return path
 
 

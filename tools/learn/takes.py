@@ -43,11 +43,20 @@ class Take:
 
 
 def labels(clips: Sequence[Clip]) -> Mapping[str, tuple[str, ...]]:
-    """What can be told, with its phrasings: the motions of walking, then the clips. A label is a number in it."""
+    """What can be told, with its phrasings: the motions of walking, then the clips. A label is a number in it.
+
+    Raises ConfigError for a name or a phrasing that two of them have.
+    """
     told = {motion.name: motion.phrasings for motion in MOTIONS}
     for clip in clips:
         if clip.name in told:
             raise ConfigError(f"clip '{clip.name}': a way of walking has that name: give it another one")
+        for text in clip.about.captions:
+            if other := next((name for name, texts in told.items() if text in texts), None):
+                raise ConfigError(
+                    f"clip '{clip.name}': '{text}' is what '{other}' is called, too, and a planner that is told so "
+                    "cannot tell which: give one of them another caption"
+                )
         told[clip.name] = clip.about.captions
     return told
 

@@ -40,7 +40,7 @@ def film(clip: Clip, robot: Robot, path: Path, *, in_physics: bool) -> None:
     shown = frames(clip, robot, in_physics=in_physics)
     if path.suffix == ".png":
         at = np.linspace(0, len(shown) - 1, COLUMNS).round().astype(int)
-        _write_picture(path, strip([shown[i] for i in at], robot))
+        write_picture(path, strip([shown[i] for i in at], robot))
         return
     step = max(round(robot.rate / FPS), 1)
     sides = [_drawn(shown[::step], robot, azimuth) for azimuth in SIDES]
@@ -59,7 +59,8 @@ def _drawn(shown: list[Frame], robot: Robot, azimuth: float) -> list[Array]:
     return [picture.copy() for picture in render(robot, shown, *SIZE, shadows=False, azimuth=azimuth)]
 
 
-def _write_picture(path: Path, picture: Array) -> None:
+def write_picture(path: Path, picture: Array) -> None:
+    """Write `(height, width, 3)` uint8 as a small PNG. Raises OSError."""
     from PIL import Image
 
     Image.fromarray(picture).quantize(48).save(path)

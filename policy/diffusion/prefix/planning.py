@@ -16,12 +16,13 @@ class Planning:
     text_weight: float = 2.5  # of classifier-free guidance by the sentence; 0: unread, 1: as trained
     text_nearest: bool = True  # a sentence is read as the nearest one of the training; False: word by word
     reach: float = 0.33  # m that a goal is asked for ahead at most, within one plan
+    turn: float = 1.2  # rad that a heading is asked for away at most, within one plan
 
     def __post_init__(self) -> None:
         if self.frames < 1 or self.delay < 0 or self.steps < 0:
             raise ValueError("frames must be at least 1, and delay and steps must not be negative")
-        if self.text_weight < 0 or self.reach <= 0:
-            raise ValueError("text_weight must not be negative, and reach must be positive")
+        if self.text_weight < 0 or min(self.reach, self.turn) <= 0:
+            raise ValueError("text_weight must not be negative, and reach and turn must be positive")
 
 
 def history_ticks(prefix: int, stride: int) -> int:

@@ -164,20 +164,32 @@ class PlannerRuntime:
         if instruction.targets is not None:
             for name, values in instruction.targets.items():
                 each = np.broadcast_to(values, (batch, *np.shape(values)[-1:]) if np.ndim(values) else (batch,))
+                if name == target.HEADING:
+                    each = np.clip(each, -self._planning.turn, self._planning.turn)
                 for asked, value in zip(wanted, each, strict=True):
                     asked.append((name, np.atleast_1d(value)))
+        elif instruction.text is None and (instruction.goal is None or velocity.any()):
+            for asked, place, angle in zip(wanted, *self._led(instruction, velocity), strict=True):
+                asked += [("ground", place), (target.HEADING, np.atleast_1d(angle))]
         elif instruction.goal is not None:
             goal = np.broadcast_to(instruction.goal, (batch, 2))
-            distance = np.linalg.norm(goal, axis=-1, keepdims=True)
-            near = goal * np.minimum(self._planning.reach / np.maximum(distance, 1e-9), 1.0)
-            for asked, place in zip(wanted, near, strict=True):
+            for asked, place in zip(wanted, _within(goal, self._planning.reach), strict=True):
                 asked.append(("ground", place))
-        elif instruction.text is None:  # where the velocity leads to, along an arc
-            seconds = (self._model.config.frames + self._planning.delay / self._frames.stride) * self._frames.dt
-            angle = velocity[:, 2] * seconds
-            chord = velocity[:, :2] * (seconds * np.sinc(angle / (2 * np.pi)))[:, None]
-            for asked, place, heading in zip(wanted, turned(chord, angle / 2), angle, strict=True):
-                asked += [("ground", place), (target.HEADING, np.atleast_1d(heading))]
+
+    def _led(self, instruction: Instruction, velocity: Array) -> tuple[Array, Array]:
+        """Where the velocity leads to by the end of a plan, along an arc: places `(batch, 2)` m and turns `(batch,)`.
+
+        A velocity that leads to a goal is one for this moment: a plan goes no further than the goal, and toward it, and
+        turns no further than to face it.
+        """
+        seconds = (self._model.config.frames + self._planning.delay / self._frames.stride) * self._frames.dt
+        angle = velocity[:, 2] * seconds
+        chord = velocity[:, :2] * (seconds * np.sinc(angle / (2 * np.pi)))[:, None]
+        if instruction.goal is None:
+            return turned(chord, angle / 2), angle
+        goal = np.broadcast_to(instruction.goal, chord.shape)
+        bearing = np.abs(np.arctan2(goal[:, 1], goal[:, 0]))
+        return _within(goal, np.linalg.norm(chord, axis=-1, keepdims=True)), np.clip(angle, -bearing, bearing)
 
     def _sentence(self, text: str) -> Tensor:
         if text not in self._read:
@@ -188,3 +200,9 @@ class PlannerRuntime:
                 tokens = self._encoder.tokens([text], self._model.config.words)
             self._read[text] = torch.from_numpy(tokens)
         return self._read[text]
+
+
+def _within(goal: Array, reach: float | Array) -> Array:
+    """Places `(batch, 2)` on the way to goals `(batch, 2)`, so far off at most."""
+    distance = np.linalg.norm(goal, axis=-1, keepdims=True)
+    return np.asarray(goal * np.minimum(reach / np.maximum(distance, 1e-9), 1.0))

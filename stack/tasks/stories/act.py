@@ -63,6 +63,7 @@ class Act:
     done: Done
     seconds: float  # from its beginning, after which it has failed
     sentence: str | None = None  # that asks a planner for it; none: as the velocity says
+    lasts: float = 0.0  # s that a planner takes for that; 0: as long as the skill
     targets: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     # where parts shall be, m from the thing's middle: along its heading, to the left and up; by name
     skill: str | None = None  # that performs it; none: standing there does
@@ -72,8 +73,8 @@ class Act:
     name: str = ""  # of its file
 
     def __post_init__(self) -> None:
-        if self.seconds <= 0.0 or self.share < 0.0:
-            raise ValueError("seconds must be positive, and share not negative")
+        if self.seconds <= 0.0 or min(self.share, self.lasts) < 0.0:
+            raise ValueError("seconds must be positive, and share and lasts not negative")
 
 
 def load_acts(skills: Mapping[str, Skill]) -> dict[str, Act]:

@@ -49,6 +49,7 @@ class Machine(BaseBehaviour):
         self._acting: int | None = None  # tick at which the act itself was asked for
         self._facing: float | None = None  # rad, toward the thing, as its approach began
         self._aside = False  # whether it has turned its back to the seat, away from it
+        self._done = False  # the act, though the robot may be in the middle of it
         self._held = 0  # ticks for which what it is done by has held
         self._recent: deque[State] = deque(maxlen=self._ticks(REST_SECONDS) + 1)
         self._events: list[str] = []
@@ -71,8 +72,12 @@ class Machine(BaseBehaviour):
         thing, lost = self._see(percept)
         self._say(lost)
         act = self._act
-        if lost is None and self._is_done(act, state, thing):
-            self._events.append(f"'{act.name}' is done, {(tick - self._began) * self._dt:.1f} s after it began")
+        if self._done or (lost is None and self._is_done(act, state, thing)):
+            if not self._done:
+                self._events.append(f"'{act.name}' is done, {(tick - self._began) * self._dt:.1f} s after it began")
+            self._done = True
+            if self._in_motion(act):
+                return Instruction(np.zeros(3), text=act.sentence)
             self._next(tick)
             return self._rest() if self._over is not None else self.instruct_again(state, percept)
         if (tick - self._began) * self._dt > act.seconds:
@@ -94,7 +99,8 @@ class Machine(BaseBehaviour):
 
     def _next(self, tick: int) -> None:
         self._acting = self._facing = None
-        self._aside, self._held, self._began = False, 0, tick
+        self._aside = self._done = False
+        self._held, self._began = 0, tick
         if self._number + 1 == len(self.episode.acts):
             self._over = tick
         else:
@@ -154,8 +160,18 @@ class Machine(BaseBehaviour):
         """Whether the act was performed, and did not do it: what stays where it is, as on a seat, is given its time."""
         if self._acting is None or act.approach is None or act.skill is None or act.done.seated:
             return False
-        skill = self._skills[act.skill]
-        return self._tick - self._acting > self._ticks(skill.seconds + AGAIN_SECONDS)
+        return self._tick - self._acting > self._ticks(self._lasts(act, act.skill) + AGAIN_SECONDS)
+
+    def _lasts(self, act: Act, skill: str) -> float:
+        """s that an act takes by its skill, or by a planner."""
+        return act.lasts if act.lasts and not self._performs else self._skills[skill].seconds
+
+    def _in_motion(self, act: Act) -> bool:
+        """Whether a planner is in the middle of what it was told: it knows no way back from there, on one foot say, but
+        to its end. A skill ends by itself."""
+        if self._performs or self._acting is None or act.skill is None:
+            return False
+        return self._tick - self._acting < self._ticks(self._lasts(act, act.skill))
 
     def _walk(self, act: Act, state: State, thing: Array) -> Instruction | None:
         """To where the act is performed; None where the robot is there."""

@@ -131,6 +131,26 @@ def test_velocity_goal_and_targets_change_a_plan_and_a_far_goal_is_asked_for_in_
         plan(Instruction(np.zeros(3), text="???"))
 
 
+def test_a_velocity_that_leads_to_a_goal_is_planned_for_no_further_than_it(checkpoint: str) -> None:
+    runtime = _runtime(checkpoint)
+
+    def plan(velocity: tuple[float, float, float], **asked: object) -> Array:
+        return runtime.plan(_request(instruction=Instruction(np.array(velocity), **asked))).states  # type: ignore[arg-type]
+
+    ahead = (0.2, 0.0, 0.0)
+    far, further, none = plan(ahead, goal=np.array([2.0, 0.0])), plan(ahead, goal=np.array([3.0, 0.0])), plan(ahead)
+    np.testing.assert_allclose(far, further, atol=1e-6)
+    np.testing.assert_allclose(far, none, atol=1e-6)
+    assert not np.allclose(far, plan(ahead, goal=np.array([0.03, 0.0])), atol=1e-5)
+    turning = (0.0, 0.0, 0.8)
+    beside, aside = (plan(turning, goal=np.array([1.0, y])) for y in (0.02, 3.0))
+    assert not np.allclose(beside, aside, atol=1e-5), "it faces the goal, and turns no further"
+    targets = [{"heading": np.array(angle)} for angle in (2.0, 3.0, 0.2)]
+    most, more, less = (plan((0.0, 0.0, 0.0), targets=asked) for asked in targets)
+    np.testing.assert_allclose(most, more, atol=1e-6)
+    assert not np.allclose(most, less, atol=1e-5)
+
+
 def test_a_sentence_is_read_as_the_nearest_of_the_training(checkpoint: str) -> None:
     """So that one that no training saw asks for a motion all the same."""
     nearest, plain = _runtime(checkpoint), _runtime(checkpoint, text_nearest=False)
@@ -214,7 +234,7 @@ def test_without_a_planner_it_says_how_to_train_one() -> None:
 
 def test_it_is_found_by_its_settings_and_by_its_checkpoint(checkpoint: str, tmp_path: Path) -> None:
     task = load_task("stand", {}, ROBOT.dt)
-    assert load_settings().frames == 40
+    assert load_settings().frames == 20
     policy = make_policy(checkpoint, ROBOT, task, False)
     policy.close()
     assert policy_fingerprint(checkpoint)["closed_loop"]["feedback"] is True

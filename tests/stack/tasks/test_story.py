@@ -137,6 +137,24 @@ def test_words_ask_for_the_same_acts_by_a_sentence_and_by_where_parts_shall_be()
     np.testing.assert_allclose(near.targets["left hand"], [0.15, 0.03, 0.33], atol=0.02)
 
 
+def test_words_ask_for_a_kick_to_its_end_though_the_bag_lies_before_that() -> None:
+    """A planner knows no way back from one foot but that."""
+    _, episode, machine = _story(plan="kick-left", by="words")
+    standing, seen = _poses(episode), Percept("scene", 0.0, objects=_poses(episode))
+    lying = standing.copy()
+    lying[0, 3:] = [np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]
+    fallen = replace(seen, objects=lying)
+    away = np.arctan2(standing[0, 1], standing[0, 0])
+    spot = standing[0, :2] - 0.15 * np.array([np.cos(away), np.sin(away)])
+    there = _at(spot + 0.05 * np.array([np.sin(away), -np.cos(away)]), float(away))
+    machine.instruct(0, STANDING, seen)  # where it is to face is seen from afar
+    assert machine.instruct(1, there, seen).text == "kick high with the left foot"
+    assert machine.instruct(round(3.0 / ROBOT.dt), there, fallen).text == "kick high with the left foot"
+    assert len(machine.take_events()) == 1
+    assert machine.instruct(round(6.0 / ROBOT.dt), there, fallen).stand
+    assert not machine.take_events(), "it is said once"
+
+
 def test_things_are_not_in_each_others_way() -> None:
     for seed in range(5):
         task, *_ = _story(plan="sit,rise,reach,punch,any,any")

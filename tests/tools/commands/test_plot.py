@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from servoid.hw.robot.description import load_robot
@@ -12,6 +13,7 @@ from servoid.stack.log.flightlog import read_log
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.tools.cli import main
 from servoid.tools.commands.plot import title
+from servoid.tools.common.pictures.video import middle_frames
 
 
 class Marcher(GaitPolicy):
@@ -44,6 +46,16 @@ def test_logs_cut_anywhere_are_drawn(log: Path, share: float, tmp_path: Path) ->
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("one.png", "two.png", "joints.png"))
 
 
+def test_a_strip_shows_the_middle_of_a_run(log: Path) -> None:
+    run_of = read_log(log)
+    shown = middle_frames(run_of, 4, seconds=0.2)
+    place = run_of.column("/state", "displacement")[run_of.ticks("/state") >= run_of.ticks("/instruction")[0]]
+    at = [int(np.argmin(np.abs(place - frame.place).sum(1))) for frame in shown]
+    assert at == sorted(set(at))  # four moments, in their order
+    assert at[0] == pytest.approx(len(place) / 2 - 5, abs=2.5)
+    assert at[-1] == pytest.approx(len(place) / 2 + 5, abs=2.5)
+
+
 @pytest.mark.slow
 def test_two_logs_have_a_file_of_their_own(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Beside the first, whose own plot is left alone."""
@@ -57,6 +69,7 @@ def test_two_logs_have_a_file_of_their_own(log: Path, capsys: pytest.CaptureFixt
         (["--joints", "l_kne"], "no joint 'l_kne': did you mean 'l_knee'?"),
         (["--video", "a.avi"], "give a name that ends in .mp4"),
         (["--video", "a.mp4", "--video-size", "wide"], "such as 1280x720"),
+        (["--strip", "a.jpg"], "give a name that ends in .png"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(

@@ -71,6 +71,15 @@ def test_a_pose_that_nothing_leads_on_from_is_refused() -> None:
         TakeMaker(ROBOT, CLIPS[:2], np.random.default_rng(0))
 
 
+def test_one_phrasing_names_one_motion() -> None:
+    """A planner that was told two of them alike did the one where it was asked for the other."""
+    wave = CLIPS[0]
+    for caption in ("turn left on the spot", LIBRARY["rise"].about.captions[0]):
+        twice = replace(wave, about=replace(wave.about, captions=(caption,)))
+        with pytest.raises(ConfigError, match=f"clip 'wave': '{caption}'"):
+            labels([LIBRARY["rise"], twice])
+
+
 def test_takes_are_learned_from_as_they_are_executed_until_they_are_lost() -> None:
     """By the clips' own goals here. A robot that is made to give way is lost, and what is left ends before that."""
     frames = Frames(ROBOT)

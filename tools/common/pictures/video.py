@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
 from servoid.stack.log.flightlog import FlightLog
@@ -63,6 +64,16 @@ def make_video(
         raise VideoError(str(error)) from error
     except OSError as error:
         raise VideoError(f"{path}: {error}") from error
+
+
+def middle_frames(log: FlightLog, count: int, seconds: float = 1.0) -> list[Frame]:
+    """So many moments of a second in the middle of what a film shows. Raises ConfigError for a log without states."""
+    if not log.messages["/state"]:
+        raise ConfigError(f"{log.path}: holds no state: the run ended before every sensor was read")
+    rows = _rows(log)
+    middle, half = len(rows) / 2, 0.5 * seconds * FPS
+    picked = np.linspace(middle - half, middle + half, count).round().astype(int)
+    return shown_frames(log, rows[np.clip(picked, 0, len(rows) - 1)])
 
 
 def _rows(log: FlightLog) -> Array:

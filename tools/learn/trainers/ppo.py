@@ -183,7 +183,7 @@ class PpoTrainer(Trainer):
     def restore(self, path: Path, saved: Mapping[str, Any]) -> None:
         try:
             self.ppo.load(saved["ppo"], None, True)
-        except RuntimeError:  # torch's word for weights of other shapes
+        except (RuntimeError, ValueError):  # torch's words for weights of other shapes, and for other groups of them
             raise ConfigError(
                 f"{path}: a network with other inputs or layers: use --no-resume or another --out"
             ) from None
