@@ -151,10 +151,12 @@ def _required(cls: Any) -> list[str]:
     return [f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING]
 
 
-@functools.cache
 def hints_of(cls: Any) -> dict[str, Any]:
     """Types of a dataclass's fields by their names, kept: finding them takes most of the time of a small file."""
-    return typing.get_type_hints(cls)
+    return _hints(cls)
+
+
+_hints = functools.cache(typing.get_type_hints)
 
 
 class _Reader:

@@ -127,9 +127,13 @@ def as_typed(value: Any) -> str:
     return "none" if value is None else f"{value:g}" if isinstance(value, (int, float)) else str(value)
 
 
-@functools.cache
 def _described(cls: Any) -> tuple[tuple[str, Setting, bool], ...]:
     """Name and setting of each field that has one, and whether its value is a range."""
+    return _found(cls)
+
+
+@functools.cache
+def _found(cls: Any) -> tuple[tuple[str, Setting, bool], ...]:
     hints = typing.get_type_hints(cls, include_extras=True)
     found = []
     for f in fields(cls):
