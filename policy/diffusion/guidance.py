@@ -88,6 +88,8 @@ class Guidance:
         clean = predicted.detach().numpy()
         for again in reversed(range(self.repeats)):
             cost, slope = self.slope(clean)
+            if not np.isfinite(cost).all():  # its slope may be finite all the same, but leads nowhere
+                raise Diverged("the guidance cost is not finite on this trajectory; check the task's cost")
             gradient = slope
             if through:
                 pulled = torch.from_numpy(slope)

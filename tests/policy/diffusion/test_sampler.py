@@ -261,6 +261,15 @@ def test_a_cost_without_a_finite_gradient_is_an_error() -> None:
         sampler.sample(full_sequence(LEVELS, 1, 1, 1), unknown(1), generators(1), guidance)
 
 
+@pytest.mark.parametrize("cost", [np.nan, np.inf])
+@pytest.mark.parametrize("limited", [False, True])
+def test_a_cost_that_is_not_finite_is_an_error_though_its_gradient_is(cost: float, limited: bool) -> None:
+    sampler = Sampler(lambda s, a, ks, ka: (torch.zeros_like(s), a), cosine_signal(LEVELS))
+    guidance = Guidance(lambda s: (np.full(len(s), cost), np.ones_like(s)), weight=1.0, clip=1.0, limited=limited)
+    with pytest.raises(Diverged, match="cost is not finite"):
+        sampler.sample(full_sequence(LEVELS, 1, 1, 1), unknown(1), generators(1), guidance)
+
+
 def test_an_unknown_gradient_is_refused() -> None:
     with pytest.raises(ConfigError, match="'numeric'"):
         Guidance(by_torch(lambda s: s.sum()), 1.0, 1.0, gradient="numeric")
