@@ -167,10 +167,10 @@ def test_standing_it_neither_moves_nor_sinks() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("policy", "walks"), [("expert", 20), ("diffusion", 10), ("gait", 20)])  # plans take long
-def test_drift_of_walks_is_a_small_share_of_the_path(policy: str, walks: int) -> None:
-    result = drift(ROBOT, maker(ROBOT, policy), load_odometry(ROBOT), walks=walks, seconds=30.0, seed=11)
-    assert result.walks >= 0.75 * walks  # that stayed up and covered more than a metre
+@pytest.mark.parametrize("policy", ["expert", "diffusion", "gait"])
+def test_drift_of_twenty_walks_is_a_small_share_of_the_path(policy: str) -> None:
+    result = drift(ROBOT, maker(ROBOT, policy), load_odometry(ROBOT), walks=20, seconds=30.0, seed=11)
+    assert result.walks >= 15  # that stayed up and covered more than a metre
     assert result.p90 <= 0.04
     assert result.yaw_p90 <= 0.1
 
