@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import ctypes
 import signal
 import sys
 import threading
@@ -12,6 +13,24 @@ from multiprocessing import resource_tracker
 from types import FrameType
 
 _AGAIN_SECONDS = 0.02
+_DISABLE = 2  # SS_DISABLE of sigaltstack(2)
+
+
+class _Stack(ctypes.Structure):
+    """stack_t of sigaltstack(2)."""
+
+    _fields_ = (("start", ctypes.c_void_p), ("flags", ctypes.c_int), ("size", ctypes.c_size_t))
+
+
+def ordinary_stack() -> None:
+    """Have this thread's signals handled on its ordinary stack.
+
+    Python asks for another one where the thread has it. Libraries that export and run networks give the thread one and
+    free it again: then the first Ctrl-C ends the program by a segmentation fault, torque on.
+    """
+    set_stack = getattr(ctypes.CDLL(None), "sigaltstack", None)
+    if set_stack is not None:
+        set_stack(ctypes.byref(_Stack(None, _DISABLE, 0)), None)
 
 
 def raise_interrupts() -> None:

@@ -9,6 +9,7 @@ import pytest
 from synthetic_recording import write_dataset
 
 from servoid.hw.robot.description import load_robot
+from servoid.hw.signals import ordinary_stack
 
 # A shell lets what it starts in the background ignore Ctrl-C and Ctrl-\\, and nohup a hang-up. A run leaves alone what
 # it finds ignored, and the tests of what these signals do would wait for ever.
@@ -16,6 +17,11 @@ for number in (signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP):
     signal.signal(number, signal.SIG_DFL)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_runtest_teardown() -> None:
+    """Tests that send a signal to themselves do so without a run, which would see to this."""
+    ordinary_stack()
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
-from servoid.hw.signals import importing
+from servoid.hw.signals import importing, ordinary_stack
 from servoid.stack.safety.event import Event
 
 # Whatever ends a process, or freezes it, and can be handled: a robot that walks is brought to rest first. Of these a
@@ -60,10 +60,12 @@ class Interrupt:
     def settle(self) -> None:
         """End of being eager: signals are requests from here on. Raises KeyboardInterrupt for one that came before."""
         self.eager = False
+        ordinary_stack()  # what was loaded since may have given this thread another
         self.check()
 
     def __enter__(self) -> Interrupt:
         if threading.current_thread() is threading.main_thread():
+            ordinary_stack()
             free = [number for number in (*ELSE, *IGNORED) if signal.getsignal(number) is signal.SIG_DFL]
             for number in (*ALWAYS, *free):
                 handler = signal.SIG_IGN if number in IGNORED else self._handle

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -62,3 +64,33 @@ def test_a_program_that_was_told_to_survive_its_terminal_does() -> None:
             assert interrupt.count == 0
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+ON_A_STACK_THAT_IS_GONE = """
+import ctypes, mmap, signal
+from servoid.stack.runtime.interrupt import Interrupt
+class Stack(ctypes.Structure):
+    _fields_ = (("start", ctypes.c_void_p), ("flags", ctypes.c_int), ("size", ctypes.c_size_t))
+libc = ctypes.CDLL(None)
+libc.mmap.restype = ctypes.c_void_p
+size = 65536
+place = libc.mmap(None, ctypes.c_size_t(size), 3, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, -1, ctypes.c_long(0))
+def lost():
+    libc.sigaltstack(ctypes.byref(Stack(place, 0, size)), None)
+lost()
+libc.munmap(ctypes.c_void_p(place), ctypes.c_size_t(size))
+with Interrupt() as interrupt:
+    signal.raise_signal(signal.SIGINT)
+    lost()
+    try:
+        interrupt.settle()
+    except KeyboardInterrupt:
+        signal.raise_signal(signal.SIGINT)
+    print(interrupt.count)
+"""
+
+
+def test_a_signal_is_counted_though_a_library_took_away_the_stack_that_it_gave_for_signals() -> None:
+    """Exporting a network leaves one behind that is unmapped: Ctrl-C ended the program by a segmentation fault."""
+    result = subprocess.run([sys.executable, "-c", ON_A_STACK_THAT_IS_GONE], capture_output=True, text=True)
+    assert (result.stdout, result.stderr, result.returncode) == ("2\n", "", 0)
