@@ -28,9 +28,8 @@ def ordinary_stack() -> None:
     Python asks for another one where the thread has it. Libraries that export and run networks give the thread one and
     free it again: then the first Ctrl-C ends the program by a segmentation fault, torque on.
     """
-    set_stack = getattr(ctypes.CDLL(None), "sigaltstack", None)
-    if set_stack is not None:
-        set_stack(ctypes.byref(_Stack(None, _DISABLE, 0)), None)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).sigaltstack(ctypes.byref(_Stack(None, _DISABLE, 0)), None)
 
 
 def raise_interrupts() -> None:
