@@ -350,7 +350,7 @@ class OdometryWalks:
     policy: Annotated[tuple[str, ...], "policies or checkpoints that walk, besides the gait"] = ("expert", "diffusion")
     worlds: Annotated[int, "simulated robots that walk, over all policies"] = 192
     seconds: Annotated[float, "seconds that each of them walks"] = 60.0
-    floor: Annotated[float, "friction of the floor that they walk on, as a share of the robot's floor_friction"] = 0.75
+    floor: Annotated[float, "friction of the floor that they walk on, as a share of the robot's floor_friction"] = 1.0
     walks: Annotated[int, "walks of each policy on which the drift is measured"] = 64
     walk_seconds: Annotated[float, "seconds of each of these walks"] = 30.0
 

@@ -106,8 +106,8 @@ def measure(
 
 
 def walked(robot: Robot, makers: Mapping[str, MakePolicy], settings: OdometryTraining) -> dict[str, Array]:
-    """Record walks of every kind, for every way of walking slips in its own: see `record`. Floors are more slippery than
-    the robot's own, by the share `floor`: feet that hold teach nothing of feet that slip."""
+    """Record walks of every kind, for every way of walking slips in its own: see `record`. `floor` makes floors
+    more slippery than the robot's own, since feet that hold teach nothing of feet that slip."""
     known = _shipped(robot)
     slippery = replace(robot, floor_friction=settings.floor * robot.floor_friction)
     data: dict[str, Array] = {}
