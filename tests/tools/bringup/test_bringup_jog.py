@@ -12,6 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from waiting import type_in
 
 from servoid.hw.contracts.body import Observation
 from servoid.hw.dynamixel.transport.bus import Bus
@@ -220,13 +221,11 @@ def test_a_burst_of_keys_moves_no_further_than_one_and_idleness_ends(monkeypatch
     try:
         with jogging.Keys() as keys:
             assert keys.wish(0.0, 0.0) is Wish.HOLD
-            os.write(master, b"\x1b[C" * 30)
-            time.sleep(0.05)
+            type_in(master, slave, b"\x1b[C" * 30)
             assert keys.wish(1.0, 0.0) is Wish.UP
             assert keys.wish(1.0 + 0.9 * KEY_SECONDS, 0.0) is Wish.UP
             assert keys.wish(1.0 + 1.1 * KEY_SECONDS, 0.0) is Wish.HOLD
-            os.write(master, b"+\x1b[B")
-            time.sleep(0.05)
+            type_in(master, slave, b"+\x1b[B")
             assert keys.wish(3.0, 0.0) is Wish.DOWN, "the newest counts"
             assert keys.wish(3.0 + IDLE_SECONDS, 0.0) is Wish.END
     finally:
