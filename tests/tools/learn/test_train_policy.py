@@ -119,7 +119,7 @@ def test_an_episode_that_is_unlike_the_data_ends(prior: Path) -> None:
 
 def test_a_place_and_a_ball_are_not_asked_for_where_it_is_to_stand() -> None:
     stand = Instruction(np.zeros(3), stand=True)
-    assert np.array_equal(GOALS["location"].observe(stand, ROBOT.walking), [0.0, 0.0])
+    assert np.array_equal(GOALS["location"].observe(stand, ROBOT.walking), [0.0, 0.0, 1.0, 0.0])
     assert np.hypot(*GOALS["ball"].observe(stand, ROBOT.walking)[:2]) >= 1.0
 
 
@@ -157,6 +157,12 @@ def test_rewards_are_highest_for_what_is_asked() -> None:
     place = np.array([[1.0, 0.0]])
     assert location.reward(place, state((1.0, 0.0), 0.0, (0.0, 0.0)))[0] == pytest.approx(1.0)
     assert location.reward(place, state((0.0, 0.0), 0.0, (0.0, 0.0)))[0] < 0.01
+    # Far from it, training rewards whoever goes there all the same; there, whoever stays.
+    off, on, there = (
+        location.guided(place, state(at, 0.0, v))[0]
+        for at, v in (((0.0, 0.0), (-0.4, 0.0)), ((0.0, 0.0), (0.4, 0.0)), ((1.0, 0.0), (0.0, 0.0)))
+    )
+    assert off < 0.02 < 0.25 < on < there == pytest.approx(1.0)
 
 
 def test_what_a_policy_sees_of_an_instruction() -> None:
@@ -167,7 +173,11 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
     turning = Instruction(velocity=np.array([0.25, 0.0, 0.5]))
     assert np.allclose(GOALS["steering"].observe(turning, walking), [0.5, 0.0, np.cos(0.5), np.sin(0.5)])
     far = Instruction(velocity=np.zeros(3), goal=np.array([3.0, 4.0]))
-    assert np.allclose(GOALS["location"].observe(far, walking), [0.6, 0.8])
+    assert np.allclose(GOALS["location"].observe(far, walking), [0.6, 0.8, 0.6, 0.8])  # there, and facing it
+    near = Instruction(velocity=np.zeros(3), goal=np.array([-0.04, 0.0]))
+    assert np.allclose(GOALS["location"].observe(near, walking), [-0.1, 0.0, 1.0, 0.0])  # slowly, and without turning
+    behind = Instruction(velocity=np.zeros((2, 3)), goal=np.array([[-1.0, 0.0], [0.0, 0.4]]))
+    assert np.allclose(GOALS["location"].observe(behind, walking), [[-1, 0, -1, 0], [0, 1, 0, 1]])
     things = np.array([[2.0, 0.0, 0.1, -0.5, 0.0], [0.0, -1.0, 0.1, 0.0, 0.25]])
     seen = GOALS["ball"].observe(Instruction(np.zeros(3), obstacles=things), walking)
     assert np.allclose(seen, [0.0, -1.0, 0.0, 0.5])  # the nearest

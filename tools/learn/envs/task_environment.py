@@ -235,7 +235,7 @@ class TaskEnvironment:
         self.task_reward = self.task.reward(self.asked, known)
         change = action - self._action
         step = TaskStep(
-            task=self.task_reward, manner=manner, change=change, jerk=change - self._change,
+            task=self.task.guided(self.asked, known), manner=manner, change=change, jerk=change - self._change,
             effort=self.fleet.worlds.effort, shock=shock, blocked=blocked,
             beyond=np.abs(target - clamp(target, self.robot)), fallen=fallen,
         )  # fmt: skip
