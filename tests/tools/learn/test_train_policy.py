@@ -33,7 +33,7 @@ from servoid.sim.kinematics import limbs_of
 from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
 from servoid.tools.learn.envs.score_term import Rival
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
-from servoid.tools.learn.envs.tasks import LEARNED_TASKS, TaskState, load_learned_task
+from servoid.stack.tasks.learned import LEARNED_TASKS, TaskState, load_learned_task
 from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.policy import PolicyTrainer, environment
 
@@ -190,7 +190,7 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
 def test_a_task_without_a_reward_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     file.write_text(
-        "from servoid.tools.learn.envs.tasks import LearnedTask\n"
+        "from servoid.stack.tasks.learned import LearnedTask\n"
         "class Mine(LearnedTask):\n"
         "    name, goal, size, every, run = 'mine', 'velocity', 1, (1.0, 2.0), 'walk'\n"
         "    def draw(self, rng, position): return [0.0]\n"

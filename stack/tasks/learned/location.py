@@ -7,7 +7,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.geometry import turned
-from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
+from servoid.stack.tasks.learned.base import LearnedTask, TaskState
 
 # A human runs 10 m, the farthest place, within about 2 of the 5 to 10 s. This robot's top speed is a fifth of the
 # scaled one, so places are as much nearer; lengths are those of the body, x 0.275.
