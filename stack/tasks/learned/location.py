@@ -13,8 +13,8 @@ from servoid.stack.tasks.learned.base import LearnedTask, TaskState
 # scaled one, so places are as much nearer; lengths are those of the body, x 0.275.
 _NEAREST, _FARTHEST = 0.15, 1.2  # m
 _LENGTH = 0.275  # m: exp(-0.5 (distance / length)^2)
-_THERE, _APPROACH = 0.7, 0.3  # AMP's shares of the place and of the velocity toward it, in what guides
-_BRISK, _SHARPNESS = 0.8, 4.0  # exp(-sharpness (brisk - velocity toward it)^2), in shares of the top speed
+_THERE, _APPROACH = 0.5, 0.5  # of the place, and of the velocity toward it, in what guides
+_BRISK, _SHARPNESS = 0.85, 4.0  # exp(-sharpness (brisk - velocity toward it)^2), in shares of the top speed
 _NEAR = 0.07  # m from the place where any velocity will do
 _FARAWAY = 1e3  # m
 
