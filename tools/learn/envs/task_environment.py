@@ -202,6 +202,8 @@ class TaskEnvironment:
     def step(self, action: Array) -> tuple[Array, Array, Array]:
         """Decide `(n, n_joints)`. Returns reward, done and time-out `(n,)`.
 
+        Where something else is asked from now on, that is a time-out, too, though the episode goes on: what is asked
+        next is chance, and no merit of what was done.
         The prior judges the window up to the state that the decision is made in: what this one leads to, it says next.
         """
         manner = self.score(self.fleet.state)
@@ -255,5 +257,6 @@ class TaskEnvironment:
             if self.down is not None:
                 self.down.learn(done, self.achieved)
             self._reset(done)
+        other = ~done & (self.ticks >= self._next)
         self._observe()
-        return reward * self.dt, done, late
+        return reward * self.dt, done | other, late | other
