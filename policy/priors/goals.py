@@ -15,7 +15,7 @@ from servoid.hw.robot.mirror import Mirror
 
 AHEAD = 1.0  # s of turning that an instruction which gives a yaw rate asks to face
 FARTHEST = 1.0  # m: nothing to keep clear of is nearer, where there is nothing
-SLOWING = 0.4  # m from a place within which the velocity that leads to it is less than the top speed
+SLOWING = 0.3  # m from a place within which the velocity that leads to it is less than the top speed
 TURNING = (0.05, 0.2)  # m from a place: nearer than the first it is not faced, from the second on wholly
 
 

@@ -70,7 +70,7 @@ class LearnedRun(BaseTask):
         return self.asks.draw(np.random.default_rng(episode.seeds[number]), position)
 
     def behaviour(self, episode: Draws) -> BaseBehaviour:
-        return _Ask(episode, self)
+        return _AskAnew(episode, self)
 
     def criteria(self, trace: Trace, episode: Draws) -> list[Criterion]:
         earned = self.metrics(trace, episode)["return"]
@@ -96,7 +96,7 @@ class LearnedRun(BaseTask):
         return found
 
 
-class _Ask(BaseBehaviour):
+class _AskAnew(BaseBehaviour):
     def __init__(self, episode: Draws, task: LearnedRun) -> None:
         super().__init__(episode)
         self._task, self._number, self._tick = task, -1, 0
@@ -125,8 +125,8 @@ def _states(trace: Trace, cycle: int) -> tuple[Array, ...]:
 
 
 class RunSpeed(LearnedRun):
-    name = "target-speed"
-    description = "walk straight on at a speed that changes in steps, for a return (SMP)"
+    name = "speed"
+    description = "walk straight on at a speed that changes in steps"
     learned, settings_type = TargetSpeed, SpeedSettings
 
     def drawn(self, episode: Draws, number: int, position: Array) -> Array:
@@ -135,18 +135,18 @@ class RunSpeed(LearnedRun):
 
 
 class RunSteering(LearnedRun):
-    name = "target-steering"
-    description = "move one way and face another, for a return (SMP)"
+    name = "steering"
+    description = "move one way over the ground, and face another"
     learned = TargetSteering
 
 
 class RunLocation(LearnedRun):
-    name = "target-location"
-    description = "go to a place, and to another every few seconds, for a return (SMP)"
+    name = "location"
+    description = "go to a place, and to another every few seconds"
     learned = TargetLocation
 
 
 class RunDodgeball(LearnedRun):
     name = "dodgeball"
-    description = "get out of the way of balls, for a return (SMP); they are no bodies of the simulation"
+    description = "get out of the way of balls, which are not there in physics"
     learned = Dodgeball

@@ -78,9 +78,9 @@ def test_a_task_policy_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: 
         head, tensors = read(resolve("speed"))
         trained = {**head["training"], "rewards": {**head["training"]["rewards"], **rewards}}
         write(path, tensors, {**head, "training": trained, "results": {"share": share}})
-        return Experiment("target-speed", network=OwnNetwork(name, train, policy=True))
+        return Experiment("speed", network=OwnNetwork(name, train, policy=True))
 
-    lacking = Experiment("target-speed", network=OwnNetwork("lacking", train, policy=True))
+    lacking = Experiment("speed", network=OwnNetwork("lacking", train, policy=True))
     assert policies.training(lacking) == f"`servoid train policy --out {tmp_path}/networks/lacking {train}`"
     ours = {"task": 1.0, "both": 0.0}
     with pytest.raises(ConfigError, match="trained with --rewards"):
