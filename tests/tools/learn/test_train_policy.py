@@ -176,7 +176,9 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
     far = Instruction(velocity=np.zeros(3), goal=np.array([3.0, 4.0]))
     assert np.allclose(GOALS["location"].observe(far, walking), [0.6, 0.8, 0.6, 0.8])  # there, and facing it
     near = Instruction(velocity=np.zeros(3), goal=np.array([-0.04, 0.0]))
-    assert np.allclose(GOALS["location"].observe(near, walking), [-0.04 / 0.3, 0.0, 1.0, 0.0])  # slowly, and without turning
+    assert np.allclose(
+        GOALS["location"].observe(near, walking), [-0.04 / 0.3, 0.0, 1.0, 0.0]
+    )  # slowly, and without turning
     behind = Instruction(velocity=np.zeros((2, 3)), goal=np.array([[-1.0, 0.0], [0.0, 0.4]]))
     assert np.allclose(GOALS["location"].observe(behind, walking), [[-1, 0, -1, 0], [0, 1, 0, 1]])
     things = np.array([[2.0, 0.0, 0.1, -0.5, 0.0], [0.0, -1.0, 0.1, 0.0, 0.25]])
