@@ -37,8 +37,8 @@ class Moment:
 
 
 def moments(trace: Trace, legs: Array) -> Moment:
-    """All ticks of a trace of a robot whose joints `legs` are those of its legs. Raises ValueError for a trace that does
-    not hold orientation and joints."""
+    """All ticks of a trace of a robot whose joints `legs` are those of its legs. Raises ValueError for a trace without
+    orientation or joints."""
     if trace.orientation is None or trace.joints is None:
         raise ValueError("a trace without orientation or joints: no act can be judged by it")
     earlier = np.maximum(np.arange(len(trace.yaw)) - round(REST_SECONDS / trace.dt), 0)
