@@ -7,9 +7,9 @@ can be repeated from its log. Until the first plan the robot holds its pose.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,7 +34,6 @@ from servoid.stack.control.tracker import Followers
 
 if TYPE_CHECKING:
     from servoid.policy.diffusion.prefix.runtime import PlannerRuntime
-    from servoid.stack.skills.words import SkillWords
 
 _NOW = np.array([0])
 
@@ -53,15 +52,13 @@ class ClosedLoopPolicy(BasePolicy):
 
     def __init__(
         self, robot: Robot, planner: Planner, pace: Pace, stride: int, history: int, tracker: Followers | None = None,
-        shape: tuple[int, ...] = (), reading: Reading | None = None,
+        shape: tuple[int, ...] = (),
     ) -> None:  # fmt: skip
-        """`stride` are the ticks of a frame, `history` those of states that the planner is given; `reading` says in the
-        planner's own words what it is told (none: as it was said)."""
+        """`stride` are the ticks of a frame, `history` those of states that the planner is given."""
         self.plans = PlanBuffer(planner, pace, shape)
         self._reference, self._tracker = PlanReference(robot, shape), tracker
         self._layout, self._robot, self._shape, self._stride = row_layout(robot), robot, shape, stride
         self._history = History(history, JOINT_TARGETS, shape)
-        self._read = reading
         self._told: tuple[str | None, bool] = (None, False)  # with the last request
         self._fresh = np.ones(shape, bool)
 
@@ -94,8 +91,6 @@ class ClosedLoopPolicy(BasePolicy):
         """Joint targets `(..., n_joints)` rad for this tick. Raises PlannerError when the planner cannot plan any
         more. A sentence or a target that it cannot plan for is an event, and the last plan goes on."""
         plans, applied = self.plans, np.array(applied, dtype=float)
-        if self._read is not None and instruction.text is not None:
-            instruction = replace(instruction, text=self._read(instruction.text))
         self._see(state, applied)
         plans.adopt()
         told = instruction.text, instruction.stand
@@ -140,29 +135,6 @@ class ClosedLoopPolicy(BasePolicy):
         return row
 
 
-class Reading:
-    """What a sentence asks for, said as the planner knows it. Sentences that name no known walk or skill stay as they
-    are: the planner reads them by the nearest of its own, which takes "sidestep left" for a reach to the left side."""
-
-    def __init__(self, robot: Robot, sentences: Collection[str]) -> None:
-        """`sentences` are those that the planner was trained with."""
-        self._robot, self._sentences = robot, frozenset(sentences)
-        self._heard: dict[str, str] = {}
-
-    @cached_property
-    def _words(self) -> SkillWords:
-        from servoid.policy.text.encoder import load_encoder
-        from servoid.stack.skills.skill import load_skills
-        from servoid.stack.skills.words import SkillWords
-
-        return SkillWords(load_encoder(), load_skills(self._robot))
-
-    def __call__(self, text: str) -> str:
-        if text not in self._heard:
-            self._heard[text] = text if text in self._sentences else self._words.said(text)
-        return self._heard[text]
-
-
 def load_settings(name: str = "closd") -> ClosedLoopSettings:
     """By a name in configs/policies/, or by file. Raises ConfigError."""
     return load_yaml(find("policies", name), ClosedLoopSettings)
@@ -178,8 +150,7 @@ def closed_loop_policy(
     """
     settings = settings or load_settings()
     path, frames = _checkpoint(settings.checkpoint, robot), Frames(robot)
-    head = read_header(path)
-    config = check_fit(path, head, robot, frames)
+    config = check_fit(path, read_header(path), robot, frames)
     wrong = check(settings, frames.stride, config.levels)
     if process and not settings.delay:
         wrong.append("delay 0 needs plans that take no time: in real time set it to a frame or more")
@@ -190,8 +161,7 @@ def closed_loop_policy(
     planner: Planner = ProcessPlanner(build) if process else InlinePlanner(build())
     pace = Pace(1, settings.frames * frames.stride, settings.delay, wait=not process)
     history = history_ticks(config.prefix, frames.stride)
-    reading = Reading(robot, head.get("sentences", ())) if settings.text_nearest else None
-    return ClosedLoopPolicy(robot, planner, pace, frames.stride, history, tracker, shape, reading)
+    return ClosedLoopPolicy(robot, planner, pace, frames.stride, history, tracker, shape)
 
 
 def _checkpoint(name: str, robot: Robot) -> Path:

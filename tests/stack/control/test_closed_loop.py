@@ -23,7 +23,7 @@ from servoid.policy.diffusion.prefix.runtime import PlannerRuntime
 from servoid.policy.features import Normaliser, raw_layout
 from servoid.policy.references.plan import PlanReference, row_layout
 from servoid.policy.text.encoder import load_encoder
-from servoid.stack.control.closed_loop import ClosedLoopSettings, Reading, closed_loop_policy, load_settings
+from servoid.stack.control.closed_loop import ClosedLoopSettings, closed_loop_policy, load_settings
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.policies import make_policy, policy_fingerprint
 from servoid.stack.control.tracker import walks
@@ -159,15 +159,6 @@ def test_a_sentence_is_read_as_the_nearest_of_the_training(checkpoint: str) -> N
     np.testing.assert_array_equal(nearest.plan(told).states, nearest.plan(meant).states)
     np.testing.assert_array_equal(plain.plan(meant).states, nearest.plan(meant).states)
     assert not np.allclose(plain.plan(told).states, plain.plan(meant).states, atol=1e-5)
-
-
-def test_what_is_said_of_a_known_motion_is_told_in_the_words_of_the_training() -> None:
-    """The nearest sentence alone takes "sidestep left" for a reach to the left side."""
-    reading = Reading(ROBOT, ["lie down on your back"])
-    assert reading("sidestep left") == "side-step to the left"
-    assert reading("have a seat on the stool") == "sit on the seat"
-    for unread in ("lie down on your back", "solve the equation", "???"):
-        assert reading(unread) == unread
 
 
 def test_only_what_steps_with_both_feet_is_followed_as_a_walk() -> None:
