@@ -99,7 +99,7 @@ class Story(BaseTask):
         begin = 0
         if not len(trace.yaw):
             return [None] * len(episode.acts)
-        now = moments(trace)
+        now = moments(trace, self.conditions.legs)
         for number, act in enumerate(episode.acts):
             at = None
             if not found or found[-1] is not None:
