@@ -22,11 +22,10 @@ from servoid.policy.features import raw_layout
 from servoid.policy.recording import read_recording
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.gait import GaitPolicy
-from servoid.stack.control.tracker import ExpertPolicy
 from servoid.tools import cli
 from servoid.tools.learn.collect.disturbances import Disturbances, DisturbanceSettings, joint_noise
 from servoid.tools.learn.collect.episode_cutter import EpisodeCutter
-from servoid.tools.learn.collect.skills import SKILLS, Commands, skills_of
+from servoid.tools.learn.collect.skills import SKILLS, skills_of
 from servoid.tools.learn.dataset.lerobot import DatasetWriter
 from servoid.tools.learn.dataset.schema import Feature, Schema
 
@@ -245,25 +244,6 @@ def test_episodes_under_way_end_early_but_whole(robot: Robot) -> None:
     assert driver.tick.tolist() == [160, 160]  # their last second is not kept: they may have been falling
     assert told[-1] == 220
     assert told == sorted(told)
-
-
-def test_crouched_walks_are_lower_and_slow(robot: Robot) -> None:
-    """What was asked is what the base does: a planner is to learn that it can be lower as it walks."""
-    fleet = Fleet(robot, 12, None, threads=1, seed=3)
-    calm = DisturbanceSettings(noisy_share=0.0, pushed_share=0.0)
-    commands = Commands(robot, fleet.n, crouched=1.0)
-    cutter = EpisodeCutter(fleet, ExpertPolicy(robot, shape=(fleet.n,)), calm, 3.0, commands)
-    seen = []
-    for _ in cutter.episodes(
-        12 * 100, lambda _: seen.append((commands.lower.copy(), fleet.truth.position[:, 2].copy()))
-    ):
-        pass
-    lower, height = (np.array(part)[80:130] for part in zip(*seen, strict=True))
-    assert (lower[-1] > 0.0).all()
-    assert (lower <= 0.13 * robot.standing_height).all()
-    assert np.corrcoef(lower.mean(0), height.mean(0))[0, 1] < -0.8
-    assert height.mean() < robot.walking.height - 0.005
-    assert (commands.velocity[:, 0] <= 0.4 * robot.walking.forward).all()
 
 
 def test_policy_that_always_falls_is_given_up(robot: Robot) -> None:
