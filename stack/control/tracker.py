@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from servoid.hw.contracts.body import Array
@@ -104,7 +106,11 @@ class ExpertPolicy(BasePolicy):
         self._tracker.reset(where)
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
-        self._gait.command(instruction.velocity)
+        self._gait.command(instruction.velocity, instruction.lower)
+        if self._gait.lowered.any():  # it has only seen walks upright, and would push itself up
+            displacement = state.displacement.copy()
+            displacement[..., 2] += self._gait.lowered
+            state = replace(state, displacement=displacement)
         target = self._gait.led(self._tracker(state, applied, self._gait))
         self._gait.advance()
         return target
