@@ -4,7 +4,8 @@
 goal; it decides joint targets around the home pose as often as its prior has frames. --rewards weighs the task, the
 prior (manner) and their product (both); the paper adds the first two. With --prior none manner is 1 everywhere, and
 --decide-every and --reach say what the prior would. With --demonstrations it begins as a network that
-does what a dataset shows, instead of at random.
+does what a dataset shows, instead of at random: that is kept as imitation.safetensors, and others can begin with it by
+--init.
 
 Ctrl-C saves, and the same command continues. The newest network is policy.safetensors.
 """
@@ -26,9 +27,9 @@ from servoid.policy.mlp import Mlp
 from servoid.policy.priors.task_policy import KIND, save_task_policy
 from servoid.policy.rising.policy import KIND as RISING
 from servoid.policy.rising.policy import save_rising_policy
+from servoid.stack.tasks.learned import LearnedTask, load_learned_task
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
 from servoid.tools.learn.envs.task_judge import measure
-from servoid.tools.learn.envs.tasks import LearnedTask, load_learned_task
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.ppo import PpoTrainer
@@ -42,6 +43,7 @@ _JUDGED, _JUDGED_STARTS = 32, 256  # worlds; states that they begin in, where a 
 _LED_SHARE = 0.05  # of what initial weights give, where a lead knows a way already
 NO_PRIOR = "none"
 _LICENCE = "Apache-2.0"  # of what learns from nothing but its own experience
+_IMITATION = "imitation.safetensors"  # what a policy began as, where it imitated
 _DISCRIMINATOR = "discriminator.safetensors"  # beside the policy
 
 
@@ -251,7 +253,7 @@ class PolicyTrainer(PpoTrainer):
         self.begin_with(network)
 
     def imitate(self, folder: Path) -> None:
-        """Begin with a network that does what the dataset in `folder` shows. Raises DatasetError."""
+        """Begin with a network that does what the dataset in `folder` shows, and keep it. Raises DatasetError."""
         from servoid.policy.recording import read_recording
         from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
         from servoid.tools.learn.trainers.trainer import source_of
@@ -264,6 +266,7 @@ class PolicyTrainer(PpoTrainer):
         mirrors = Mirrors(env.mirrors["actor"], env.mirrors["action"])
         self.begin_with(cloned(seen, actions, mirrors, self.settings.hidden, self.settings.imitation_steps, seed))
         self.begun_with = {"demonstrations": source_of(folder, recording)}
+        self.ship(self.out / _IMITATION, self.progress)
 
     def state(self) -> dict[str, Any]:
         return {**super().state(), "score": self.env.score.state()}

@@ -7,7 +7,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.geometry import turned
-from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
+from servoid.stack.tasks.learned.base import LearnedTask, TaskState
 
 # A human has half a second, and 10 m. Steps of this robot go 0.13 m/s to the side and its arms are 0.17 m from its
 # middle: what it has to see coming is slower.

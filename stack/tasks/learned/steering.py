@@ -6,7 +6,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState, over_ground
+from servoid.stack.tasks.learned.base import LearnedTask, TaskState, over_ground
 
 _SHARPNESS = 0.5 * 5.0**2  # exp(-0.5 error^2) of a human who goes 5 m/s at most: here, of as large a share of the top
 _SLOWEST = 0.5 / 5.0  # of the top speed that way
