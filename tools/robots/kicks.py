@@ -15,10 +15,10 @@ from servoid.policy.motion.clip import About, Clip, smooth
 from servoid.policy.references.clip import ClipReference
 from servoid.sim.model import build
 from servoid.sim.worlds import Worlds
-from servoid.stack.safety.balance import Feedback
 from servoid.stack.control.tracker import ExpertPolicy
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import load_odometry
+from servoid.stack.safety.balance import Feedback
 from servoid.stack.safety.limits import limit
 from servoid.stack.safety.upright import Upright
 from servoid.stack.tasks.skills.kick import SIDES, KickSettings

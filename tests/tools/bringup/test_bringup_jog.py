@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import termios
 import threading
-import time
 from dataclasses import replace
 from typing import Any
 
