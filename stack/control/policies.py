@@ -188,6 +188,17 @@ def skills_known(name: str, robot: Robot, planner: DiffusionSettings | None = No
     return tuple(read_header(resolve(settings.checkpoint, robot)).get("skills", {}))
 
 
+def sentences_known(name: str, robot: Robot) -> tuple[str, ...]:
+    """Sentences that the planner of a closed loop was trained with, where it reads others by the nearest of them; none
+    of another policy. Raises ConfigError."""
+    from servoid.policy.checkpoint import read_header, resolve
+
+    if _maker(name) is not _closed_loop:
+        return ()
+    settings = _loop_settings(name)
+    return tuple(read_header(resolve(settings.checkpoint, robot)).get("sentences", ())) if settings.text_nearest else ()
+
+
 def policy_fingerprint(name: str, robot: Robot | None = None) -> dict[str, Any]:
     """Name of a policy and what it is made of, for the flight log: its checkpoint and that of odometry by their hashes,
     settings of the planner, of a closed loop with its tracker or of the robot's gait, and the file of a user's own.

@@ -89,6 +89,14 @@ class SkillWords:
             )
         return str(self._names[fitting.argmax()])
 
+    def said(self, text: str) -> str:
+        """What a text asks for in the first of its phrases; the text itself where it is not understood."""
+        try:
+            asked = self.understand(text)
+        except ConfigError:
+            return text
+        return MOTIONS[asked].phrasings[0] if isinstance(asked, int) else self._skills[asked].phrases[0]
+
     def clearest(self, name: str) -> str:
         """The phrase of a skill that is least like those of anything else.
 

@@ -66,8 +66,10 @@ class PlannerRuntime:
         now = Anchor.before(executed, -1)
         with one_thread():
             text, wanted = self._asked(request.instruction, len(raw), now, begin)
+            # All that the network says, also where the next plan comes sooner: trackers look ahead.
+            count = max(self._planning.frames, self._model.config.frames)
             planned = self._planner.plan(
-                torch.from_numpy(prefix.astype(np.float32)), text, wanted, generators, self._planning.frames
+                torch.from_numpy(prefix.astype(np.float32)), text, wanted, generators, count
             ).numpy()
         frames = planned.astype(float)
         motion = self._frames.to_global(frames, Anchor.before(begin, -1))
