@@ -16,7 +16,7 @@ from servoid.hw.contracts.world import Percept
 from servoid.hw.setting import Range, Setting
 from servoid.policy.references.gait import load_gait
 from servoid.policy.text.captions import caption
-from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings, drawn_pushes
 from servoid.stack.tasks.terms import metrics as measures
 
 _COMPONENTS = ("vx", "vy", "yaw_rate")
@@ -61,13 +61,8 @@ class Walk(BaseTask):
         s = self.settings
         ranges = np.array([s.vx, s.vy, s.yaw_rate])
         commands = rng.uniform(ranges[:, 0], ranges[:, 1], size=(math.ceil(self.seconds / s.every), 3))
-        count = math.ceil(self.seconds / s.push_every)
-        size = rng.uniform(s.push[0], s.push[1], size=count)
-        bearing = rng.uniform(-math.pi, math.pi, size=count)
-        pushes = size[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
-        ticks = self.ticks(s.push_every)
-        due = {(number + 1) * ticks: push for number, push in enumerate(pushes)}
-        return WalkEpisode(commands=commands, pushes=due if s.push[1] > 0.0 else {})
+        pushes = drawn_pushes(rng, self.seconds, s.push, s.push_every, self.ticks(s.push_every))
+        return WalkEpisode(commands=commands, pushes=pushes)
 
     def behaviour(self, episode: WalkEpisode) -> BaseBehaviour:
         return FollowCommands(episode, self.ticks(self.settings.every))

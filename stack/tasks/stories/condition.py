@@ -73,6 +73,9 @@ class Conditions:
         elif done.part is not None:
             at = self._points(now.joints)[..., self._points.names.index(done.part), :]
             found &= np.linalg.norm(now.base + rotate(now.orientation, at) - thing[..., :3], axis=-1) <= done.within
+        if done.faces is not None:
+            off = (yaw_of(now.orientation) - yaw_of(thing[..., 3:]) + np.pi) % (2 * np.pi) - np.pi
+            found &= np.abs(off) <= done.faces
         if done.lies:
             found &= up_vector(thing[..., 3:])[..., 2] <= LIES
         if done.seated and seat is not None:

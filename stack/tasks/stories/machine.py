@@ -208,6 +208,8 @@ class Machine(BaseBehaviour):
             edge = to.ahead + (0.0 if seat is None else seat.size[0] / 2) + (0.0 if self._aside else AWAY)
             place = thing[:2] + turned(np.array([edge, to.aside]), facing)
         else:
+            if act.done.faces is not None:
+                self._facing = float(yaw_of(thing[3:]))
             if self._facing is None:  # kept from then on: seen from near by, where it should face turns with each step
                 away = thing[:2] - state.displacement[:2]
                 self._facing = math.atan2(away[1], away[0])

@@ -17,7 +17,7 @@ from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import load_robot
 from servoid.stack.runtime.run import RunSettings
 from servoid.stack.tasks import load_task
-from servoid.stack.tasks.stories.condition import moments
+from servoid.stack.tasks.stories.condition import Moment, moments
 from servoid.stack.tasks.stories.layout import CLEAR
 from servoid.stack.tasks.stories.machine import Machine
 from servoid.stack.tasks.stories.story import Story
@@ -204,6 +204,22 @@ def test_things_are_not_in_each_others_way() -> None:
         apart = np.linalg.norm(places[:, None] - places[None], axis=-1)[np.triu_indices(len(places), 1)]
         assert (apart >= CLEAR["bag"]).all()
         assert (np.linalg.norm(places, axis=1) >= CLEAR["bag"]).all(), "nor where the robot starts"
+
+
+def test_a_point_lies_behind_where_that_is_asked_and_is_done_facing_as_it_says() -> None:
+    settings = {"plan": "face", "least_bearing": "1.57", "push": "0.3,0.3", "seconds": "3"}
+    for seed in range(5):
+        task, *_ = _story(**settings)
+        episode = task.scenario(np.random.default_rng(seed))
+        assert abs(np.arctan2(episode.points[0, 1], episode.points[0, 0])) >= 1.57
+        assert [tick * ROBOT.dt for tick in episode.pushes] == [1.0, 2.0, 3.0]
+        np.testing.assert_allclose([np.linalg.norm(push) for push in episode.pushes.values()], 0.3)
+        away = float(episode.headings[0])
+        thing = episode.point(0, None)
+        for off, done in ((0.2, True), (0.4, False), (2 * np.pi + 0.2, True)):
+            there = _at(episode.points[0, :2], away + off)
+            now = Moment(there.displacement, there.orientation, there.position, np.array(True))
+            assert task.conditions.hold(episode.acts[0], now, thing, None) == done
 
 
 def test_a_drawn_story_rises_where_it_sat() -> None:
