@@ -112,6 +112,7 @@ POLICIES: dict[str, Maker] = {
     "expert": _expert,
     "fast": _expert,
     "gait": _gait,
+    "location": _task_policy,
     "speed": _task_policy,
     "steering": _task_policy,
 }

@@ -17,7 +17,7 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
-from servoid.stack.control.balance import Balance
+from servoid.stack.safety.balance import Balance
 from servoid.tools.common.output import add_json_argument, reporting
 from servoid.tools.motions.keyframes import Authored, AuthoredClip, JointStep
 
