@@ -15,7 +15,7 @@ from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.setting import Range, Setting
 from servoid.policy.references.gait import load_gait
-from servoid.policy.text.captions import caption
+from servoid.policy.text.captions import caption, motion_of
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings, drawn_pushes
 from servoid.stack.tasks.terms import metrics as measures
 
@@ -100,6 +100,9 @@ class FollowCommands(BaseBehaviour):
         return Instruction(velocity=commands[min(tick // self._ticks, len(commands) - 1)].copy())
 
 
+_MOTION_SECONDS = 2.0  # over which a motion is told by its mean twist
+
+
 @dataclass(frozen=True)
 class SurviveSettings(WalkSettings):
     told: Annotated[
@@ -123,7 +126,14 @@ class Survive(Walk):
         return _ToldAtFirst(episode, self.ticks(self.settings.every), self.settings.told, self)
 
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
-        return {"episode_ticks": float(len(trace.yaw)), **super().metrics(trace, episode)}
+        """`motions`: how many different ones, of those that have a name, it moved by once it was left to itself."""
+        alone = self.ticks(self.settings.told)
+        seen = measures.mean_twists(trace, _MOTION_SECONDS)[math.ceil(alone * trace.dt / _MOTION_SECONDS) :]
+        return {
+            "episode_ticks": float(len(trace.yaw)),
+            "motions": float(len(np.unique(motion_of(seen, self.top)))),
+            **super().metrics(trace, episode),
+        }
 
 
 class _ToldAtFirst(FollowCommands):

@@ -29,7 +29,7 @@ from servoid.policy.priors.observation import TaskObservation
 from servoid.policy.priors.score_matching.model import Style, load_prior
 from servoid.policy.priors.score_matching.windows import PriorWindows
 from servoid.policy.priors.task_policy import TaskPolicy
-from servoid.policy.recording import read_recording
+from servoid.policy.recording import DatasetError, read_recording
 from servoid.sim.kinematics import limbs_of
 from servoid.stack.tasks.learned import LEARNED_TASKS, TaskState, load_learned_task
 from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
@@ -116,6 +116,18 @@ def test_an_episode_that_is_unlike_the_data_ends(prior: Path) -> None:
     _, done, late = env.step(np.zeros((env.n, env.action_size)))
     assert done.all()
     assert not late.any()
+
+
+def test_what_is_asked_next_is_no_merit_of_what_was_done(prior: Path) -> None:
+    """For the learner, time is up where another place is drawn; the episode goes on."""
+    env = made(prior, "location", replace(SETTINGS, episode_seconds=10.0))
+    env.reset()
+    env._next[:] = np.where(np.arange(env.n) == 2, 1, 1000)
+    asked = env.asked.copy()
+    _, done, late = env.step(np.zeros((env.n, env.action_size)))
+    assert np.flatnonzero(done).tolist() == np.flatnonzero(late).tolist() == [2]
+    assert env.ticks.tolist() == [1] * env.n
+    assert np.flatnonzero((env.asked != asked).any(1)).tolist() == [2]
 
 
 def test_a_place_and_a_ball_are_not_asked_for_where_it_is_to_stand() -> None:
@@ -225,6 +237,13 @@ def test_demonstrations_are_told_what_came_of_them(synthetic_dataset: Path) -> N
         assert np.allclose(alone.of_rows(raw[1 + 2 * i], applied[2 * i], seen[i, -2:]), seen[i], atol=1e-6)
 
 
+def test_demonstrations_too_short_to_look_ahead_are_refused(synthetic_dataset: Path) -> None:
+    recording = read_recording(synthetic_dataset, ROBOT)
+    short = replace(recording, episode=np.arange(len(recording.raw)) // 20)
+    with pytest.raises(DatasetError, match=r"no episode lasts longer than the 0\.48 s"):
+        demonstrated(short, ROBOT, GOALS["velocity"], 2, np.random.default_rng(0))
+
+
 @pytest.mark.slow
 def test_what_a_policy_imitates_is_kept_and_others_can_begin_with_it(
     prior: Path, synthetic_dataset: Path, tmp_path: Path
@@ -236,6 +255,8 @@ def test_what_a_policy_imitates_is_kept_and_others_can_begin_with_it(
     first.imitate(synthetic_dataset)
     kept = tmp_path / "a" / "imitation.safetensors"
     assert "demonstrations" in read_header(kept)["results"]["begun_with"]
+    with pytest.raises(ConfigError, match=r"sees its goal in 4 numbers \(steering\), and task speed shows 2"):
+        second.start(resume=False, init=checkpoint.resolve("steering"))
     second.start(resume=False, init=kept)
     seen = first.env.observations["actor"]
     assert np.allclose(first.actor()(seen), second.actor()(seen), atol=1e-6)
