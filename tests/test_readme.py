@@ -17,10 +17,10 @@ from servoid.hw.plugins import is_file_reference
 from servoid.stack import tasks
 from servoid.stack.control.policies import names as policies
 from servoid.stack.runtime.backends import BACKENDS
+from servoid.stack.tasks.learned import LEARNED_TASKS
 from servoid.tools.cli import VERBS, Verb, main
 from servoid.tools.commands import rollout
 from servoid.tools.common.parser import Parser, settings
-from servoid.tools.learn.envs.tasks import LEARNED_TASKS
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])

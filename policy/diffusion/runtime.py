@@ -139,7 +139,7 @@ class Runtime:
         with one_thread(), torch.no_grad() if through else torch.inference_mode():
             # Sample i of a robot's n draws noise of its own; the first one's does not depend on n.
             keys = [(*pair, *((i,) if i else ())) for pair in seeds for i in range(n)]
-            known = self._known(states, actions, instruction)
+            known = self.known(states, actions, instruction)
             matrix, start = self._start(keys, states[:, -1], previous)
             text = self._text(instruction, len(states))
             predict = classifier_free(
@@ -182,7 +182,7 @@ class Runtime:
         if not (np.isfinite(states).all() and np.isfinite(actions).all()):
             raise ValueError("plan request: states or actions are not finite; was every sensor read?")
 
-    def _known(self, states: Array, actions: Array, instruction: Instruction) -> Known:
+    def known(self, states: Array, actions: Array, instruction: Instruction) -> Known:
         """Past states and past and committed actions, clean and normalised, and keyframes; `samples` of each window.
 
         A keyframe counts when it comes to a tick that has a token: those further ahead will come in later.

@@ -14,7 +14,9 @@ from servoid.hw.robot.description import Walking
 from servoid.hw.robot.mirror import Mirror
 
 AHEAD = 1.0  # s of turning that an instruction which gives a yaw rate asks to face
-FARTHEST = 1.0  # m: a place farther away is seen at this distance
+FARTHEST = 1.0  # m: nothing to keep clear of is nearer, where there is nothing
+SLOWING = 0.3  # m from a place within which the velocity that leads to it is less than the top speed
+TURNING = (0.05, 0.2)  # m from a place: nearer than the first it is not faced, from the second on wholly
 
 
 @dataclass(frozen=True)
@@ -48,15 +50,19 @@ def _steering(instruction: Instruction, walking: Walking) -> Array:
 
 
 def _location(instruction: Instruction, walking: Walking) -> Array:
-    """The place in the heading frame `(..., 2)` m: here, where it is to stand. Raises ConfigError where the task has
-    none."""
+    """The velocity that leads to a place, in shares of the top speed, and the direction to face, in the heading frame
+    `(..., 4)`: what `_steering` gives of a velocity, so that what steers can learn to go to places. Here, where it is
+    to stand. Raises ConfigError where the task has no place."""
     if instruction.stand:
-        return np.zeros((*np.shape(instruction.velocity)[:-1], 2))
+        return np.broadcast_to([0.0, 0.0, 1.0, 0.0], (*np.shape(instruction.velocity)[:-1], 4))
     if instruction.goal is None:
         raise ConfigError("this policy walks to a place, and the task gives none: run goal, goal-near or goal-far")
     goal = np.asarray(instruction.goal, float)
-    distance = np.maximum(np.linalg.norm(goal, axis=-1, keepdims=True), 1e-9)
-    return goal * np.minimum(1.0, FARTHEST / distance)
+    distance = np.linalg.norm(goal, axis=-1)
+    # The direction of a place underfoot swings wildly.
+    angle = np.arctan2(goal[..., 1], goal[..., 0]) * np.interp(distance, TURNING, (0.0, 1.0))
+    facing = np.stack([np.cos(angle), np.sin(angle)], -1)
+    return np.concatenate([goal / np.maximum(distance, SLOWING)[..., None], facing], -1)
 
 
 def _ball(instruction: Instruction, walking: Walking) -> Array:
@@ -82,7 +88,7 @@ GOALS: Mapping[str, SeenGoal] = {
     for goal in (
         SeenGoal("velocity", 2, Mirror.PLANAR, _velocity, velocity=True),
         SeenGoal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering, velocity=True),
-        SeenGoal("location", 2, Mirror.PLANAR, _location),
+        SeenGoal("location", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _location),
         SeenGoal("ball", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _ball),
         SeenGoal("stand", 0, Mirror(np.zeros(0, int), np.zeros(0, np.float32)), nothing, odometry=False),
     )

@@ -22,6 +22,7 @@ from servoid.hw.robot.legs import ALONG, LegInverse, Legs
 _SMOOTH = 0.3  # of a smooth swing's easing that is left at full speed
 _FASTEST = 8.0  # rad/s of the reference that count for `yaw_lead`: where a swing begins and ends, there are jumps
 _NOW = np.array([0])
+_LOWERING = 0.04  # m/s at which the base goes lower and rises again
 _ACROSS = 5.0  # rad/s of turning that weigh as much as 1 m/s sideways
 
 
@@ -51,6 +52,7 @@ class GaitSettings:
     turning_gain: float = 1.0  # soles slip as they turn: how much further than asked steps turn
     yaw_lead: float = 0.0  # s of their rate that the goals of joints that turn the feet go ahead by, for servos lag
     lift_loss: float = 0.0  # m that steps are lower at the faster speed of `even_swing`: knees are too slow for both
+    lower_shift: float = 0.5  # m that the feet are further ahead for each m that the base goes lower: knees weigh, too
 
 
 @cache
@@ -122,23 +124,30 @@ class Gait(Reference):
         self.velocity = np.zeros((*shape, 3))
         self.target = np.zeros((*shape, 3))
         self.activity = np.zeros(shape)
+        self.lower_by, self.lowered = np.zeros(shape), np.zeros(shape)  # m that are asked, and that it is
 
     def reset(self, where: Array | slice = slice(None)) -> None:
         """Stand still, in the worlds `where` (default: all)."""
         if self.phase.ndim:
             self.phase[where], self.velocity[where], self.target[where], self.activity[where] = 0.0, 0.0, 0.0, 0.0
+            self.lower_by[where], self.lowered[where] = 0.0, 0.0
         else:
             self.phase, self.activity = np.zeros(()), np.zeros(())
             self.velocity, self.target = np.zeros(3), np.zeros(3)
+            self.lower_by, self.lowered = np.zeros(()), np.zeros(())
 
-    def command(self, velocity: Array) -> None:
-        """Ask for `(..., 3)` m/s forward, m/s left, rad/s, clipped to the gait's limits."""
+    def command(self, velocity: Array, lower: Array | None = None) -> None:
+        """Ask for `(..., 3)` m/s forward, m/s left, rad/s, clipped to the gait's limits, and for a base that is `lower`
+        `(...)` m than it goes; None: not at all."""
         self.target = np.clip(velocity, self.lower, self.upper)
+        self.lower_by = np.zeros(self.phase.shape) if lower is None else np.asarray(lower, float)
 
     def advance(self) -> None:
         """Go on by one tick."""
         moving = (np.abs(self.target) > 1e-3).any(-1) | (np.abs(self.velocity) > 1e-3).any(-1)
         self.velocity = self.velocity + np.clip(self.target - self.velocity, -self._slew, self._slew)
+        step = _LOWERING * self.robot.dt
+        self.lowered = self.lowered + np.clip(self.lower_by - self.lowered, -step, step)
         # Steps fade in over half a cycle and out over a whole one.
         rate = np.where(moving, 2.0, -1.0) * self._phase_step
         # The first step says where it goes: the left foot takes it, but for a walk to the right. Were it drawn, who
@@ -171,8 +180,9 @@ class Gait(Reference):
         phase = (self.phase[..., None] + np.asarray(ahead) * self._phase_step * moving) % 1.0
         velocity = np.broadcast_to(self.velocity[..., None, :], (*shape, 3))
         activity = np.broadcast_to(self.activity[..., None], shape)
-        position, contact = self.pose(phase, velocity, activity)
-        after, _ = self.pose((phase + self._phase_step * moving) % 1.0, velocity, activity)
+        lowered = np.broadcast_to(self.lowered[..., None], shape)
+        position, contact = self.pose(phase, velocity, activity, lowered)
+        after, _ = self.pose((phase + self._phase_step * moving) % 1.0, velocity, activity, lowered)
         height = np.full(shape, self.robot.standing_height)
         seconds = np.asarray(ahead) * self.robot.dt
         # Along an arc: the chord is the arc's length times sin(a) / a, and leaves its start at half of the turn.
@@ -195,10 +205,11 @@ class Gait(Reference):
         """Forward pitch of the base [rad] at `forward` m/s."""
         return self.settings.lean - self.settings.backward_lean * np.minimum(forward, 0.0)
 
-    def pose(self, phase: Array, velocity: Array, activity: Array) -> tuple[Array, Array]:
+    def pose(self, phase: Array, velocity: Array, activity: Array, lowered: Array | float = 0.0) -> tuple[Array, Array]:
         """Joint positions `(..., n_joints)` and planned contacts `(..., n_feet)` at a phase `(...)` of the cycle.
 
         A foot swings in the middle of its half of the cycle and is carried back by the body's twist while it stands.
+        The base goes `lowered` `(...)` m lower than it walks.
         """
         s = self.settings
         local = (phase[..., None] + self._shift) % 1.0  # 0..0.5 is this foot's step
@@ -218,11 +229,12 @@ class Gait(Reference):
         backward = np.minimum(vx, 0.0)
         vx = vx + (s.backward_gain - 1.0) * backward
         yaw = wz * period * travel
-        x0, y0 = s.foot_forward, self._inverse.hip[:, 1] + self._side * s.foot_apart
+        down = np.asarray(lowered)[..., None]
+        x0, y0 = s.foot_forward + s.lower_shift * down, self._inverse.hip[:, 1] + self._side * s.foot_apart
         x = x0 + s.backward_shift * backward + (vx - wz * y0) * period * travel
         y = y0 + (vy + wz * x0) * period * travel
         y = y + (s.sway * activity * np.sin(2 * np.pi * phase))[..., None]  # away from the foot that steps
-        z = self._inverse.hip[:, 2] - s.height + (s.lift - s.lift_loss * swift) * lift
+        z = self._inverse.hip[:, 2] - (s.height - down) + (s.lift - s.lift_loss * swift) * lift
         lean = self._lean(velocity[..., None, 0])
         cos, sin = np.cos(lean), np.sin(lean)
         ankle = np.stack([cos * x - sin * z, y, sin * x + cos * z], -1)  # seen from the leaning base

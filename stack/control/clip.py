@@ -10,9 +10,9 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import Clip
 from servoid.policy.references.clip import ClipReference
 from servoid.policy.references.either import GaitOrClip
-from servoid.stack.control.balance import Balance, Feedback
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.control.tracker import Tracker
+from servoid.stack.safety.balance import Balance, Feedback
 
 HOLD_SECONDS = 0.3  # of a tracked clip's last frame, before the robot goes home
 SETTLE_SECONDS = 1.2  # from the end of a tracked clip until it is over

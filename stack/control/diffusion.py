@@ -173,8 +173,22 @@ def diffusion_policy(
         planner = ProcessPlanner(partial(_build, robot, settings, cost))
     else:
         planner = InlinePlanner(_build(robot, settings, cost))
+    return executing(planner, robot, settings, config.history, space=space, wait=not process, shape=shape)
+
+
+def executing(
+    planner: Planner,
+    robot: Robot,
+    settings: DiffusionSettings,
+    history: int,
+    *,
+    space: ActionSpace = JOINT_TARGETS,
+    wait: bool = True,
+    shape: tuple[int, ...] = (),
+) -> DiffusionPolicy:
+    """The policy that executes the plans of `planner`, at the pace of `settings`, made from so many states."""
     trim = Trim(robot, settings.trim, shape) if settings.trim else None
-    pace = Pace(config.history, settings.execution_horizon, settings.delay, wait=not process)
+    pace = Pace(history, settings.execution_horizon, settings.delay, wait=wait)
 
     def stand(pose: Array) -> MinJerk:
         return MinJerk(pose, robot.home, round(STAND_SECONDS * robot.rate))

@@ -23,7 +23,7 @@ class GaitPolicy(BasePolicy):
         self._gait.reset(slice(None) if where is None else where)
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
-        self._gait.command(instruction.velocity)
+        self._gait.command(instruction.velocity, instruction.lower)
         target = self._gait.led(self._gait.frames(_NOW).position[..., 0, :])
         self._gait.advance()
         return self._feedback(target, state.angular_velocity)

@@ -112,6 +112,7 @@ POLICIES: dict[str, Maker] = {
     "expert": _expert,
     "fast": _expert,
     "gait": _gait,
+    "location": _task_policy,
     "speed": _task_policy,
     "steering": _task_policy,
 }
@@ -185,6 +186,21 @@ def skills_known(name: str, robot: Robot, planner: DiffusionSettings | None = No
         return ()
     settings = planner or _planner(name)
     return tuple(read_header(resolve(settings.checkpoint, robot)).get("skills", {}))
+
+
+def sentences_known(name: str, robot: Robot) -> tuple[tuple[str, ...], float]:
+    """Sentences that the planner of a closed loop was trained with, where it reads others by the nearest of them, and
+    how long from a request to the end of its plan [s]; none of another policy. Raises ConfigError."""
+    from servoid.policy.checkpoint import read_header, resolve
+    from servoid.policy.diffusion.prefix.frames import RATE
+
+    if _maker(name) is not _closed_loop:
+        return (), 0.0
+    settings = _loop_settings(name)
+    head = read_header(resolve(settings.checkpoint, robot))
+    if not settings.text_nearest or "sentences" not in head:
+        return (), 0.0
+    return tuple(head["sentences"]), head["config"]["frames"] / RATE + settings.delay * robot.dt
 
 
 def policy_fingerprint(name: str, robot: Robot | None = None) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from servoid.hw.contracts.body import Array
@@ -13,8 +15,9 @@ from servoid.policy.tracker.network import gait_of_tracker, load_tracker
 from servoid.policy.tracker.observation import RESIDUAL, TrackerObservation
 from servoid.stack.control.base import BasePolicy
 
-LOOK = np.arange(0, 26, 5)  # ticks ahead over which a plan is asked whether it walks
+LOOK = np.arange(0, 26)  # ticks ahead, a step with each foot, over which a plan is asked whether it walks
 WALKS = 0.1  # of the top speeds, mean over that, from where on it does
+LIFTED = 0.5  # contact below which a foot is in the air
 UPRIGHT = 0.85  # of the standing height, which it keeps then
 OVER_SECONDS = 0.2  # from one tracker to the other
 
@@ -77,11 +80,15 @@ class Followers:
 
 
 def walks(reference: Reference, robot: Robot) -> Array:
-    """Whether a reference goes anywhere, or turns, upright `(...,)`."""
+    """Whether a reference goes anywhere, or turns, step by step, upright `(...,)`.
+
+    What keeps a foot on the ground is no walk, however it moves: a punch turns the trunk, a kick leans to the side.
+    """
     frames = reference.frames(LOOK)
     twist = np.concatenate([frames.velocity, frames.yaw_rate[..., None]], -1).mean(-2) / robot.walking.scale
     upright = frames.height.min(-1) >= UPRIGHT * robot.standing_height
-    return np.asarray(upright & (np.linalg.norm(twist, axis=-1) > WALKS))
+    steps = (frames.contact.min(-2) < LIFTED).all(-1)
+    return np.asarray(upright & steps & (np.linalg.norm(twist, axis=-1) > WALKS))
 
 
 class ExpertPolicy(BasePolicy):
@@ -99,7 +106,11 @@ class ExpertPolicy(BasePolicy):
         self._tracker.reset(where)
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
-        self._gait.command(instruction.velocity)
+        self._gait.command(instruction.velocity, instruction.lower)
+        if self._gait.lowered.any():  # it has only seen walks upright, and would push itself up
+            displacement = state.displacement.copy()
+            displacement[..., 2] += self._gait.lowered
+            state = replace(state, displacement=displacement)
         target = self._gait.led(self._tracker(state, applied, self._gait))
         self._gait.advance()
         return target

@@ -15,11 +15,12 @@ LEAST = 0.09  # m/s: slower steps hardly move it
 ALONG = 0.3  # rad off the way it shall face, up to where it steps while it turns
 
 
-def go_to_pose(ahead: Array, turn: float, profile: SpeedProfile, within: float) -> Array:
+def go_to_pose(ahead: Array, turn: float, profile: SpeedProfile, within: float, near: float = NEAR) -> Array:
     """Velocity command `(3,)` m/s forward, m/s left, rad/s toward a place `ahead` `(2,)` m in the heading frame, to be
-    within so many m of, and there to a heading that is `turn` rad to the left of the present one."""
+    within so many m of, and there to a heading that is `turn` rad to the left of the present one; from `near` m on it
+    turns to that."""
     distance = math.hypot(ahead[0], ahead[1])
-    if distance > NEAR:
+    if distance > near:
         return go_to_point(ahead, profile)
     rate = min(max(profile.turn_gain * turn, -profile.yaw_rate), profile.yaw_rate)
     if abs(turn) > ALONG:

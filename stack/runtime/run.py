@@ -19,7 +19,7 @@ from servoid.hw.robot.description import Robot, load_robot
 from servoid.hw.seeds import Stream, generator
 from servoid.policy.text.encoder import load_encoder
 from servoid.stack.control.get_up import GetUp, fingerprints, get_up
-from servoid.stack.control.policies import make_policy, policy_fingerprint, skills_known
+from servoid.stack.control.policies import make_policy, policy_fingerprint, sentences_known, skills_known
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import odometry_of
 from servoid.stack.log.provenance import header
@@ -38,6 +38,7 @@ from servoid.stack.runtime.settings import RunSettings, Script
 from servoid.stack.safety.event import Event
 from servoid.stack.safety.guard import Guard
 from servoid.stack.safety.recovery import TRIES
+from servoid.stack.skills.rewording import RewordedPolicy
 from servoid.stack.skills.runtime import SkillPolicy
 from servoid.stack.skills.skill import chosen, load_skills
 from servoid.stack.skills.skill import fingerprints as skill_fingerprints
@@ -235,6 +236,9 @@ class Run:
                 f"policy '{settings.policy}' knows no skills, and what is said asks for some ({asked}): use --policy "
                 "skills, or servoid run skill --set text=..."
             )
+        sentences, seconds = ((), 0.0) if self._policy else sentences_known(settings.policy, robot)
+        if sentences:
+            policy = RewordedPolicy(robot, policy, sentences, seconds)
         return SkillPolicy(robot, policy, load_skills(robot)) if assignment.task.performs else policy
 
     def loop(self) -> None:

@@ -26,7 +26,8 @@ tests/stack/test_safety*.py:
    many tries and so much time (recovery.py); what ends a run ends it then too, damped at once. It runs on when it has
    stood still, on flat soles, at the home pose.
 
-Homing is the guard's own: from the pose that the robot is in, slowly, to the home pose.
+Homing is the guard's own: from the pose that the robot is in, slowly, to the home pose. So is how it stands there until
+`start`: ankles that answer a tilt, as slowly (upright.py).
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ from servoid.stack.safety.limits import limit
 from servoid.stack.safety.lowering import lowered_pose
 from servoid.stack.safety.min_jerk import MIN_JERK_PEAK, MinJerk
 from servoid.stack.safety.recovery import LOAD, TRIES, Recovery
+from servoid.stack.safety.upright import Upright
 
 ASKED = {"interrupt", "button"}  # kinds of what a person does to stop the robot
 PATIENCE = 3  # targets in a row that may be not finite
@@ -66,7 +68,7 @@ class Phase(StrEnum):
 
     LIMP = "limp"  # nothing is sent
     HOMING = "homing"  # going to the home pose
-    READY = "ready"  # holding it
+    READY = "ready"  # holding it, upright
     RUNNING = "running"  # following targets
     FALLEN = "fallen"  # falling, or lying: braked, until it is still
     RECOVERING = "recovering"  # following targets to get up
@@ -94,7 +96,7 @@ class Guard:
         self.cause: str | None = None  # kind of the event that ended the run, the first if there were several
         self.recovery = Recovery(robot) if recover else None
         self.down = False  # it fell while it ran, and has not got up
-        self.lowest = lowered_pose(robot)
+        self.lowest, self._upright = lowered_pose(robot), Upright(robot)
         self._motors = motors
         self._gain = np.full(len(robot.names), gain)
         self._health = Health(robot, self._gain)
@@ -216,15 +218,16 @@ class Guard:
     def decide(self, observation: Observation, state: State | None, target: Array | None) -> Command:
         """What to send at this tick.
 
-        `observation` holds the newest sample of each joint and its age; `state` is read for the tilt alone, and is None
-        while there is not a sample of everything yet; `target` `(n_joints,)` rad is what a policy proposes and is
-        looked at only in RUNNING, RECOVERING and STOPPING, where None means that it proposes nothing and the goal
-        holds.
+        `observation` holds the newest sample of each joint and its age; `state` is read for tilt and turning, and is
+        None while there is not a sample of everything yet; `target` `(n_joints,)` rad is what a policy proposes and is
+        looked at only in RUNNING, RECOVERING and STOPPING, where None proposes nothing and the goal holds.
         """
         if self.phase in POWERED:
             self._check(observation, state)
         if self.phase is Phase.RUNNING and self.recovery is not None and state is not None:
-            self._watch_fall(self.recovery.falls(state, self._tick))
+            why = self.recovery.falls(state, self._tick)
+            if why is not None:  # as soon as it is certain: so there is time for the arms to come in
+                self._fall(why)
         if self.phase in DOWN:
             self._watch_recovery(observation, state)
         if self.phase is Phase.STOPPING and self._rests():
@@ -233,6 +236,8 @@ class Guard:
             self._accept(target)
         elif self.phase in {Phase.READY, Phase.RECOVERING, *FOLLOWING}:
             self._accepted = self._tick  # a goal that is held is accepted anew: time spent holding earns no leap
+            if self.phase is Phase.READY and self._stands and state is not None:
+                self.applied = self._upright.goal(state, self.applied)
         elif self.phase is Phase.HOMING:
             self._home_on(observation, state)
         elif self.phase is Phase.LOWERING:
@@ -324,11 +329,6 @@ class Guard:
             self._goals.popleft()
         goals = [goal for _, goal in self._goals]
         return self._tick - self._goals[0][0] >= window and float(np.ptp(goals, axis=0).max()) < REST_RANGE
-
-    def _watch_fall(self, why: str | None) -> None:
-        """Fall as soon as that is certain: so there is time for the arms to come in."""
-        if why is not None:
-            self._fall(why)
 
     def _fall(self, text: str) -> None:
         """Falling while it ran, of a robot that is to get up again."""

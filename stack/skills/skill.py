@@ -13,8 +13,8 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import resolve
 from servoid.policy.motion.clip import POSES, SUFFIX, Clip, load
 from servoid.policy.motion.library import Library
-from servoid.stack.control.balance import Balance
 from servoid.stack.log.provenance import sha256
+from servoid.stack.safety.balance import Balance
 
 UPRIGHT = "upright"
 Part = Literal["feet", "hands", "knees", "trunk"]

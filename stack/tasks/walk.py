@@ -15,8 +15,8 @@ from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.setting import Range, Setting
 from servoid.policy.references.gait import load_gait
-from servoid.policy.text.captions import caption
-from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
+from servoid.policy.text.captions import caption, motion_of
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings, drawn_pushes
 from servoid.stack.tasks.terms import metrics as measures
 
 _COMPONENTS = ("vx", "vy", "yaw_rate")
@@ -61,13 +61,8 @@ class Walk(BaseTask):
         s = self.settings
         ranges = np.array([s.vx, s.vy, s.yaw_rate])
         commands = rng.uniform(ranges[:, 0], ranges[:, 1], size=(math.ceil(self.seconds / s.every), 3))
-        count = math.ceil(self.seconds / s.push_every)
-        size = rng.uniform(s.push[0], s.push[1], size=count)
-        bearing = rng.uniform(-math.pi, math.pi, size=count)
-        pushes = size[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
-        ticks = self.ticks(s.push_every)
-        due = {(number + 1) * ticks: push for number, push in enumerate(pushes)}
-        return WalkEpisode(commands=commands, pushes=due if s.push[1] > 0.0 else {})
+        pushes = drawn_pushes(rng, self.seconds, s.push, s.push_every, self.ticks(s.push_every))
+        return WalkEpisode(commands=commands, pushes=pushes)
 
     def behaviour(self, episode: WalkEpisode) -> BaseBehaviour:
         return FollowCommands(episode, self.ticks(self.settings.every))
@@ -105,6 +100,9 @@ class FollowCommands(BaseBehaviour):
         return Instruction(velocity=commands[min(tick // self._ticks, len(commands) - 1)].copy())
 
 
+_MOTION_SECONDS = 2.0  # over which a motion is told by its mean twist
+
+
 @dataclass(frozen=True)
 class SurviveSettings(WalkSettings):
     told: Annotated[
@@ -128,7 +126,14 @@ class Survive(Walk):
         return _ToldAtFirst(episode, self.ticks(self.settings.every), self.settings.told, self)
 
     def metrics(self, trace: Trace, episode: Episode) -> dict[str, float]:
-        return {"episode_ticks": float(len(trace.yaw)), **super().metrics(trace, episode)}
+        """`motions`: how many different ones, of those that have a name, it moved by once it was left to itself."""
+        alone = self.ticks(self.settings.told)
+        seen = measures.mean_twists(trace, _MOTION_SECONDS)[math.ceil(alone * trace.dt / _MOTION_SECONDS) :]
+        return {
+            "episode_ticks": float(len(trace.yaw)),
+            "motions": float(len(np.unique(motion_of(seen, self.top)))),
+            **super().metrics(trace, episode),
+        }
 
 
 class _ToldAtFirst(FollowCommands):

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+import struct
+import termios
 import time
 from collections.abc import Callable
 
@@ -16,3 +20,15 @@ def until(condition: Callable[[], object], otherwise: str = "it did not happen")
             return
         time.sleep(_STEP)
     raise AssertionError(otherwise)
+
+
+def type_in(person: int, program: int, text: bytes) -> None:
+    """Type at a pseudo-terminal, and wait until all of it is at the program's end: the kernel takes its time."""
+    before = _unread(program)
+    os.write(person, text)
+    until(lambda: _unread(program) >= before + len(text), "what was typed did not arrive")
+
+
+def _unread(terminal: int) -> int:
+    count: int = struct.unpack("i", fcntl.ioctl(terminal, termios.FIONREAD, bytes(4)))[0]
+    return count

@@ -17,7 +17,9 @@ from servoid.tools.common.exit_codes import explain
 
 if TYPE_CHECKING:
     from servoid.stack.runtime.run import RunSettings
+    from servoid.tools.evaluate.judge import Judged
 
+_PRIOR = "prior"  # that tells the manner
 PATH_STEP = 0.2  # s between the points of a path that is kept
 
 
@@ -55,6 +57,7 @@ def do_episode(job: EpisodeJob, do: Callable[[RunSettings], dict[str, Any]] | No
 def record(settings: RunSettings) -> dict[str, Any]:
     """Do an episode and keep what any row could ask of it. Raises ConfigError."""
     from servoid.hw.robot.description import load_robot
+    from servoid.stack.tasks.learned.run import LearnedRun
     from servoid.tools.common.motion_quality import quality
     from servoid.tools.evaluate.judge import judge
 
@@ -65,6 +68,7 @@ def record(settings: RunSettings) -> dict[str, Any]:
     return {
         **judged.row,
         "ticks": min(judged.ground_truth.upright, limit),
+        "manner": _manner(judged, settings.robot) if isinstance(assignment.task, LearnedRun) else {},
         "motion": quality(judged.ground_truth.poses(), load_robot(settings.robot)),
         "path": _points(trace.displacement[:, :2], trace.dt),
         "goal": None if goal is None else np.round(goal, 3),
@@ -72,6 +76,22 @@ def record(settings: RunSettings) -> dict[str, Any]:
         "spheres": _rolling(trace),
         "others": _walking(trace),
     }
+
+
+def _manner(judged: Judged, robot: str) -> dict[str, float]:
+    """What the prior of this robot says of it; nothing, where it has none."""
+    from servoid.hw.robot.description import load_robot
+    from servoid.policy import checkpoint
+    from servoid.policy.priors.score_matching.judged import manner_of
+    from servoid.policy.priors.score_matching.model import load_prior
+    from servoid.sim.kinematics import limbs_of
+
+    body = load_robot(robot)
+    try:
+        path = checkpoint.resolve(_PRIOR, body)
+    except checkpoint.CheckpointError:
+        return {}
+    return manner_of(np.array(judged.estimates), load_prior(path, body, limbs_of(body)))
 
 
 def _points(places: Array, dt: float) -> Array:

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.backend import Backend, Simulation
+from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Assignment, Trace
 
 if TYPE_CHECKING:
+    from servoid.stack.log.tick import TickRecord
     from servoid.stack.runtime.run import RunSettings
     from servoid.tools.common.ground_truth import GroundTruth
 
@@ -26,6 +28,7 @@ class Judged:
     assignment: Assignment
     trace: Trace
     ground_truth: GroundTruth
+    estimates: list[Array]  # raw rows of what the robot knew, a tick of the task each
 
 
 def judge(job: RunSettings) -> Judged:
@@ -37,13 +40,21 @@ def judge(job: RunSettings) -> Judged:
     after it.
     """
     from servoid.hw.robot.description import load_robot
+    from servoid.policy.features import raw_row
     from servoid.stack.runtime.run import prepare, run
     from servoid.tools.common.ground_truth import GroundTruth
 
     assignment, backend = prepare(job)
     dt, episode = load_robot(job.robot).dt, assignment.episode
     ground_truth = GroundTruth(simulation(backend), dt, recover=job.recover, low=episode.low, seated=episode.seated)
-    result = run(job, backend=backend, on_tick=ground_truth)
+    estimates: list[Array] = []
+
+    def watch(record: TickRecord) -> None:
+        ground_truth(record)
+        if record.proposal.instruction is not None and record.state is not None:
+            estimates.append(raw_row(record.state))
+
+    result = run(job, backend=backend, on_tick=watch)
     _give_memory_back()
     if result.interrupted:
         raise KeyboardInterrupt
@@ -64,7 +75,7 @@ def judge(job: RunSettings) -> Judged:
     }
     if ground_truth.falls is not None:
         row |= {"falls": ground_truth.falls.falls, "stand_seconds": ground_truth.falls.seconds}
-    return Judged(row, assignment, trace, ground_truth)
+    return Judged(row, assignment, trace, ground_truth, estimates)
 
 
 def _give_memory_back() -> None:

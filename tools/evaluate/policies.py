@@ -44,11 +44,9 @@ class Policies:
 
     def network(self, experiment: Experiment) -> Path | None:
         """Where the network of its own that an experiment needs is looked for."""
-        return (
-            None
-            if experiment.network is None
-            else self._folder / "networks" / experiment.network.name / "best.safetensors"
-        )
+        own = experiment.network
+        file = "policy.safetensors" if own is not None and own.policy else "best.safetensors"
+        return None if own is None else self._folder / "networks" / own.name / file
 
     def training(self, experiment: Experiment) -> str | None:
         """How the network that an experiment lacks is trained; None where nothing is lacking. Raises ConfigError."""
@@ -59,6 +57,8 @@ class Policies:
 
     def _command(self, network: OwnNetwork, path: Path) -> str:
         """What trains a network and, before it, its latents; given again, it goes on with what was begun."""
+        if network.policy:
+            return f"`servoid train policy --out {path.parent} {network.train}`"
         options, before = network.train + _anew(path), ""
         if network.latents:
             latents = self._folder / "networks" / "latents" / "latent.safetensors"
@@ -71,7 +71,7 @@ class Policies:
         """An experiment's policy, as `servoid run --policy` takes it. Raises ConfigError where settings do not fit."""
         settings = self.settings(experiment)
         if settings is None:
-            return experiment.policy or self._policy
+            return self._other(experiment)
         values = asdict(settings)
         task = re.sub(r"\W+", "-", experiment.task)  # which may be a class in a file
         path = self._folder / "policies" / f"{task}-{key(values)}.yaml"
@@ -88,23 +88,31 @@ class Policies:
         """Settings of an experiment's planner; None for another policy. Raises ConfigError for a variant of that."""
         from servoid.hw.overrides import override
 
-        own = experiment.policy
-        base, path = self._settings if own is None else _diffusion_settings(own), self.network(experiment)
+        own, network, path = experiment.policy, experiment.network, self.network(experiment)
+        learned = network is not None and network.policy
+        if network is not None and path is not None:
+            _check_training(path, network)
+            self._check_whole(path, network)
+        base = None if learned else self._settings if own is None else _diffusion_settings(own)
         if base is None:
-            if experiment.plan or experiment.network is not None:
+            if experiment.plan or (network is not None and not learned):
                 raise ConfigError(
                     f"policy '{own or self._policy}' has no such settings: this row is for diffusion models"
                 )
             return None
-        if experiment.network is not None and path is not None:
-            _check_training(path, experiment.network)
-            self._check_whole(path, experiment.network)
+        if path is not None:
             base = replace(base, checkpoint=str(path.resolve()))
         return override(base, dict(experiment.plan), "planner setting")
 
+    def _other(self, experiment: Experiment) -> str:
+        """The policy of an experiment that is for no diffusion model, as `servoid run --policy` takes it."""
+        path = self.network(experiment)
+        return experiment.policy or self._policy if path is None else str(path.resolve())
+
     def _check_whole(self, path: Path, network: OwnNetwork) -> None:
         """Raise ConfigError for a network whose training was not finished: the best so far is there from early on."""
-        share, last = _share(path), path.with_name(_LAST)
+        last = path if network.policy else path.with_name(_LAST)
+        share = _share(path, last)
         if share is None:
             raise ConfigError(
                 f"{last}: does not record that the training finished; train it again: {self._command(network, path)}"
@@ -122,19 +130,19 @@ class Policies:
 
         settings = self.settings(experiment)
         if settings is None:
-            known = policy_fingerprint(experiment.policy or self._policy)
+            known = policy_fingerprint(self._other(experiment))
             return {name: value for name, value in known.items() if name != "name" or not known["checkpoint_sha256"]}
         values = asdict(settings)
         checkpoint = {"checkpoint": sha256(resolve(values["checkpoint"]))}
         return {"odometry": sha256(resolve("odometry")), "settings": values | checkpoint}
 
 
-def _share(path: Path) -> float | None:
-    """How much of its budget a training has used, 0 to 1, by the newest network beside its best, `path`; None where
-    there is none, or an old one that does not say."""
+def _share(path: Path, last: Path | None = None) -> float | None:
+    """How much of its budget a training has used, 0 to 1, by the newest network, which is beside its best, `path`; None
+    where there is none, or an old one that does not say."""
     from servoid.policy.checkpoint import read_header
 
-    last = path.with_name(_LAST)
+    last = last or path.with_name(_LAST)
     return read_header(last)["results"].get("share") if last.is_file() else None
 
 
@@ -147,25 +155,36 @@ def _anew(path: Path) -> str:
 def _check_training(path: Path, network: OwnNetwork) -> None:
     """Raise ConfigError for a network that was trained with other options than its row says."""
     from servoid.policy.checkpoint import read_header
-    from servoid.tools.learn.flags import plain, read_settings
-    from servoid.tools.learn.settings import DiffusionTraining
-    from servoid.tools.learn.trainers.diffusion import add_arguments
 
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    args = parser.parse_args(["--data", "", "--out", "", *shlex.split(network.train)])
-    asked = plain(read_settings(args, DiffusionTraining()))
+    asked = _asked(network)
     header = read_header(path)
-    given = {**header.get("config", {}), **header.get("training", {})}
+    given = {**({} if network.policy else header.get("config", {})), **header.get("training", {})}
     if "committed" in given:  # in headers of before it was called inference_delay
         given["inference_delay"] = given.pop("committed")
-    whatever = {*_WHATEVER, "minutes"} if asked["steps"] else _WHATEVER  # then they say when to evaluate, and no more
+    whatever = (
+        {*_WHATEVER, "minutes"} if asked.get("steps") else _WHATEVER
+    )  # then they say when to evaluate, and no more
     for name, value in given.items():
         if name in asked and name not in whatever and asked[name] != value:
             option = "--" + name.replace("_", "-")
             raise ConfigError(
                 f"{path}: trained with {option} {value}, but this row needs {asked[name]}: train it again"
             )
+
+
+def _asked(network: OwnNetwork) -> dict[str, Any]:
+    """The settings of a network's training, as its row gives them."""
+    from servoid.tools.learn.flags import plain, read_settings
+    from servoid.tools.learn.prior_settings import PolicyTraining
+    from servoid.tools.learn.settings import DiffusionTraining
+    from servoid.tools.learn.trainers import diffusion, policy
+
+    parser, options = argparse.ArgumentParser(), ["--out", "", *shlex.split(network.train)]
+    if network.policy:
+        policy.add_arguments(parser)
+        return plain(read_settings(parser.parse_args(options), PolicyTraining()))
+    diffusion.add_arguments(parser)
+    return plain(read_settings(parser.parse_args(["--data", "", *options]), DiffusionTraining()))
 
 
 def _diffusion_settings(policy: str) -> DiffusionSettings | None:

@@ -21,12 +21,14 @@ T = TypeVar("T")
 class OwnNetwork:
     """A network that is not shipped. `train` are the options of `servoid train diffusion` beside --data and --out.
 
-    With `latents` it plans latents, which `servoid train latent` makes first.
+    With `latents` it plans latents, which `servoid train latent` makes first. With `policy` it is a task policy, and
+    `train` all options of `servoid train policy` but --out.
     """
 
     name: str
     train: str
     latents: bool = False
+    policy: bool = False
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,7 @@ class Evaluation:
 class _Network:
     train: str
     latents: bool = False
+    policy: bool = False
 
 
 @dataclass(frozen=True)
@@ -192,7 +195,7 @@ class _Rows:
         network = None
         if merged.network is not None:
             found = self._find(merged.network, self._file.networks, key, "network")
-            network = OwnNetwork(merged.network, found.train, found.latents)
+            network = OwnNetwork(merged.network, **asdict(found))
         if merged.task is None:
             raise self._marks.error(key, "names no task")
         given = _said(merged) | {"set": _texts(merged.set), "plan": _texts(merged.plan), "network": network}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,10 +16,8 @@ from servoid.policy.features import raw_layout, raw_mirror
 from servoid.policy.mlp import Mlp
 from servoid.policy.priors.goals import SeenGoal
 from servoid.policy.priors.observation import TaskObservation
+from servoid.policy.recording import DatasetError, Recording
 from servoid.tools.learn.progress import counted
-
-if TYPE_CHECKING:
-    from servoid.policy.recording import Recording
 
 AHEAD_SECONDS = (0.48, 2.0)  # how far ahead what came to pass is taken for what was asked
 _BATCH = 512
@@ -34,25 +31,32 @@ def demonstrated(
     """Observations `(n, size)` and joint targets `(n, n_joints)` rad at the decisions of a recording and in a mirror.
 
     Each is given as a goal what the episode then did, over a time drawn from `AHEAD_SECONDS`: the mean velocity, the
-    way it faced, the place where it was.
+    way it faced, the place where it was. Raises DatasetError where no episode is long enough.
     """
-    observations, targets, mirror, joints = [], [], raw_mirror(robot), Mirror.joints(robot)
-    for first, end in recording.spans:
-        for side in (False, True):
-            raw, applied, wanted = (x[first:end] for x in (recording.raw, recording.applied, recording.action))
-            if side:
-                raw, applied, wanted = mirror(raw), joints(applied), joints(wanted)
-            rows = np.arange(1, len(raw) - round(AHEAD_SECONDS[0] * robot.rate), stride)
-            if not len(rows):
-                continue
-            told = _hindsight(raw, rows, robot, rng)
-            seen = goal.observe(told, robot.walking)
-            observe = TaskObservation(robot, goal)
-            observations += [observe.of_rows(raw[t], applied[t - 1], seen[i]) for i, t in enumerate(rows)]
-            # What was decided at each tick that the decision lasts: held for as long, it is late by half of that.
-            lasting = np.minimum(rows[:, None] + np.arange(stride), len(wanted) - 1)
-            targets.append(wanted[lasting].mean(1))
-    return np.stack(observations), np.concatenate(targets)
+    mirror, joints, rows, seen = raw_mirror(robot), Mirror.joints(robot), [], []
+    n = len(recording.raw)
+    # Both sides, one after the other, so that an episode is one of rows, wherever it lies.
+    raw = np.concatenate([recording.raw, mirror(recording.raw)])
+    applied = np.concatenate([recording.applied, joints(recording.applied)])
+    wanted = np.concatenate([recording.action, joints(recording.action)])
+    targets = []
+    for first, end in [*recording.spans, *(recording.spans + n)]:
+        decided = np.arange(1, end - first - round(AHEAD_SECONDS[0] * robot.rate), stride)
+        if not len(decided):
+            continue
+        rows.append(first + decided)
+        seen.append(goal.observe(_hindsight(raw[first:end], decided, robot, rng), robot.walking))
+        # What was decided at each tick that the decision lasts: held for as long, it is late by half of that.
+        lasting = np.minimum(decided[:, None] + np.arange(stride), end - first - 1)
+        targets.append(wanted[first:end][lasting].mean(1))
+    if not rows:
+        raise DatasetError(f"no episode lasts longer than the {AHEAD_SECONDS[0]:g} s that are looked ahead")
+    # All episodes at once, a decision at a time; those that are over repeat their last.
+    observe, last = TaskObservation(robot, goal, (len(rows),)), max(map(len, rows))
+    at = np.stack([np.r_[row, np.full(last - len(row), row[-1])] for row in rows])
+    goals = np.stack([np.concatenate([x, np.repeat(x[-1:], last - len(x), 0)]) for x in seen])
+    found = np.stack([observe.of_rows(raw[at[:, i]], applied[at[:, i] - 1], goals[:, i]) for i in range(last)], 1)
+    return np.concatenate([found[i, : len(row)] for i, row in enumerate(rows)]), np.concatenate(targets)
 
 
 def _hindsight(raw: Array, rows: Array, robot: Robot, rng: np.random.Generator) -> Instruction:

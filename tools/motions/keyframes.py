@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from servoid.hw.config import ConfigError, load_yaml, resolve
 from servoid.policy.motion.clip import About
-from servoid.stack.control.balance import Balance
+from servoid.stack.safety.balance import Balance
 
 Vector = tuple[float, float, float]
 

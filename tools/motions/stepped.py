@@ -12,7 +12,7 @@ from servoid.hw.config import ConfigError, nearest
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import About, Clip
-from servoid.stack.control.balance import Feedback
+from servoid.stack.safety.balance import Feedback
 from servoid.stack.safety.limits import limit
 from servoid.tools.motions.keyframes import AuthoredClip, JointStep
 from servoid.tools.motions.physics import play

@@ -15,14 +15,15 @@ from servoid.policy.motion.clip import About, Clip, smooth
 from servoid.policy.references.clip import ClipReference
 from servoid.sim.model import build
 from servoid.sim.worlds import Worlds
-from servoid.stack.control.balance import Feedback
 from servoid.stack.control.tracker import ExpertPolicy
 from servoid.stack.estimation.estimator import Estimator
 from servoid.stack.estimation.odometry import load_odometry
+from servoid.stack.safety.balance import Feedback
 from servoid.stack.safety.limits import limit
+from servoid.stack.safety.upright import Upright
 from servoid.stack.tasks.skills.kick import SIDES, KickSettings
 
-READY_SECONDS = 0.7  # that the robot holds its home pose, as before a run: it sags and leans as its servos give
+READY_SECONDS = 0.7  # that the robot stands at its home pose, as before a run: it sags and leans as its servos give
 LOOK_SECONDS = 0.5  # that the expert stands before the kick
 AFTER_SECONDS = 1.0  # that it stands after it
 _BLEND_SECONDS = 0.2  # from a kick's last pose to what stands
@@ -61,7 +62,7 @@ class KickTrial:
         self._worlds = Worlds(robot, n, threads=1, randomise=randomise, model=build(robot, scene))
         self._estimator = Estimator(robot, load_odometry(robot), (n,))
         self._stands = ExpertPolicy(robot, "expert", (n,))
-        self._feedback = Feedback(robot)
+        self._feedback, self._upright = Feedback(robot), Upright(robot)
 
     def kick(self, goals: Sequence[Array], gains: Array, foot: str, generation: int) -> Kicks:
         """Candidates by their goals `(ticks, n_joints)` rad each, and their gains `(candidates, 4, 2)` of `Balance`."""
@@ -81,7 +82,7 @@ class KickTrial:
         for tick in range(ticks):
             state = self._estimator.update(worlds.observe(), applied)
             stands = self._stands.act(state, applied, told)
-            target = np.tile(robot.home, (n, 1)) if tick < ready else stands
+            target = self._upright.goal(state, applied) if tick < ready else stands
             if tick == look:
                 reference.play(np.repeat(np.arange(self.candidates), self.each))
                 reference.enter(applied)

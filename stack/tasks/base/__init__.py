@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
@@ -15,7 +16,7 @@ from servoid.hw.contracts.operator import CommandSource, Intent
 from servoid.hw.contracts.task import Behaviour, Criterion, Episode, Objective, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot, shipped_robot
-from servoid.hw.setting import Setting, asks, check, rescaled
+from servoid.hw.setting import Range, Setting, asks, check, rescaled
 from servoid.policy.references.gait import gait_of
 from servoid.stack.tasks.terms.body import Build
 from servoid.stack.tasks.terms.guidance import TotalCost
@@ -43,6 +44,16 @@ class Settings:
     def completed(typed: dict[str, str]) -> dict[str, str]:
         """Settings as typed on a command line, with those that follow from them."""
         return typed
+
+
+def drawn_pushes(rng: np.random.Generator, seconds: float, size: Range, every: float, ticks: int) -> dict[int, Array]:
+    """Pushes in random directions `(2,)` m/s by their tick, one each `every` s, which are so many `ticks`. The first
+    comes one interval after the start; none where the largest `size` [m/s] is 0."""
+    count = math.ceil(seconds / every)
+    sizes = rng.uniform(*size, size=count)
+    bearing = rng.uniform(-math.pi, math.pi, size=count)
+    pushes = sizes[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+    return {(number + 1) * ticks: push for number, push in enumerate(pushes)} if size[1] > 0.0 else {}
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,7 @@ class Done:
 
     part: str | None = None  # "pelvis" over the point, or a key point ("left hand") at it
     within: float = 0.08  # m from it
+    faces: float | None = None  # rad off the heading that is drawn with a point, at most
     lies: bool = False  # the bag has fallen
     seated: bool = False  # the base is over the seat, and low
     upright: bool = False  # the robot stands

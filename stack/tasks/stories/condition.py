@@ -20,8 +20,9 @@ LIES = 0.25  # of a bag's upward axis: below that it lies, as in CLoSD
 EDGE = 0.03  # m that the base's middle may be before a seat's edge: the pelvis reaches 0.04 m behind it
 LOW = 0.07  # m of the base above a seat, at most, by which it sits
 UPRIGHT, LEAN = 0.85, 0.35  # of the standing height, at least, and rad at most: it stands
-# It is at rest where within so many seconds no joint moves by more than this and the base leans no other way. Not by
-# the speed of the base: odometry counts on feet that carry, and drifts while the robot sits.
+# It is at rest where within so many seconds no joint of a leg moves by more than this and the base leans no other way.
+# Not by the speed of the base: odometry counts on feet that carry, and drifts while the robot sits. Nor by its arms: a
+# plan holds them a little otherwise than the one before it, and the base does not move by that.
 REST_SECONDS, REST_JOINTS, REST_LEAN = 0.2, 0.03, 0.03  # s, rad, rad
 
 
@@ -35,17 +36,19 @@ class Moment:
     still: Array  # (...,) bool
 
 
-def moments(trace: Trace) -> Moment:
-    """All ticks of a trace. Raises ValueError for one that does not hold orientation and joints."""
+def moments(trace: Trace, legs: Array) -> Moment:
+    """All ticks of a trace of a robot whose joints `legs` are those of its legs. Raises ValueError for a trace without
+    orientation or joints."""
     if trace.orientation is None or trace.joints is None:
         raise ValueError("a trace without orientation or joints: no act can be judged by it")
     earlier = np.maximum(np.arange(len(trace.yaw)) - round(REST_SECONDS / trace.dt), 0)
-    still = rests(trace.joints, trace.joints[earlier], trace.orientation, trace.orientation[earlier])
+    bent = trace.joints[:, legs]
+    still = rests(bent, bent[earlier], trace.orientation, trace.orientation[earlier])
     return Moment(trace.displacement, trace.orientation, trace.joints, still)
 
 
 def rests(joints: Array, joints_before: Array, orientation: Array, orientation_before: Array) -> Array:
-    """Whether a robot is at rest `(...,)`, by its joints and its lean now and REST_SECONDS earlier."""
+    """Whether a robot is at rest `(...,)`, by the joints of its legs and its lean now and REST_SECONDS earlier."""
     moved = np.abs(joints - joints_before).max(-1)
     leant = np.linalg.norm(up_vector(orientation) - up_vector(orientation_before), axis=-1)
     return np.asarray((moved <= REST_JOINTS) & (leant <= REST_LEAN))
@@ -55,7 +58,7 @@ class Conditions:
     """What acts are done by, for one robot."""
 
     def __init__(self, robot: Robot) -> None:
-        self._robot = robot
+        self._robot, self.legs = robot, robot.leg_index.reshape(-1)
 
     @cached_property
     def _points(self) -> KeyPoints:
@@ -70,6 +73,9 @@ class Conditions:
         elif done.part is not None:
             at = self._points(now.joints)[..., self._points.names.index(done.part), :]
             found &= np.linalg.norm(now.base + rotate(now.orientation, at) - thing[..., :3], axis=-1) <= done.within
+        if done.faces is not None:
+            off = (yaw_of(now.orientation) - yaw_of(thing[..., 3:]) + np.pi) % (2 * np.pi) - np.pi
+            found &= np.abs(off) <= done.faces
         if done.lies:
             found &= up_vector(thing[..., 3:])[..., 2] <= LIES
         if done.seated and seat is not None:

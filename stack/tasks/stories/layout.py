@@ -29,7 +29,7 @@ class Things:
     reach: Range
     strike: Range
     sit: Range
-    bearing: float  # of a thing off the way that the robot faces, at most
+    bearing: Range  # of a thing off the way that the robot faces, to either side
     touch: Range  # heights of points for hands
     bag: tuple[float, float, float]
     bag_mass: float
@@ -42,6 +42,7 @@ class StoryLayout:
     objects: tuple[SceneObject, ...]
     things: tuple[int, ...]  # of each act: the number of its object, or -1
     points: Array  # (acts, 3) m: that of each act, NaN where it is about an object
+    headings: Array  # (acts,) rad: that to face at it
 
 
 def laid_out(acts: Sequence[Act], what: Things, rng: np.random.Generator) -> StoryLayout:
@@ -49,7 +50,8 @@ def laid_out(acts: Sequence[Act], what: Things, rng: np.random.Generator) -> Sto
     for _ in range(_BEGINNINGS):
         drawing = _Drawing(what, rng)
         if all(drawing.add(act) for act in acts):
-            return StoryLayout(tuple(drawing.objects), tuple(drawing.things), np.array(drawing.points))
+            points, headings = np.array(drawing.points), np.array(drawing.headings)
+            return StoryLayout(tuple(drawing.objects), tuple(drawing.things), points, headings)
     raise ConfigError(f"no room for the things of {len(acts)} acts: plan fewer, or nearer or farther ones")
 
 
@@ -60,6 +62,7 @@ class _Drawing:
         self.objects: list[SceneObject] = []
         self.things: list[int] = []
         self.points: list[Array] = []
+        self.headings: list[float] = []
         self._what, self._rng = what, rng
         self._here, self._facing = np.zeros(2), 0.0
         self._ways: list[tuple[Array, Array, int]] = []  # from, to, and the object that it leads to
@@ -74,9 +77,11 @@ class _Drawing:
         seat = next((i for i, thing in enumerate(objects) if thing.kind == "seat"), -1)
         known = act.thing == "seat" and seat >= 0  # there is one in a story
         distance = self._rng.uniform(*{"point": what.reach, "bag": what.strike, "seat": what.sit}[act.thing])
-        turn = self._facing + self._rng.uniform(-what.bearing, what.bearing)
+        (least, most), off = what.bearing, self._rng.uniform(-1.0, 1.0)
+        turn = self._facing + math.copysign(least + (most - least) * abs(off), off)
         there = self._here + distance * np.array([math.cos(turn), math.sin(turn)])
         point, new, index = np.full(3, np.nan), list(objects), seat if known else -1
+        facing = turn if act.done.faces is None else self._rng.uniform(-math.pi, math.pi)
         if act.thing == "point":
             point = np.array([*there, 0.0 if act.done.part == PELVIS else self._rng.uniform(*what.touch)])
         elif not known:
@@ -91,7 +96,8 @@ class _Drawing:
         self.objects, self._ways = new, ways
         self.things.append(index)
         self.points.append(point)
-        self._facing = new[index].heading if act.thing == "seat" else turn
+        self.headings.append(facing)
+        self._facing = new[index].heading if act.thing == "seat" else facing
         # It stops before a bag, which lies beyond that then.
         self._here = (
             there - IN_FRONT_OF_BAG * np.array([math.cos(turn), math.sin(turn)]) if act.thing == "bag" else there

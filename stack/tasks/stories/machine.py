@@ -25,7 +25,9 @@ from servoid.stack.tasks.stories.condition import REST_SECONDS, Conditions, Mome
 from servoid.stack.tasks.stories.told import StoryEpisode, StorySettings
 
 AGAIN_SECONDS = 2.0  # after a skill that did not do it, before another try
+READY_SECONDS = 0.8  # in which a planner comes to a stand before what it is told, and may be told otherwise
 STAGE = 0.04  # m from there that will do
+FAR = 0.25  # m from there beyond which a robot that had come near walks there anew: turning, it drifts
 AWAY = 0.08  # m farther off that a robot turns its back to a seat: its toes need room
 REST_AT_END = 1.0  # s, of standing or sitting
 PROFILE = SpeedProfile(reverse=0.1, lateral=0.1)
@@ -48,6 +50,7 @@ class Machine(BaseBehaviour):
         self._number = self._began = 0
         self._acting: int | None = None  # tick at which the act itself was asked for
         self._facing: float | None = None  # rad, toward the thing, as its approach began
+        self._near = False  # whether it has come near to where the act is performed
         self._aside = False  # whether it has turned its back to the seat, away from it
         self._done = False  # the act, though the robot may be in the middle of it
         self._held = 0  # ticks for which what it is done by has held
@@ -99,7 +102,7 @@ class Machine(BaseBehaviour):
 
     def _next(self, tick: int) -> None:
         self._acting = self._facing = None
-        self._aside = self._done = False
+        self._near = self._aside = self._done = False
         self._held, self._began = 0, tick
         if self._number + 1 == len(self.episode.acts):
             self._over = tick
@@ -134,8 +137,8 @@ class Machine(BaseBehaviour):
         self._lost = what
 
     def _is_done(self, act: Act, state: State, thing: Array) -> bool:
-        before = self._recent[0]
-        still = rests(state.position, before.position, state.orientation, before.orientation)
+        before, legs = self._recent[0], self._conditions.legs
+        still = rests(state.position[legs], before.position[legs], state.orientation, before.orientation)
         now = Moment(state.displacement, state.orientation, state.position, still)
         held = self._conditions.hold(act, now, thing, self.episode.seat(self._number))
         self._held = self._held + 1 if bool(held) else 0
@@ -168,10 +171,11 @@ class Machine(BaseBehaviour):
 
     def _in_motion(self, act: Act) -> bool:
         """Whether a planner is in the middle of what it was told: it knows no way back from there, on one foot say, but
-        to its end. A skill ends by itself."""
+        to its end. Before that, a kick at a bag that it has walked over would end on it. A skill ends by itself."""
         if self._performs or self._acting is None or act.skill is None:
             return False
-        return self._tick - self._acting < self._ticks(self._lasts(act, act.skill))
+        since = self._tick - self._acting
+        return self._ticks(READY_SECONDS) <= since < self._ticks(self._lasts(act, act.skill))
 
     def _walk(self, act: Act, state: State, thing: Array) -> Instruction | None:
         """To where the act is performed; None where the robot is there."""
@@ -188,9 +192,13 @@ class Machine(BaseBehaviour):
         if there:
             return None
         faces = to.turned < math.pi
-        velocity = go_to_pose(ahead, turn if faces else 0.0, PROFILE, to.within)
-        if faces and float(np.linalg.norm(ahead)) < NEAR:
-            return Instruction(velocity, targets={"ground": ahead, "heading": np.array(turn)})
+        near = FAR if self._near else NEAR
+        velocity = go_to_pose(ahead, turn if faces else 0.0, PROFILE, to.within, near)
+        self._near = float(np.linalg.norm(ahead)) <= near
+        if faces and self._near:
+            # First it turns, then it steps: a planner that is told to turn and shown a place beside it stumbles.
+            place = ahead if velocity[:2].any() else np.zeros(2)
+            return Instruction(velocity, targets={"ground": place, "heading": np.array(turn)})
         return Instruction(velocity, goal=ahead)
 
     def _place(self, act: Act, state: State, thing: Array) -> tuple[Array, float]:
@@ -202,6 +210,8 @@ class Machine(BaseBehaviour):
             edge = to.ahead + (0.0 if seat is None else seat.size[0] / 2) + (0.0 if self._aside else AWAY)
             place = thing[:2] + turned(np.array([edge, to.aside]), facing)
         else:
+            if act.done.faces is not None:
+                self._facing = float(yaw_of(thing[3:]))
             if self._facing is None:  # kept from then on: seen from near by, where it should face turns with each step
                 away = thing[:2] - state.displacement[:2]
                 self._facing = math.atan2(away[1], away[0])

@@ -13,7 +13,7 @@ from servoid.hw.contracts.task import Criterion, Trace
 from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.description import Robot, shipped_robot
 from servoid.stack.skills.skill import Skill, load_skills
-from servoid.stack.tasks.base import BaseBehaviour, BaseTask
+from servoid.stack.tasks.base import BaseBehaviour, BaseTask, drawn_pushes
 from servoid.stack.tasks.stories.act import Act, drawn, load_acts
 from servoid.stack.tasks.stories.condition import Conditions, first, held_ticks, moments
 from servoid.stack.tasks.stories.layout import laid_out
@@ -68,9 +68,12 @@ class Story(BaseTask):
         layout = laid_out(acts, self.settings.things, rng)
         scene = Scene(np.zeros((0, 3)), np.zeros((0, 4)), objects=layout.objects)
         sits = any(act.done.seated for act in acts)
+        s = self.settings
         return StoryEpisode(
-            scene if layout.objects else None, acts=acts, things=layout.things, points=layout.points, seated=sits
-        )
+            scene if layout.objects else None, acts=acts, things=layout.things, points=layout.points,
+            headings=layout.headings, seated=sits,
+            pushes=drawn_pushes(rng, self.seconds, s.push, s.push_every, self.ticks(s.push_every)),
+        )  # fmt: skip
 
     def behaviour(self, episode: StoryEpisode) -> BaseBehaviour:
         return Machine(episode, self.settings, self.conditions, self.skills, self.dt)
@@ -99,7 +102,7 @@ class Story(BaseTask):
         begin = 0
         if not len(trace.yaw):
             return [None] * len(episode.acts)
-        now = moments(trace)
+        now = moments(trace, self.conditions.legs)
         for number, act in enumerate(episode.acts):
             at = None
             if not found or found[-1] is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -10,7 +11,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Episode
 from servoid.hw.contracts.world import SceneObject
-from servoid.hw.geometry import turned, yaw_of
+from servoid.hw.geometry import headed, turned, yaw_of
 from servoid.hw.setting import Range, Setting
 from servoid.stack.tasks.base import Settings
 from servoid.stack.tasks.stories.act import Act
@@ -34,6 +35,7 @@ class StorySettings(Settings):
     bearing: Annotated[float, Setting("how far a thing may be off the way that the robot faces", "rad", least=0)] = (
         3.1416
     )
+    least_bearing: Annotated[float, Setting("how far off it is at least", "rad", least=0)] = 0.0
     touch: Annotated[Range, Setting("height of a point for a hand", "m", above=0)] = (0.26, 0.31)
     seat_height: Annotated[Range, Setting("height of a seat", "m", above=0)] = (0.14, 0.15)
     seat_depth: Annotated[float, Setting("of a seat, from front to back", "m", above=0)] = 0.2
@@ -41,12 +43,19 @@ class StorySettings(Settings):
     bag_height: Annotated[float, Setting("of a bag", "m", above=0)] = 0.36
     bag_width: Annotated[float, Setting("of a bag", "m", above=0)] = 0.06
     bag_mass: Annotated[float, Setting("of a bag", "kg", above=0)] = 0.1
+    push: Annotated[Range, Setting("size of each push, in a random direction", "m/s", least=0)] = (0.0, 0.0)
+    push_every: Annotated[float, Setting("time between pushes", "s", above=0)] = 1.0
     stale: Annotated[float, Setting("age of what is seen from which on it is not gone by", "s", above=0)] = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.least_bearing > self.bearing:
+            raise ValueError(f"least_bearing: {self.least_bearing:g} is more than bearing ({self.bearing:g})")
 
     @property
     def things(self) -> Things:
         return Things(
-            self.reach, self.strike, self.sit, self.bearing, self.touch,
+            self.reach, self.strike, self.sit, (self.least_bearing, self.bearing), self.touch,
             (self.bag_width, self.bag_width, self.bag_height), self.bag_mass,
             (self.seat_depth, self.seat_width), self.seat_height,
         )  # fmt: skip
@@ -57,6 +66,7 @@ class StoryEpisode(Episode):
     acts: tuple[Act, ...]
     things: tuple[int, ...]  # of each act: the number of its object in the scene, -1: a point
     points: Array  # (acts, 3) m in the frame that the robot starts in
+    headings: Array  # (acts,) rad there, to face at a point
 
     @property
     def objects(self) -> tuple[SceneObject, ...]:
@@ -70,12 +80,15 @@ class StoryEpisode(Episode):
     def point(self, number: int, objects: Array | None) -> Array:
         """That of an act, as poses `(..., 7)`: where it was drawn, as seen from a seat where `objects`, seen in poses
         `(..., objects, 7)`, have one: a seat stays where it is, and odometry drifts."""
-        drawn = np.array([*self.points[number], 1.0, 0.0, 0.0, 0.0])
+        facing = self.headings[number]
+        drawn = np.array([*self.points[number], math.cos(facing / 2), 0.0, 0.0, math.sin(facing / 2)])
         seat = next((i for i, thing in enumerate(self.objects) if thing.kind == "seat"), None)
         if seat is None or objects is None:
             return drawn
         now, thing = objects[..., seat, :], self.objects[seat]
         found = np.broadcast_to(drawn, now.shape).copy()
-        moved = turned(drawn[:2] - np.array(thing.place), yaw_of(now[..., 3:]) - thing.heading)
+        turn = yaw_of(now[..., 3:]) - thing.heading
+        moved = turned(drawn[:2] - np.array(thing.place), turn)
         found[..., :2] = np.where(np.isfinite(now[..., :1]), now[..., :2] + moved, drawn[:2])
+        found[..., 3:] = headed(found[..., 3:], np.where(np.isfinite(turn), turn, 0.0))
         return found

@@ -32,6 +32,15 @@ def velocity_error(trace: Trace, cycle: float) -> float:
     return float(np.mean(errors)) if errors else float("nan")
 
 
+def mean_twists(trace: Trace, window: float) -> Array:
+    """Mean m/s forward, m/s left and rad/s `(n, 3)` over one whole `window` s after the other."""
+    ticks = round(window / trace.dt)
+    count = len(trace.yaw) // ticks
+    velocity = trace.velocity[: count * ticks, :2].reshape(count, ticks, 2).mean(1)
+    yaw = np.unwrap(trace.yaw)[: count * ticks].reshape(count, ticks)
+    return np.column_stack([velocity, (yaw[:, -1] - yaw[:, 0]) / ((ticks - 1) * trace.dt)])
+
+
 def top_speed(trace: Trace, window: float = 2.0) -> float:
     """Highest mean forward speed over `window` s [m/s]; NaN for a shorter run."""
     ticks = round(window / trace.dt)

@@ -228,7 +228,7 @@ def test_a_guardian_that_is_killed_is_replaced_and_told_again(servos: Servos, li
 
 def test_a_guardian_that_cannot_live_keeps_torque_off(line: Lifeline, monkeypatch: pytest.MonkeyPatch) -> None:
     os.kill(line.pid, signal.SIGKILL)
-    time.sleep(0.1)
+    line._process.wait(60.0)
     monkeypatch.setattr(guardian, "__file__", "/nonexistent/guardian.py")
     with pytest.raises(BackendError, match="torque stays off"):
         line.hold()
@@ -240,7 +240,7 @@ def test_a_guardian_that_cannot_be_replaced_does_not_keep_torque_on(
     """Out of processes or file descriptors in the middle of a run: a clear error, and then torque off as ever."""
     line.hold()
     os.kill(line.pid, signal.SIGKILL)
-    line._process.wait(5.0)
+    line._process.wait(60.0)
 
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")

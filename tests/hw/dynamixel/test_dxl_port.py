@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import pty
-import time
 import tty
 from collections.abc import Iterator
 
 import pytest
+from waiting import type_in, until
 
 from servoid.hw.contracts.body import BackendError
 from servoid.hw.dynamixel.transport.port import SerialPort, drain
@@ -33,8 +33,7 @@ def test_bytes_go_both_ways_and_reading_does_not_wait(line: tuple[int, str]) -> 
     assert port.read() == b""
     port.write(b"\xff\xff\xfd\x00\x11\x13")  # with XON and XOFF, which a cooked line would eat
     assert os.read(far, 100) == b"\xff\xff\xfd\x00\x11\x13"
-    os.write(far, b"\x03\x0d\x00")
-    time.sleep(0.01)
+    type_in(far, port.fileno(), b"\x03\x0d\x00")
     assert port.read() == b"\x03\x0d\x00"
     port.set_baud(4_000_000)
     assert port.baud == 4_000_000
@@ -68,9 +67,8 @@ def test_a_port_that_vanishes_is_a_backend_error(line: tuple[int, str]) -> None:
     far, name = line
     port = SerialPort(name, 2_000_000)
     os.close(far)
-    time.sleep(0.01)
     with pytest.raises(BackendError, match="port is gone"):
-        port.read()
+        until(port.read, "it reads on")
     with pytest.raises(BackendError, match="port is gone"):
         port.write(b"x")
     port.close()

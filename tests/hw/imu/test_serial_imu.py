@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import queue
 import threading
-import time
 import tty
 from dataclasses import replace
 from typing import Any
@@ -104,8 +103,8 @@ class Sensor(Messages):
                 os.write(self.master, self.next())
 
     def unplug(self) -> None:
-        self.mode = "silent"
-        time.sleep(2 * self.period)
+        self._end.set()
+        self._thread.join()  # it may be writing
         os.close(self.master)
         os.close(self.slave)
         self.master = self.slave = -1

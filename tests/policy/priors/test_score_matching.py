@@ -18,7 +18,9 @@ from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.limbs import Limb, Limbs
 from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.features import raw_layout
 from servoid.policy.priors.score_matching.generate import generate, starts, upright
+from servoid.policy.priors.score_matching.judged import manner_of
 from servoid.policy.priors.score_matching.model import Prior, Style, load_prior
 from servoid.policy.priors.score_matching.score import RunningMean, Score, likeness
 from servoid.policy.recording import DatasetError
@@ -92,6 +94,21 @@ def test_a_window_with_a_nan_is_refused(prior: Prior) -> None:
     bad[3, 1, 5] = torch.nan
     with pytest.raises(ValueError, match="not finite"):
         Score(prior, Style(), 0)(bad)
+
+
+def test_the_manner_of_a_run_is_judged_from_when_it_has_settled() -> None:
+    """A robot that stands is unlike the data of walks, and has no amplitude."""
+    found = load_prior(checkpoint.resolve("prior"), ROBOT, limbs_of(ROBOT))
+    layout = raw_layout(len(ROBOT.joints))
+    stands = np.zeros((120, layout.size), np.float32)
+    stands[:, layout.slice("position")] = ROBOT.home
+    stands[:, layout.slice("gravity")] = [0.0, 0.0, -1.0]
+    stands[:, layout.slice("displacement")] = [0.0, 0.0, ROBOT.standing_height]
+    manner = manner_of(stands, found)
+    assert manner["prior_error"] > 2.0
+    assert manner["amplitude"] < 1e-6
+    assert np.isnan(manner["cadence"])
+    assert manner_of(stands[:100], found) == {}  # two seconds
 
 
 def test_a_random_level_is_one_error_a_window(prior: Prior) -> None:

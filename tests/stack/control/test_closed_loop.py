@@ -21,11 +21,12 @@ from servoid.policy.diffusion.prefix.model import PlannerModel, load, save
 from servoid.policy.diffusion.prefix.network import PlannerNetwork
 from servoid.policy.diffusion.prefix.runtime import PlannerRuntime
 from servoid.policy.features import Normaliser, raw_layout
-from servoid.policy.references.plan import row_layout
+from servoid.policy.references.plan import PlanReference, row_layout
 from servoid.policy.text.encoder import load_encoder
 from servoid.stack.control.closed_loop import ClosedLoopSettings, closed_loop_policy, load_settings
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.policies import make_policy, policy_fingerprint
+from servoid.stack.control.tracker import walks
 from servoid.stack.tasks import load_task
 
 ROBOT = load_robot("op3")
@@ -158,6 +159,23 @@ def test_a_sentence_is_read_as_the_nearest_of_the_training(checkpoint: str) -> N
     np.testing.assert_array_equal(nearest.plan(told).states, nearest.plan(meant).states)
     np.testing.assert_array_equal(plain.plan(meant).states, nearest.plan(meant).states)
     assert not np.allclose(plain.plan(told).states, plain.plan(meant).states, atol=1e-5)
+
+
+def test_only_what_steps_with_both_feet_is_followed_as_a_walk() -> None:
+    """A punch turns the trunk as fast as a slow turn does; a follower of the gait topples over where it is told to."""
+    layout, reference = row_layout(ROBOT), PlanReference(ROBOT)
+    angle = 0.3 * np.arange(60) * ROBOT.dt / 2
+    rows = np.zeros((60, layout.size))
+    rows[:, layout.slice("place")] = [0.0, 0.0, ROBOT.standing_height]
+    rows[:, layout.slice("orientation")] = np.stack([np.cos(angle), 0 * angle, 0 * angle, np.sin(angle)], -1)
+    rows[:, layout.slice("position")] = ROBOT.home
+    rows[:, layout.slice("contact")] = 1.0
+    for lifted, is_walk in (((), False), ((0,), False), ((0, 1), True)):
+        turning = rows.copy()
+        for foot in lifted:
+            turning[5 + 12 * foot : 12 + 12 * foot, layout.slice("contact").start + foot] = 0.0
+        reference.follow(turning)
+        assert walks(reference, ROBOT) == is_walk
 
 
 def test_another_sentence_is_planned_for_at_once_and_a_run_is_repeated(checkpoint: str) -> None:

@@ -6,13 +6,13 @@ import ctypes
 import os
 import pickle
 import pty
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from waiting import type_in
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.task import Episode
@@ -41,8 +41,7 @@ def terminal() -> Iterator[tuple[Keyboard, Callable[[str], None], int]]:
     keyboard = Keyboard(program)
 
     def press(text: str) -> None:
-        os.write(person, text.encode())
-        time.sleep(0.05)
+        type_in(person, program, text.encode())
 
     yield keyboard, press, program
     keyboard.close()

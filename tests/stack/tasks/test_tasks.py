@@ -176,6 +176,15 @@ def test_top_speed_is_that_of_two_seconds() -> None:
     assert np.isnan(measures.top_speed(trace(velocity[:50])))
 
 
+def test_different_motions_are_counted_once_a_robot_is_left_alone() -> None:
+    """Two seconds each: what it was told at first, and what lasted less, is none of its own."""
+    velocity = np.zeros((1000, 2))
+    velocity[:200, 0] = -0.1  # told
+    velocity[200:400, 0] = velocity[800:, 0] = 0.2
+    velocity[600:800, 1] = 0.1
+    assert Drawn(load_task("survive", {}, DT)).metrics(trace(velocity))["motions"] == 3.0
+
+
 def test_walk_fails_by_falling() -> None:
     task = Drawn(load_task("walk", {}, DT))
     run = trace(np.full((1500, 2), [0.1, 0.0]), np.full((1500, 3), [0.1, 0.0, 0.0]))

@@ -5,20 +5,20 @@ from __future__ import annotations
 import os
 import termios
 import threading
-import time
 from dataclasses import replace
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+from waiting import type_in
 
 from servoid.hw.contracts.body import Observation
 from servoid.hw.dynamixel.transport.bus import Bus
 from servoid.hw.robot.description import load_robot
 from servoid.sim.model import build
 from servoid.sim.rig.in_process import InProcessLine
-from servoid.sim.rig.process.control import RigProcess
+from servoid.sim.rig.process.control import Control, RigProcess
 from servoid.sim.rig.rig import Rig
 from servoid.tools.bringup import watch
 from servoid.tools.bringup.desk.jogging import IDLE_SECONDS, KEY_SECONDS, SPAN, SPEED, There, Wish, reach, restrict
@@ -111,14 +111,19 @@ def test_a_held_key_moves_and_letting_go_stops(
     """On a terminal, with keys that repeat as a held one does, then silence, then the other way, then q."""
     master, slave = os.openpty()
     over = threading.Event()
+    watched = Control(rig.control_path)
+
+    def now() -> int:
+        return int(watched.call("hello")["now"])
 
     def person() -> None:
+        """Goes by the rig's time, in which the joint moves: on a busy machine it passes slowly."""
         while termios.tcgetattr(slave)[3] & termios.ICANON and not over.wait(0.1):
             pass  # until keys are read one by one
-        for key, count in ((b"\x1b[C", 30), (b"", 40), (b"\x1b[D", 15), (b"", 40)):
-            for _ in range(count):
+        for key, seconds in ((b"\x1b[C", 1.2), (b"", 1.6), (b"\x1b[D", 0.6), (b"", 1.6)):
+            end = now() + round(seconds * 1e9)
+            while now() < end and not over.wait(0.01):
                 os.write(master, key)
-                time.sleep(0.04)
         os.write(master, b"q")
 
     class Terminal:
@@ -136,6 +141,7 @@ def test_a_held_key_moves_and_letting_go_stops(
     finally:
         over.set()
         hands.join()
+        watched.close()
         os.close(master)
         os.close(slave)
     assert code == 0, capfd.readouterr().err
@@ -220,13 +226,11 @@ def test_a_burst_of_keys_moves_no_further_than_one_and_idleness_ends(monkeypatch
     try:
         with jogging.Keys() as keys:
             assert keys.wish(0.0, 0.0) is Wish.HOLD
-            os.write(master, b"\x1b[C" * 30)
-            time.sleep(0.05)
+            type_in(master, slave, b"\x1b[C" * 30)
             assert keys.wish(1.0, 0.0) is Wish.UP
             assert keys.wish(1.0 + 0.9 * KEY_SECONDS, 0.0) is Wish.UP
             assert keys.wish(1.0 + 1.1 * KEY_SECONDS, 0.0) is Wish.HOLD
-            os.write(master, b"+\x1b[B")
-            time.sleep(0.05)
+            type_in(master, slave, b"+\x1b[B")
             assert keys.wish(3.0, 0.0) is Wish.DOWN, "the newest counts"
             assert keys.wish(3.0 + IDLE_SECONDS, 0.0) is Wish.END
     finally:

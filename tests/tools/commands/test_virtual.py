@@ -15,6 +15,7 @@ import pytest
 import serial
 from waiting import until
 
+from servoid.hw.config import ConfigError
 from servoid.hw.dynamixel.protocol import codec
 from servoid.hw.robot.description import load_robot
 from servoid.sim.rig.process.control import RigProcess
@@ -38,6 +39,15 @@ def start(*arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "servoid", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
+
+
+def walks(path: Path) -> bool:
+    """Whether a run that is being recorded has begun its task, by its log so far."""
+    try:
+        commands = read_log(path).messages["/command"]
+    except ConfigError:  # its header is not there yet
+        return False
+    return bool(commands) and commands[-1]["phase"] == "running"
 
 
 @pytest.mark.slow
@@ -231,8 +241,7 @@ def test_a_port_for_the_virtual_rig_is_refused(capsys: pytest.CaptureFixture[str
 def test_a_signal_in_mid_walk_ends_with_torque_off_acknowledged(number: signal.Signals, tmp_path: Path) -> None:
     """A servo that had not said that torque is off would be exit code 3."""
     process = start(*RUN, "--seconds", "600", "--record", "a.mcap", "--json")
-    until(lambda: (tmp_path / "a.mcap").exists() or process.poll() is not None)
-    time.sleep(1.0)
+    until(lambda: walks(tmp_path / "a.mcap") or process.poll() is not None, "it does not walk")
     process.send_signal(number)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 130, err

@@ -5,15 +5,16 @@ from __future__ import annotations
 import io
 import os
 import pty
+import select
 import signal
 import termios
-import time
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, TextIO
 
 import numpy as np
 import pytest
+from waiting import until
 
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.tools.common.live import LiveLine, asked
@@ -42,6 +43,11 @@ def terminal() -> Iterator[tuple[int, TextIO]]:
         stream.close()
 
 
+def takes(stream: TextIO) -> bool:
+    """Whether the terminal takes more now."""
+    return bool(select.select([], [stream], [], 0.0)[1])
+
+
 def record(time_ns: int) -> Any:
     observation, proposal = SimpleNamespace(time_ns=time_ns), SimpleNamespace(instruction=None)
     return SimpleNamespace(timing=TIMING, proposal=proposal, observation=observation, state=None, phase="homing")
@@ -54,13 +60,13 @@ def test_a_terminal_that_ctrl_s_stopped_is_not_waited_for(
     line = LiveLine(stream, "xterm", interval=0.0)
     line(record(0))
     os.write(person, b"\x13")
-    time.sleep(0.1)
+    until(lambda: not takes(stream), "Ctrl-S did not stop it")
     for i in range(100):
         line(record(i))  # who waits, waits for ever
     line.close()
     os.read(person, 1000)
     os.write(person, b"\x11")  # Ctrl-Q
-    time.sleep(0.1)
+    until(lambda: takes(stream), "Ctrl-Q did not let it go on")
     line(record(101))
     assert b"homing" in os.read(person, 1000)
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import select
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from waiting import until
 
 from servoid.hw.config import ConfigError
 from servoid.sim.rig.process.control import RigProcess
@@ -29,17 +31,17 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]
 
 
 @contextmanager
-def answering(monkeypatch: pytest.MonkeyPatch, answer: str) -> Iterator[None]:
-    """A person who reads each question, and answers after it was asked."""
+def answering(monkeypatch: pytest.MonkeyPatch, *answers: str) -> Iterator[Callable[[str], None]]:
+    """A person who reads each question, and answers after it was asked; yields what types besides."""
     with terminal(monkeypatch) as type_in:
-        asked, stderr = threading.Event(), sys.stderr
+        asked, stderr = threading.Semaphore(0), sys.stderr
 
         class Watched:
             encoding, errors = stderr.encoding, stderr.errors
 
             def write(self, text: str) -> int:
                 if "Press Enter to continue" in text:
-                    asked.set()
+                    asked.release()
                 return stderr.write(text)
 
             def flush(self) -> None:
@@ -48,13 +50,18 @@ def answering(monkeypatch: pytest.MonkeyPatch, answer: str) -> Iterator[None]:
             def fileno(self) -> int:
                 return stderr.fileno()
 
+        def answer() -> None:
+            for text in answers:
+                asked.acquire(timeout=60.0)
+                type_in(text)
+
         monkeypatch.setattr(sys, "stderr", Watched())
-        person = threading.Thread(target=lambda: asked.wait(60.0) and type_in(answer))
+        person = threading.Thread(target=answer)
         person.start()
         try:
-            yield
+            yield type_in
         finally:
-            asked.set()
+            asked.release(len(answers))
             person.join()
 
 
@@ -72,34 +79,18 @@ def test_anything_else_is_a_no(monkeypatch: pytest.MonkeyPatch, answer: str) -> 
 
 def test_what_was_typed_before_the_question_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """A robot must not walk because Enter was pressed twice at the command before."""
-    with terminal(monkeypatch) as type_in:
+    with answering(monkeypatch, "n\n") as type_in:
         type_in("\n\ny\n")
-        answers: list[BaseException | None] = []
-
-        def ask() -> None:
-            try:
-                confirm("It moves")
-                answers.append(None)
-            except Cancelled as error:
-                answers.append(error)
-
-        person = threading.Thread(target=ask)
-        person.start()
-        person.join(0.3)
-        assert answers == [], "it took what was typed before for an answer"
-        type_in("n\n")
-        person.join(60.0)
-        assert isinstance(answers[0], Cancelled)
+        until(lambda: select.select([sys.stdin], [], [], 0.0)[0], "what was typed did not arrive")
+        with pytest.raises(Cancelled, match="the answer was 'n'"):
+            confirm("It moves")
 
 
 def test_what_was_pasted_behind_an_answer_does_not_answer_the_next_question(monkeypatch: pytest.MonkeyPatch) -> None:
-    with terminal(monkeypatch) as type_in:
-        for answer, outcome in (("\n\n\n", None), ("n\n\n", Cancelled)):
-            answering = threading.Timer(0.3, type_in, [answer])  # each asks, and waits, before this
-            answering.start()
-            with nullcontext() if outcome is None else pytest.raises(outcome):
-                confirm("It moves")
-            answering.join()
+    with answering(monkeypatch, "\n\n\n", "n\n\n"):
+        confirm("It moves")
+        with pytest.raises(Cancelled, match="the answer was 'n'"):
+            confirm("It moves")
 
 
 def test_lines_that_wait_in_a_pipe_are_no_answer_either(monkeypatch: pytest.MonkeyPatch) -> None:

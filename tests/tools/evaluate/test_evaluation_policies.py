@@ -68,6 +68,33 @@ def test_a_network_of_latents_wants_the_latents_first(tmp_path: Path) -> None:
     assert policies.training(experiment) == last
 
 
+def test_a_task_policy_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path) -> None:
+    policies = Policies("diffusion", tmp_path)
+    train = "--task speed --prior prior --config policy --rewards task=1 both=0"
+
+    def experiment(name: str, rewards: dict[str, float], share: float) -> Experiment:
+        path = tmp_path / "networks" / name / "policy.safetensors"
+        path.parent.mkdir(parents=True)
+        head, tensors = read(resolve("speed"))
+        trained = {**head["training"], "rewards": {**head["training"]["rewards"], **rewards}}
+        write(path, tensors, {**head, "training": trained, "results": {"share": share}})
+        return Experiment("speed", network=OwnNetwork(name, train, policy=True))
+
+    lacking = Experiment("speed", network=OwnNetwork("lacking", train, policy=True))
+    assert policies.training(lacking) == f"`servoid train policy --out {tmp_path}/networks/lacking {train}`"
+    ours = {"task": 1.0, "both": 0.0}
+    with pytest.raises(ConfigError, match="trained with --rewards"):
+        policies.name(experiment("other", {}, 1.0))
+    with pytest.raises(ConfigError, match=r"only 50\.0% of its training"):
+        policies.name(experiment("half", ours, 0.5))
+    whole = experiment("whole", ours, 1.0)
+    assert policies.training(whole) is None
+    assert policies.name(whole) == str((tmp_path / "networks" / "whole" / "policy.safetensors").resolve())
+    assert policies.fingerprint(whole)["checkpoint_sha256"]
+    with pytest.raises(ConfigError, match="for diffusion models"):
+        policies.name(replace(whole, plan={"delay": "2"}))
+
+
 def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path) -> None:
     policies = Policies("diffusion", tmp_path)
     experiment = Experiment("goal-near", network=OwnNetwork("full", "--width 128 --horizon 24"))

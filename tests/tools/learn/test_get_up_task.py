@@ -18,13 +18,13 @@ from servoid.policy.priors.score_matching.model import Style
 from servoid.policy.priors.task_policy import TaskPolicy
 from servoid.policy.rising.lead import CLIPS
 from servoid.policy.rising.policy import RisingPolicy
+from servoid.stack.tasks.learned import TaskState, load_learned_task
+from servoid.stack.tasks.learned.get_up import GettingUp, GettingUpByClips
 from servoid.tools.cli import main
 from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.score_term import Manner
 from servoid.tools.learn.envs.starts import lying
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
-from servoid.tools.learn.envs.tasks import TaskState, load_learned_task
-from servoid.tools.learn.envs.tasks.get_up import GettingUp, GettingUpByClips
 from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.policy import PolicyTrainer, environment
 

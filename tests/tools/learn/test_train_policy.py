@@ -25,15 +25,16 @@ from servoid.policy.priors.adversarial.discriminator import (
     save_discriminator,
 )
 from servoid.policy.priors.goals import GOALS
+from servoid.policy.priors.observation import TaskObservation
 from servoid.policy.priors.score_matching.model import Style, load_prior
 from servoid.policy.priors.score_matching.windows import PriorWindows
 from servoid.policy.priors.task_policy import TaskPolicy
-from servoid.policy.recording import read_recording
+from servoid.policy.recording import DatasetError, read_recording
 from servoid.sim.kinematics import limbs_of
+from servoid.stack.tasks.learned import LEARNED_TASKS, TaskState, load_learned_task
 from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
 from servoid.tools.learn.envs.score_term import Rival
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
-from servoid.tools.learn.envs.tasks import LEARNED_TASKS, TaskState, load_learned_task
 from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.policy import PolicyTrainer, environment
 
@@ -117,9 +118,21 @@ def test_an_episode_that_is_unlike_the_data_ends(prior: Path) -> None:
     assert not late.any()
 
 
+def test_what_is_asked_next_is_no_merit_of_what_was_done(prior: Path) -> None:
+    """For the learner, time is up where another place is drawn; the episode goes on."""
+    env = made(prior, "location", replace(SETTINGS, episode_seconds=10.0))
+    env.reset()
+    env._next[:] = np.where(np.arange(env.n) == 2, 1, 1000)
+    asked = env.asked.copy()
+    _, done, late = env.step(np.zeros((env.n, env.action_size)))
+    assert np.flatnonzero(done).tolist() == np.flatnonzero(late).tolist() == [2]
+    assert env.ticks.tolist() == [1] * env.n
+    assert np.flatnonzero((env.asked != asked).any(1)).tolist() == [2]
+
+
 def test_a_place_and_a_ball_are_not_asked_for_where_it_is_to_stand() -> None:
     stand = Instruction(np.zeros(3), stand=True)
-    assert np.array_equal(GOALS["location"].observe(stand, ROBOT.walking), [0.0, 0.0])
+    assert np.array_equal(GOALS["location"].observe(stand, ROBOT.walking), [0.0, 0.0, 1.0, 0.0])
     assert np.hypot(*GOALS["ball"].observe(stand, ROBOT.walking)[:2]) >= 1.0
 
 
@@ -157,6 +170,12 @@ def test_rewards_are_highest_for_what_is_asked() -> None:
     place = np.array([[1.0, 0.0]])
     assert location.reward(place, state((1.0, 0.0), 0.0, (0.0, 0.0)))[0] == pytest.approx(1.0)
     assert location.reward(place, state((0.0, 0.0), 0.0, (0.0, 0.0)))[0] < 0.01
+    # Far from it, training rewards whoever goes there all the same; there, whoever stays.
+    off, on, there = (
+        location.guided(place, state(at, 0.0, v))[0]
+        for at, v in (((0.0, 0.0), (-0.4, 0.0)), ((0.0, 0.0), (0.4, 0.0)), ((1.0, 0.0), (0.0, 0.0)))
+    )
+    assert off < 0.05 < 0.4 < on < there == pytest.approx(1.0)
 
 
 def test_what_a_policy_sees_of_an_instruction() -> None:
@@ -167,7 +186,13 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
     turning = Instruction(velocity=np.array([0.25, 0.0, 0.5]))
     assert np.allclose(GOALS["steering"].observe(turning, walking), [0.5, 0.0, np.cos(0.5), np.sin(0.5)])
     far = Instruction(velocity=np.zeros(3), goal=np.array([3.0, 4.0]))
-    assert np.allclose(GOALS["location"].observe(far, walking), [0.6, 0.8])
+    assert np.allclose(GOALS["location"].observe(far, walking), [0.6, 0.8, 0.6, 0.8])  # there, and facing it
+    near = Instruction(velocity=np.zeros(3), goal=np.array([-0.04, 0.0]))
+    assert np.allclose(
+        GOALS["location"].observe(near, walking), [-0.04 / 0.3, 0.0, 1.0, 0.0]
+    )  # slowly, and without turning
+    behind = Instruction(velocity=np.zeros((2, 3)), goal=np.array([[-1.0, 0.0], [0.0, 0.4]]))
+    assert np.allclose(GOALS["location"].observe(behind, walking), [[-1, 0, -1, 0], [0, 1, 0, 1]])
     things = np.array([[2.0, 0.0, 0.1, -0.5, 0.0], [0.0, -1.0, 0.1, 0.0, 0.25]])
     seen = GOALS["ball"].observe(Instruction(np.zeros(3), obstacles=things), walking)
     assert np.allclose(seen, [0.0, -1.0, 0.0, 0.5])  # the nearest
@@ -180,7 +205,7 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
 def test_a_task_without_a_reward_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     file.write_text(
-        "from servoid.tools.learn.envs.tasks import LearnedTask\n"
+        "from servoid.stack.tasks.learned import LearnedTask\n"
         "class Mine(LearnedTask):\n"
         "    name, goal, size, every, run = 'mine', 'velocity', 1, (1.0, 2.0), 'walk'\n"
         "    def draw(self, rng, position): return [0.0]\n"
@@ -206,6 +231,35 @@ def test_demonstrations_are_told_what_came_of_them(synthetic_dataset: Path) -> N
     speed = np.linalg.norm(asked, axis=1)
     assert speed.max() < 0.31  # the made-up bodies glide at 0.3 m/s at most
     assert (np.abs(asked[:, 0]) > np.abs(asked[:, 1])).mean() > 0.9  # and almost straight ahead
+    first, _ = recording.spans[0]  # and sees what it would see if it were alone
+    alone, raw, applied = TaskObservation(ROBOT, GOALS["velocity"]), recording.raw[first:], recording.applied[first:]
+    for i in range(8):
+        assert np.allclose(alone.of_rows(raw[1 + 2 * i], applied[2 * i], seen[i, -2:]), seen[i], atol=1e-6)
+
+
+def test_demonstrations_too_short_to_look_ahead_are_refused(synthetic_dataset: Path) -> None:
+    recording = read_recording(synthetic_dataset, ROBOT)
+    short = replace(recording, episode=np.arange(len(recording.raw)) // 20)
+    with pytest.raises(DatasetError, match=r"no episode lasts longer than the 0\.48 s"):
+        demonstrated(short, ROBOT, GOALS["velocity"], 2, np.random.default_rng(0))
+
+
+@pytest.mark.slow
+def test_what_a_policy_imitates_is_kept_and_others_can_begin_with_it(
+    prior: Path, synthetic_dataset: Path, tmp_path: Path
+) -> None:
+    settings = replace(SETTINGS, imitation_steps=5)
+    first, second = (
+        PolicyTrainer(made(prior, settings=settings), Style(), settings, tmp_path / name, prior) for name in "ab"
+    )
+    first.imitate(synthetic_dataset)
+    kept = tmp_path / "a" / "imitation.safetensors"
+    assert "demonstrations" in read_header(kept)["results"]["begun_with"]
+    with pytest.raises(ConfigError, match=r"sees its goal in 4 numbers \(steering\), and task speed shows 2"):
+        second.start(resume=False, init=checkpoint.resolve("steering"))
+    second.start(resume=False, init=kept)
+    seen = first.env.observations["actor"]
+    assert np.allclose(first.actor()(seen), second.actor()(seen), atol=1e-6)
 
 
 @pytest.mark.slow

@@ -4,6 +4,9 @@ Every world walks and stands under commands that change every few seconds, with 
 the labels are the expert's actions without the noise. An episode that ends in a fall loses its last second. Mirrored
 copies are not stored, because training mirrors each window as it reads it: the same as twice the data.
 
+With `--crouched` a share of the commands asks for a walk lower than upright, by up to an eighth of the standing height:
+what a planner learns from that passes under a bar.
+
 With `--skills` the worlds also perform the skills of configs/skills that take nothing but the ground, each for as many
 ticks, and go from any of them to any other and to walking, some in mid motion. Each tick says what was told, and how
 long a skill has lasted: what a model learns from that follows sentences about skills.
@@ -56,6 +59,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--skills", action="store_true", help="perform skills, too, by their tracker")
     parser.add_argument(
         "--tracker", default="tracker", metavar="NAME|FILE", help="tracker that performs skills (default: tracker)"
+    )
+    parser.add_argument(
+        "--crouched",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="share of the commands that ask for a walk lower than upright (default: 0)",
     )
     parser.add_argument(
         "--seconds", type=positive, default=15.0, metavar="S", help="length of an episode (default: %(default)g)"
@@ -114,8 +124,11 @@ def _check(args: argparse.Namespace) -> None:
     for name in ("frames", "worlds", "parts"):
         if getattr(args, name) < 1:
             raise ConfigError(f"--{name} must be at least 1, not {getattr(args, name)}")
-    if not 0.0 <= args.randomise <= 1.0:
-        raise ConfigError(f"--randomise must be between 0 and 1, not {args.randomise:g}")
+    for name in ("randomise", "crouched"):
+        if not 0.0 <= getattr(args, name) <= 1.0:
+            raise ConfigError(f"--{name} must be between 0 and 1, not {getattr(args, name):g}")
+    if args.crouched and args.skills:
+        raise ConfigError("--crouched does not go with --skills, which are begun from walks upright: drop one of them")
     if not 0.0 <= args.noise[0] <= args.noise[1] < math.inf:
         raise ConfigError(f"--noise {args.noise[0]:g} {args.noise[1]:g}: must not be negative, the lower one first")
     if args.skills and args.policy == "gait":
@@ -151,6 +164,7 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
         randomise=args.randomise,
         noise=(args.noise[0], args.noise[1]),
         plain_odometry=args.plain_odometry,
+        crouched=args.crouched,
         threads=args.threads or (1 if args.workers > 1 or args.ray is not None else 0),
     )
     performances, tally = how.performances(1), RecordingTally()

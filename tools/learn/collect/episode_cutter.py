@@ -34,6 +34,7 @@ class Drilled(Protocol):
     """What the worlds are asked: `Commands`, or `Performances`."""
 
     velocity: Array  # (n, 3) m/s forward, m/s left, rad/s
+    lower: Array  # (n,) m that the base shall be lower than it walks
     skill: Array  # (n,) number of the dataset's task
 
     @property
@@ -142,7 +143,7 @@ class EpisodeCutter:
         self._script.advance(rngs)
         fleet.worlds.push(self._disturbances.push(rngs))
         command = self._script.velocity
-        target = self._policy.act(state, fleet.applied, Instruction(command))
+        target = self._policy.act(state, fleet.applied, Instruction(command, lower=self._script.lower))
         clean = fleet.step(target, self._disturbances.noise(rngs))
         worlds, at = np.arange(fleet.n), self._length
         values = {"observation.state": raw_row(state), "action": clean, "action_applied": fleet.applied}

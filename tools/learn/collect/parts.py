@@ -22,6 +22,7 @@ from servoid.hw.robot.description import load_robot
 from servoid.tools.learn.collect.disturbances import DisturbanceSettings
 from servoid.tools.learn.collect.episode_cutter import EpisodeCutter, RecordedEpisode
 from servoid.tools.learn.collect.performances import Performances
+from servoid.tools.learn.collect.skills import Commands
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class FleetRecipe:
     noise: tuple[float, float]
     plain_odometry: bool
     threads: int
+    crouched: float = 0.0
 
     @property
     def disturbances(self) -> DisturbanceSettings:
@@ -79,7 +81,8 @@ class FleetRecipe:
             policy = GaitPolicy(robot, shape) if self.policy == "gait" else ExpertPolicy(robot, self.policy, shape)
         odometry = None if self.plain_odometry else load_odometry(robot)
         fleet = Fleet(robot, self.worlds, odometry, randomise=self.randomise, seed=seed, threads=self.threads)
-        return EpisodeCutter(fleet, policy, self.disturbances, self.seconds, told)
+        script = told or Commands(robot, self.worlds, self.crouched)
+        return EpisodeCutter(fleet, policy, self.disturbances, self.seconds, script)
 
 
 @dataclass(frozen=True)

@@ -57,6 +57,7 @@ class Performances(BasePolicy):
         self._ticks = np.array([clip.ticks for clip in self._reference.clip.clips])
         self.told = np.zeros(len(self._skills), int)  # ticks of each skill so far
         self.skill, self.velocity, self.clock = np.zeros(n, int), np.zeros((n, 3)), np.zeros(n)
+        self.lower = np.zeros(n)  # m: skills are begun from walks upright
         self._now = np.full(n, -1)  # number of the skill that is told; -1: a walk
         self._since = np.zeros(n, int)  # ticks since it began
         self._over = np.full(n, 10**6)  # ticks since a clip was left

@@ -37,6 +37,7 @@ class Drill:
     boxes: tuple[Box, ...]
     weight: float = 1.0
     seconds: Range = (2.0, 6.0)  # that a command lasts
+    lower: Range = (0.0, 0.0)  # that the base goes lower than it walks upright
 
     def draw(self, rng: np.random.Generator) -> Array:
         """A command `(3,)`."""
@@ -61,14 +62,36 @@ SKILLS: tuple[Drill, ...] = (
     Drill("any", "walk and turn in any direction", (Box((-0.24, 0.6), (-0.2, 0.2), (-0.8, 0.8)),), 2.0),
     Drill("creep", "creep slowly in any direction", (Box((-0.12, 0.12), (-0.12, 0.12), (-0.2, 0.2)),)),
 )
+# Crouched walks, for planners that shall pass under something: slow, since the lower and faster, the sooner one falls.
+# `lower` is a share of the standing height, and in the dataset they have the tasks of the same names.
+CROUCHED: tuple[Drill, ...] = (
+    Drill("stand", "stand still", (Box(),), 1.0, (1.0, 3.0), (0.03, 0.13)),
+    Drill("slow", "walk forward slowly", (Box(forward=(0.06, 0.26)),), 4.0, lower=(0.06, 0.13)),
+    Drill("forward", "walk forward", (Box(forward=(0.16, 0.4)),), 2.0, lower=(0.02, 0.09)),
+    Drill("arc", "walk along an arc", (Box(forward=(0.06, 0.24), turn=(-0.5, 0.5)),), 1.5, lower=(0.04, 0.12)),
+    Drill("creep", "creep slowly in any direction", (Box((-0.1, 0.1), (-0.1, 0.1)),), lower=(0.03, 0.12)),
+)
 FIRST_SECONDS: Range = (0.1, 0.6)  # of standing that an episode begins with: a run starts from rest
 
 _SHARES = np.cumsum([skill.weight for skill in SKILLS]) / sum(skill.weight for skill in SKILLS)
+_LOW_SHARES = np.array([drill.weight for drill in CROUCHED]) / sum(drill.weight for drill in CROUCHED)
 
 
 def skills_of(robot: Robot) -> tuple[Drill, ...]:
     """The skills with what this robot is asked, in m/s and rad/s."""
     return tuple(replace(skill, boxes=tuple(box.of(robot.walking) for box in skill.boxes)) for skill in SKILLS)
+
+
+def crouched_of(robot: Robot) -> tuple[Drill, ...]:
+    """The crouched walks with what this robot is asked, in m/s, rad/s and m."""
+    return tuple(
+        replace(
+            drill,
+            boxes=tuple(box.of(robot.walking) for box in drill.boxes),
+            lower=(drill.lower[0] * robot.standing_height, drill.lower[1] * robot.standing_height),
+        )
+        for drill in CROUCHED
+    )
 
 
 def drawn(skills: tuple[Drill, ...], rng: np.random.Generator) -> Drill:
@@ -79,9 +102,12 @@ def drawn(skills: tuple[Drill, ...], rng: np.random.Generator) -> Drill:
 class Commands:
     """The present command of each of `n` worlds, changed every few seconds, drawn from the worlds' own streams."""
 
-    def __init__(self, robot: Robot, n: int) -> None:
+    def __init__(self, robot: Robot, n: int, crouched: float = 0.0) -> None:
+        """A share `crouched` of the commands is for a base that is lower than it walks upright."""
         self._rate, self._skills = robot.rate, skills_of(robot)
+        self._low, self._crouched = crouched_of(robot), crouched
         self.velocity = np.zeros((n, 3))  # what is asked: m/s forward, m/s left, rad/s
+        self.lower = np.zeros(n)  # and how much lower than upright, m
         self.skill = np.zeros(n, int)  # number in SKILLS
         self._left = np.zeros(n, int)  # ticks until the next change
         self._first = np.ones(n, bool)
@@ -103,8 +129,13 @@ class Commands:
         """Draw the commands that are due; call it once a tick, before reading `velocity`."""
         for i in np.flatnonzero(self._left == 0):
             rng = rngs[i]
-            self.skill[i] = 0 if self._first[i] else int(np.searchsorted(_SHARES, rng.random(), side="right"))
-            skill = self._skills[self.skill[i]]
+            if self._crouched and not self._first[i] and rng.random() < self._crouched:
+                skill = self._low[int(rng.choice(len(CROUCHED), p=_LOW_SHARES))]
+                self.skill[i] = [each.name for each in SKILLS].index(skill.name)
+                self.lower[i] = rng.uniform(*skill.lower)
+            else:
+                self.skill[i] = 0 if self._first[i] else int(np.searchsorted(_SHARES, rng.random(), side="right"))
+                skill, self.lower[i] = self._skills[self.skill[i]], 0.0
             self.velocity[i] = skill.draw(rng)
             self._left[i] = round(rng.uniform(*(FIRST_SECONDS if self._first[i] else skill.seconds)) * self._rate)
             self._first[i] = False

@@ -17,9 +17,9 @@ from servoid.policy.priors.observation import TaskObservation
 from servoid.policy.references.gait import gait_of
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.safety.limits import clamp
+from servoid.stack.tasks.learned import LearnedTask, TaskState
 from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.score_term import GeneratedStarts, Manner
-from servoid.tools.learn.envs.tasks import LearnedTask, TaskState
 from servoid.tools.learn.prior_settings import EpisodeSettings
 from servoid.tools.learn.terms import Terms
 
@@ -202,6 +202,8 @@ class TaskEnvironment:
     def step(self, action: Array) -> tuple[Array, Array, Array]:
         """Decide `(n, n_joints)`. Returns reward, done and time-out `(n,)`.
 
+        Where something else is asked from now on, that is a time-out, too, though the episode goes on: what is asked
+        next is chance, and no merit of what was done.
         The prior judges the window up to the state that the decision is made in: what this one leads to, it says next.
         """
         manner = self.score(self.fleet.state)
@@ -235,7 +237,7 @@ class TaskEnvironment:
         self.task_reward = self.task.reward(self.asked, known)
         change = action - self._action
         step = TaskStep(
-            task=self.task_reward, manner=manner, change=change, jerk=change - self._change,
+            task=self.task.guided(self.asked, known), manner=manner, change=change, jerk=change - self._change,
             effort=self.fleet.worlds.effort, shock=shock, blocked=blocked,
             beyond=np.abs(target - clamp(target, self.robot)), fallen=fallen,
         )  # fmt: skip
@@ -255,5 +257,6 @@ class TaskEnvironment:
             if self.down is not None:
                 self.down.learn(done, self.achieved)
             self._reset(done)
+        other = ~done & (self.ticks >= self._next)
         self._observe()
-        return reward * self.dt, done, late
+        return reward * self.dt, done | other, late | other

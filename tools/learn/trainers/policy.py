@@ -4,7 +4,8 @@
 goal; it decides joint targets around the home pose as often as its prior has frames. --rewards weighs the task, the
 prior (manner) and their product (both); the paper adds the first two. With --prior none manner is 1 everywhere, and
 --decide-every and --reach say what the prior would. With --demonstrations it begins as a network that
-does what a dataset shows, instead of at random.
+does what a dataset shows, instead of at random: that is kept as imitation.safetensors, and others can begin with it by
+--init.
 
 Ctrl-C saves, and the same command continues. The newest network is policy.safetensors.
 """
@@ -23,12 +24,13 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.policy import checkpoint
 from servoid.policy.mlp import Mlp
+from servoid.policy.priors.goals import GOALS
 from servoid.policy.priors.task_policy import KIND, save_task_policy
 from servoid.policy.rising.policy import KIND as RISING
 from servoid.policy.rising.policy import save_rising_policy
+from servoid.stack.tasks.learned import LearnedTask, load_learned_task
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
 from servoid.tools.learn.envs.task_judge import measure
-from servoid.tools.learn.envs.tasks import LearnedTask, load_learned_task
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.ppo import PpoTrainer
@@ -42,6 +44,7 @@ _JUDGED, _JUDGED_STARTS = 32, 256  # worlds; states that they begin in, where a 
 _LED_SHARE = 0.05  # of what initial weights give, where a lead knows a way already
 NO_PRIOR = "none"
 _LICENCE = "Apache-2.0"  # of what learns from nothing but its own experience
+_IMITATION = "imitation.safetensors"  # what a policy began as, where it imitated
 _DISCRIMINATOR = "discriminator.safetensors"  # beside the policy
 
 
@@ -242,6 +245,12 @@ class PolicyTrainer(PpoTrainer):
         return f"servoid rollout {self.env.task.run} --policy {self.best_path} --episodes 50"
 
     def adopt(self, path: Path) -> None:
+        task, goal = self.env.task, checkpoint.read_header(path).get("config", {}).get("goal")
+        if goal in GOALS and GOALS[goal].size != task.seen.size:
+            raise ConfigError(
+                f"{path}: sees its goal in {GOALS[goal].size} numbers ({goal}), and task {task.name} shows "
+                f"{task.seen.size} ({task.goal}): begin with a policy that sees as many, or with --demonstrations"
+            )
         network, _ = Mlp.load(path, self._kind, self.env.robot, self.env.observations["actor"].shape[1])
         hidden = list(network.sizes[1:-1])
         if hidden != list(self.settings.hidden):
@@ -251,7 +260,7 @@ class PolicyTrainer(PpoTrainer):
         self.begin_with(network)
 
     def imitate(self, folder: Path) -> None:
-        """Begin with a network that does what the dataset in `folder` shows. Raises DatasetError."""
+        """Begin with a network that does what the dataset in `folder` shows, and keep it. Raises DatasetError."""
         from servoid.policy.recording import read_recording
         from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
         from servoid.tools.learn.trainers.trainer import source_of
@@ -264,6 +273,7 @@ class PolicyTrainer(PpoTrainer):
         mirrors = Mirrors(env.mirrors["actor"], env.mirrors["action"])
         self.begin_with(cloned(seen, actions, mirrors, self.settings.hidden, self.settings.imitation_steps, seed))
         self.begun_with = {"demonstrations": source_of(folder, recording)}
+        self.ship(self.out / _IMITATION, self.progress)
 
     def state(self) -> dict[str, Any]:
         return {**super().state(), "score": self.env.score.state()}

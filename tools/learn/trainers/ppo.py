@@ -68,7 +68,10 @@ class Environment(Protocol):
         """Begin a new episode in every world."""
 
     def step(self, action: Array) -> tuple[Array, Array, Array]:
-        """A tick under `action` `(n, action_size)`: reward, done, and done because time ran out, `(n,)` each."""
+        """A tick under `action` `(n, action_size)`: reward, done, and done because time ran out, `(n,)` each.
+
+        The latter is also said of a world that goes on, where what follows is no consequence of what was done.
+        """
         ...
 
     def schedule(self, progress: float) -> None:
@@ -150,7 +153,7 @@ class PpoTrainer(Trainer):
                 action = self.ppo.act(tensors(env)).numpy()
                 ticks = env.ticks + 1
                 reward, done, late = env.step(action)
-                self.lengths.extend(ticks[done].tolist())
+                self.lengths.extend(ticks[env.ticks == 0].tolist())
                 rewards.append(float(reward.mean()))
                 terms.append(env.terms)
                 extras = {"time_outs": torch.as_tensor(late, dtype=torch.float32)}

@@ -6,7 +6,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState, over_ground
+from servoid.stack.tasks.learned.base import LearnedTask, TaskState, over_ground
 
 # exp(-0.25 error^2) of a human who runs 6.8 m/s at most: here, of as large a share of the top speed. The paper does not
 # print its formula: this is that of AMP, which it follows.
@@ -15,7 +15,7 @@ _SLOWEST = 1.2 / 6.8  # of the top speed
 
 
 class TargetSpeed(LearnedTask):
-    name, goal, size, every, run = "speed", "velocity", 1, (2.0, 5.0), "walk"
+    name, goal, size, every, run = "speed", "velocity", 1, (2.0, 5.0), "speed"
 
     def draw(self, rng: np.random.Generator, position: Array) -> Array:
         return rng.uniform(_SLOWEST, 1.0, 1) * self.robot.walking.forward

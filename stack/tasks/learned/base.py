@@ -63,6 +63,10 @@ class LearnedTask(ABC):
     def reward(self, asked: Array, state: TaskState) -> Array:
         """How well it does what is asked `(n,)`, 0 to 1."""
 
+    def guided(self, asked: Array, state: TaskState) -> Array:
+        """What training rewards `(n,)`, 0 to 1, where `reward` says too little of the way there."""
+        return self.reward(asked, state)
+
     @property
     def achievable(self) -> bool:
         """Whether its episodes are over once it is `achieved`."""

@@ -7,7 +7,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.geometry import turned
-from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
+from servoid.stack.tasks.learned.base import LearnedTask, TaskState
 
 # A human has half a second, and 10 m. Steps of this robot go 0.13 m/s to the side and its arms are 0.17 m from its
 # middle: what it has to see coming is slower.
@@ -21,7 +21,7 @@ _LENGTH, _SPEED = 0.275, 0.524  # m and m/s here for one of a human
 class Dodgeball(LearnedTask):
     """The ball flies on over the ground, as it was thrown; it is no body of the simulation, and nothing stops it."""
 
-    name, goal, size, every, run = "dodgeball", "ball", 4, (5.0, 8.0), "obstacle"
+    name, goal, size, every, run = "dodgeball", "ball", 4, (5.0, 8.0), "dodgeball"
 
     def draw(self, rng: np.random.Generator, position: Array) -> Array:
         """Place and velocity of the ball."""

@@ -12,7 +12,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.geometry import up_vector
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.legs import Legs
-from servoid.stack.control.balance import Balance, Feedback
+from servoid.stack.safety.balance import Balance, Feedback
 from servoid.stack.skills.skill import load_skills
 
 ROBOT = load_robot()

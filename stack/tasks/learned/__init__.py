@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from servoid.hw.config import ConfigError, nearest
 from servoid.hw.plugins import load_plugin
 from servoid.hw.robot.description import Robot
-from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
-from servoid.tools.learn.envs.tasks.dodgeball import Dodgeball
-from servoid.tools.learn.envs.tasks.get_up import GettingUp, GettingUpByClips
-from servoid.tools.learn.envs.tasks.location import TargetLocation
-from servoid.tools.learn.envs.tasks.speed import TargetSpeed
-from servoid.tools.learn.envs.tasks.steering import TargetSteering
+from servoid.stack.tasks.learned.base import LearnedTask, TaskState
+from servoid.stack.tasks.learned.dodgeball import Dodgeball
+from servoid.stack.tasks.learned.get_up import GettingUp, GettingUpByClips
+from servoid.stack.tasks.learned.location import TargetLocation
+from servoid.stack.tasks.learned.speed import TargetSpeed
+from servoid.stack.tasks.learned.steering import TargetSteering
 
 GROUP = "servoid.learned_tasks"  # of entry points
 LEARNED_TASKS: Mapping[str, type[LearnedTask]] = {

@@ -9,7 +9,7 @@ from servoid.hw.contracts.control import Instruction, State
 from servoid.policy.motion.library import Library
 from servoid.policy.rising.lead import CLIPS, Rising
 from servoid.stack.safety.recovery import AT_HOME, UPRIGHT
-from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState
+from servoid.stack.tasks.learned.base import LearnedTask, TaskState
 
 _LYING = 0.25  # of the standing height: where a base that lies is
 _TALL = 0.85  # of the standing height: it stands on straight legs

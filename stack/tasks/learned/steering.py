@@ -6,7 +6,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
-from servoid.tools.learn.envs.tasks.base import LearnedTask, TaskState, over_ground
+from servoid.stack.tasks.learned.base import LearnedTask, TaskState, over_ground
 
 _SHARPNESS = 0.5 * 5.0**2  # exp(-0.5 error^2) of a human who goes 5 m/s at most: here, of as large a share of the top
 _SLOWEST = 0.5 / 5.0  # of the top speed that way
@@ -16,7 +16,7 @@ class TargetSteering(LearnedTask):
     """The top speed is that of the direction relative to where it faces: this robot side-steps far slower than it
     walks."""
 
-    name, goal, size, every, run = "steering", "steering", 4, (2.1, 3.7), "velocity"
+    name, goal, size, every, run = "steering", "steering", 4, (2.1, 3.7), "steering"
 
     def draw(self, rng: np.random.Generator, position: Array) -> Array:
         """Velocity over the ground, and the direction to face, a unit vector."""

@@ -1,0 +1,1 @@
+"""Plans measured in closed loop."""
