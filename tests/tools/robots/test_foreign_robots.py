@@ -1,5 +1,5 @@
-"""Models that others wrote are imported, fit their files, and stand. None is kept here: SERVOID_FOREIGN_MODELS names the
-paths of some, with what separates those in PATH between them."""
+"""Models that others wrote are imported, fit their files, and stand. None is kept here: SERVOID_FOREIGN_MODELS names
+the paths of some, with what separates those in PATH between them."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def test_a_joint_whose_image_belongs_to_another_is_its_own_mirror(
     """A neck's rod beside the servo that moves it made a draft that could not be loaded."""
     site = '<site name="imu" pos="0 0 0.03"/>'
     rows = (
-        f'<body name="{name}" pos="0 {y} 0.08"><joint name="{name}" axis="0 1 0"/><geom size="0.01" mass="0.01"/></body>'
+        f'<body pos="0 {y} 0.08"><joint name="{name}" axis="0 1 0"/><geom size="0.01" mass="0.01"/></body>'
         for name, y in (("nod", 0.0), ("rod", 0.03))
     )
     text = (ROBOTS / "wren.xml").read_text()
