@@ -188,15 +188,19 @@ def skills_known(name: str, robot: Robot, planner: DiffusionSettings | None = No
     return tuple(read_header(resolve(settings.checkpoint, robot)).get("skills", {}))
 
 
-def sentences_known(name: str, robot: Robot) -> tuple[str, ...]:
-    """Sentences that the planner of a closed loop was trained with, where it reads others by the nearest of them; none
-    of another policy. Raises ConfigError."""
+def sentences_known(name: str, robot: Robot) -> tuple[tuple[str, ...], float]:
+    """Sentences that the planner of a closed loop was trained with, where it reads others by the nearest of them, and
+    how long from a request to the end of its plan [s]; none of another policy. Raises ConfigError."""
     from servoid.policy.checkpoint import read_header, resolve
+    from servoid.policy.diffusion.prefix.frames import RATE
 
     if _maker(name) is not _closed_loop:
-        return ()
+        return (), 0.0
     settings = _loop_settings(name)
-    return tuple(read_header(resolve(settings.checkpoint, robot)).get("sentences", ())) if settings.text_nearest else ()
+    head = read_header(resolve(settings.checkpoint, robot))
+    if not settings.text_nearest or "sentences" not in head:
+        return (), 0.0
+    return tuple(head["sentences"]), head["config"]["frames"] / RATE + settings.delay * robot.dt
 
 
 def policy_fingerprint(name: str, robot: Robot | None = None) -> dict[str, Any]:

@@ -236,8 +236,9 @@ class Run:
                 f"policy '{settings.policy}' knows no skills, and what is said asks for some ({asked}): use --policy "
                 "skills, or servoid run skill --set text=..."
             )
-        if not self._policy and (sentences := sentences_known(settings.policy, robot)):
-            policy = RewordedPolicy(robot, policy, sentences)
+        sentences, seconds = ((), 0.0) if self._policy else sentences_known(settings.policy, robot)
+        if sentences:
+            policy = RewordedPolicy(robot, policy, sentences, seconds)
         return SkillPolicy(robot, policy, load_skills(robot)) if assignment.task.performs else policy
 
     def loop(self) -> None:

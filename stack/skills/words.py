@@ -47,7 +47,7 @@ class SkillWords:
     """The phrases of skills beside those of walking, in an encoder's codes."""
 
     def __init__(self, encoder: TextEncoder, skills: Mapping[str, Skill]) -> None:
-        self._encoder, self._skills, self._walking = encoder, skills, Phrasebook(encoder)
+        self._encoder, self.skills, self._walking = encoder, skills, Phrasebook(encoder)
         pairs = [(name, text) for name, skill in skills.items() for text in skill.phrases]
         self._names = np.array([name for name, _ in pairs])
         self._texts = [text for _, text in pairs]
@@ -78,7 +78,7 @@ class SkillWords:
             motion = MOTIONS[int(self._walking.motions[walking.argmax()])]
             raise ConfigError(
                 f"the instruction '{text}' asks for nothing that is known; the nearest skill is "
-                f"'{self._skills[name].phrases[0]}', the nearest motion '{motion.phrasings[0]}'"
+                f"'{self.skills[name].phrases[0]}', the nearest motion '{motion.phrasings[0]}'"
             )
         if self._sides[near.argmax()] and not side:
             raise ConfigError(f"the instruction '{text}' does not say with which side; add 'left' or 'right'")
@@ -88,14 +88,6 @@ class SkillWords:
                 f"the instruction '{text}' says '{side}', but '{name}' has no side to choose: leave it out"
             )
         return str(self._names[fitting.argmax()])
-
-    def said(self, text: str) -> str:
-        """What a text asks for in the first of its phrases; the text itself where it is not understood."""
-        try:
-            asked = self.understand(text)
-        except ConfigError:
-            return text
-        return MOTIONS[asked].phrasings[0] if isinstance(asked, int) else self._skills[asked].phrases[0]
 
     def clearest(self, name: str) -> str:
         """The phrase of a skill that is least like those of anything else.

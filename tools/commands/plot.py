@@ -1,6 +1,6 @@
 """Draw a recorded run: its path from above, velocities, tilt, joints, supply and tick timing. Several logs are drawn
 over each other. `--joints` draws the targets and positions of joints instead, `--video` a film, and `--strip` pictures
-of the second in its middle, from two sides.
+of the second in its middle, or of more (`--strip-seconds`), from two sides.
 """
 
 from __future__ import annotations
@@ -34,6 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--video", type=Path, metavar="FILE", help="film a log instead: MP4")
     parser.add_argument("--strip", type=Path, metavar="FILE", help="draw moments of a log side by side instead: PNG")
     parser.add_argument(
+        "--strip-seconds", type=float, default=1.0, metavar="S", help="how much of it (default: %(default)s)"
+    )
+    parser.add_argument(
         "--video-size", default="1280x720", metavar="WxH", help="size of the film (default: %(default)s)"
     )
     add_json_argument(parser)
@@ -46,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
         if args.video is not None:
             made["video"] = _film(logs, args)
         elif args.strip is not None:
-            made["strip"] = _strip(logs, args.strip)
+            made["strip"] = _strip(logs, args.strip, args.strip_seconds)
         else:
             out = args.out or args.log[0].with_name("-".join(path.stem for path in args.log) + ".png")
             plot_runs(logs, out, None if args.joints is None else args.joints.split(","))
@@ -75,11 +78,13 @@ def _film(logs: Sequence[FlightLog], args: argparse.Namespace) -> Path:
     return path
 
 
-def _strip(logs: Sequence[FlightLog], path: Path) -> Path:
+def _strip(logs: Sequence[FlightLog], path: Path, seconds: float) -> Path:
     if len(logs) > 1:
         raise ConfigError("--strip: a strip shows one run: name one log")
     if path.suffix != ".png":
         raise ConfigError(f"--strip {path}: give a name that ends in .png")
+    if not seconds > 0.0:
+        raise ConfigError(f"--strip-seconds must be positive, not {seconds:g}")
     choose_filming("--strip")
     from servoid.sim.render import RenderError
     from servoid.tools.common.pictures.video import middle_frames
@@ -87,7 +92,7 @@ def _strip(logs: Sequence[FlightLog], path: Path) -> Path:
 
     robot = load_robot(logs[0].header["settings"]["robot"])
     try:
-        write_picture(path, strip(middle_frames(logs[0], COLUMNS), robot))
+        write_picture(path, strip(middle_frames(logs[0], COLUMNS, seconds), robot))
     except (RenderError, OSError) as error:
         raise ConfigError(f"--strip: {error}") from None
     return path

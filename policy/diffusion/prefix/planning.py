@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from servoid.hw.contracts.body import Array
+from servoid.hw.geometry import turned
+
 
 @dataclass(frozen=True, kw_only=True)
 class Planning:
@@ -23,6 +28,14 @@ class Planning:
             raise ValueError("frames must be at least 1, and delay and steps must not be negative")
         if self.text_weight < 0 or min(self.reach, self.turn) <= 0:
             raise ValueError("text_weight must not be negative, and reach and turn must be positive")
+
+
+def led(velocity: Array, seconds: float) -> tuple[Array, Array]:
+    """Where velocities `(..., 3)` m/s, m/s and rad/s lead to in so many seconds, along an arc: places `(..., 2)` m in
+    the heading frame of the beginning, and turns `(...,)` rad."""
+    angle = velocity[..., 2] * seconds
+    chord = velocity[..., :2] * (seconds * np.sinc(angle / (2 * np.pi)))[..., None]
+    return turned(chord, angle / 2), angle
 
 
 def history_ticks(prefix: int, stride: int) -> int:

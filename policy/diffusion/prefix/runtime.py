@@ -23,7 +23,7 @@ from servoid.policy.diffusion.prefix import target
 from servoid.policy.diffusion.prefix.frames import Anchor, BodyMotion, Frames, turned
 from servoid.policy.diffusion.prefix.model import PlannerModel
 from servoid.policy.diffusion.prefix.planner import PrefixPlanner
-from servoid.policy.diffusion.prefix.planning import Planning
+from servoid.policy.diffusion.prefix.planning import Planning, led
 from servoid.policy.diffusion.rolling import seeded
 from servoid.policy.diffusion.runtime import one_thread
 from servoid.policy.text.captions import MOTIONS, caption
@@ -185,13 +185,12 @@ class PlannerRuntime:
         turns no further than to face it.
         """
         seconds = (self._model.config.frames + self._planning.delay / self._frames.stride) * self._frames.dt
-        angle = velocity[:, 2] * seconds
-        chord = velocity[:, :2] * (seconds * np.sinc(angle / (2 * np.pi)))[:, None]
+        place, angle = led(velocity, seconds)
         if instruction.goal is None:
-            return turned(chord, angle / 2), angle
-        goal = np.broadcast_to(instruction.goal, chord.shape)
+            return place, angle
+        goal = np.broadcast_to(instruction.goal, place.shape)
         bearing = np.abs(np.arctan2(goal[:, 1], goal[:, 0]))
-        return _within(goal, np.linalg.norm(chord, axis=-1, keepdims=True)), np.clip(angle, -bearing, bearing)
+        return _within(goal, np.linalg.norm(place, axis=-1, keepdims=True)), np.clip(angle, -bearing, bearing)
 
     def _sentence(self, text: str) -> Tensor:
         if text not in self._read:

@@ -21,7 +21,7 @@ _LENGTH, _SPEED = 0.275, 0.524  # m and m/s here for one of a human
 class Dodgeball(LearnedTask):
     """The ball flies on over the ground, as it was thrown; it is no body of the simulation, and nothing stops it."""
 
-    name, goal, size, every, run = "dodgeball", "ball", 4, (5.0, 8.0), "obstacle"
+    name, goal, size, every, run = "dodgeball", "ball", 4, (5.0, 8.0), "dodgeball"
 
     def draw(self, rng: np.random.Generator, position: Array) -> Array:
         """Place and velocity of the ball."""

@@ -20,7 +20,7 @@ _FARAWAY = 1e3  # m
 
 
 class TargetLocation(LearnedTask):
-    name, goal, size, every, run = "location", "location", 2, (5.0, 10.0), "goal"
+    name, goal, size, every, run = "location", "location", 2, (5.0, 10.0), "location"
 
     def draw(self, rng: np.random.Generator, position: Array) -> Array:
         distance, bearing = rng.uniform(_NEAREST, _FARTHEST), rng.uniform(-np.pi, np.pi)

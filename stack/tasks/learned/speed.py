@@ -15,7 +15,7 @@ _SLOWEST = 1.2 / 6.8  # of the top speed
 
 
 class TargetSpeed(LearnedTask):
-    name, goal, size, every, run = "speed", "velocity", 1, (2.0, 5.0), "walk"
+    name, goal, size, every, run = "speed", "velocity", 1, (2.0, 5.0), "speed"
 
     def draw(self, rng: np.random.Generator, position: Array) -> Array:
         return rng.uniform(_SLOWEST, 1.0, 1) * self.robot.walking.forward

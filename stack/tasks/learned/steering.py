@@ -16,7 +16,7 @@ class TargetSteering(LearnedTask):
     """The top speed is that of the direction relative to where it faces: this robot side-steps far slower than it
     walks."""
 
-    name, goal, size, every, run = "steering", "steering", 4, (2.1, 3.7), "velocity"
+    name, goal, size, every, run = "steering", "steering", 4, (2.1, 3.7), "steering"
 
     def draw(self, rng: np.random.Generator, position: Array) -> Array:
         """Velocity over the ground, and the direction to face, a unit vector."""

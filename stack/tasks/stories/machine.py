@@ -25,6 +25,7 @@ from servoid.stack.tasks.stories.condition import REST_SECONDS, Conditions, Mome
 from servoid.stack.tasks.stories.told import StoryEpisode, StorySettings
 
 AGAIN_SECONDS = 2.0  # after a skill that did not do it, before another try
+READY_SECONDS = 0.8  # in which a planner comes to a stand before what it is told, and may be told otherwise
 STAGE = 0.04  # m from there that will do
 FAR = 0.25  # m from there beyond which a robot that had come near walks there anew: turning, it drifts
 AWAY = 0.08  # m farther off that a robot turns its back to a seat: its toes need room
@@ -170,10 +171,11 @@ class Machine(BaseBehaviour):
 
     def _in_motion(self, act: Act) -> bool:
         """Whether a planner is in the middle of what it was told: it knows no way back from there, on one foot say, but
-        to its end. A skill ends by itself."""
+        to its end. Before that, a kick at a bag that it has walked over would end on it. A skill ends by itself."""
         if self._performs or self._acting is None or act.skill is None:
             return False
-        return self._tick - self._acting < self._ticks(self._lasts(act, act.skill))
+        since = self._tick - self._acting
+        return self._ticks(READY_SECONDS) <= since < self._ticks(self._lasts(act, act.skill))
 
     def _walk(self, act: Act, state: State, thing: Array) -> Instruction | None:
         """To where the act is performed; None where the robot is there."""

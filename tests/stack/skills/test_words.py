@@ -41,21 +41,29 @@ def test_most_held_out_phrases_are_understood() -> None:
 
 
 def test_what_is_said_of_a_known_motion_is_told_in_the_words_of_the_training() -> None:
-    """The nearest sentence alone takes "sidestep left" for a reach to the left side."""
-    heard: list[str | None] = []
+    """The nearest sentence alone takes "sidestep left" for a reach to the left side, and without a place that it leads
+    to a walk begins without a step."""
+    heard: list[Instruction] = []
 
     class Hearing(BasePolicy):
         def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
-            heard.append(instruction.text)
+            heard.append(instruction)
             return applied
 
     robot = load_robot()
-    policy = RewordedPolicy(robot, Hearing(), ["lie down on your back"])
+    policy = RewordedPolicy(robot, Hearing(), ["lie down on your back"], 2.0)
     state = StillEstimator(robot).update(observation(robot, 0, robot.home), robot.home)
     said = ("sidestep left", "have a seat on the stool", "lie down on your back", "solve the equation", "???", None)
     for text in said:
         policy.act(state, robot.home, Instruction(np.zeros(3), text=text))
-    assert heard == ["side-step to the left", "sit on the seat", *said[2:]]
+    assert [one.text for one in heard] == ["side-step to the left", "sit on the seat", *said[2:]]
+    assert [one.targets is not None for one in heard] == [True] + 5 * [False]
+    assert heard[0].targets is not None
+    np.testing.assert_allclose(heard[0].targets["ground"], [0.0, 2.0 * 0.16 * robot.walking.scale[1]], atol=1e-9)
+    assert heard[0].targets["heading"] == 0.0
+    mine = {"ground": np.ones(2)}
+    policy.act(state, robot.home, Instruction(np.zeros(3), text="sidestep left", targets=mine))
+    assert heard[-1].targets is mine, "what is asked for stays"
 
 
 def test_a_skill_is_told_in_the_phrase_that_is_least_like_any_others() -> None:

@@ -194,6 +194,10 @@ def test_words_ask_for_a_kick_to_its_end_though_the_bag_lies_before_that() -> No
     assert len(machine.take_events()) == 1
     assert machine.instruct(round(6.0 / ROBOT.dt), there, fallen).stand
     assert not machine.take_events(), "it is said once"
+    _, _, early = _story(plan="kick-left", by="words")
+    early.instruct(0, STANDING, seen)
+    assert early.instruct(1, there, seen).text == "kick high with the left foot"
+    assert early.instruct(round(0.3 / ROBOT.dt), there, fallen).stand, "it has not begun to kick"
 
 
 def test_things_are_not_in_each_others_way() -> None:

@@ -54,6 +54,9 @@ def test_a_strip_shows_the_middle_of_a_run(log: Path) -> None:
     assert at == sorted(set(at))  # four moments, in their order
     assert at[0] == pytest.approx(len(place) / 2 - 5, abs=2.5)
     assert at[-1] == pytest.approx(len(place) / 2 + 5, abs=2.5)
+    whole = middle_frames(run_of, 4, seconds=1000.0)
+    np.testing.assert_array_equal(whole[0].place, place[0])
+    assert np.abs(place[-3:] - whole[-1].place).sum(1).min() == 0.0
 
 
 @pytest.mark.slow
@@ -70,6 +73,7 @@ def test_two_logs_have_a_file_of_their_own(log: Path, capsys: pytest.CaptureFixt
         (["--video", "a.avi"], "give a name that ends in .mp4"),
         (["--video", "a.mp4", "--video-size", "wide"], "such as 1280x720"),
         (["--strip", "a.jpg"], "give a name that ends in .png"),
+        (["--strip", "a.png", "--strip-seconds", "0"], "--strip-seconds must be positive, not 0"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(

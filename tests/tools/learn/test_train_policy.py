@@ -255,6 +255,8 @@ def test_what_a_policy_imitates_is_kept_and_others_can_begin_with_it(
     first.imitate(synthetic_dataset)
     kept = tmp_path / "a" / "imitation.safetensors"
     assert "demonstrations" in read_header(kept)["results"]["begun_with"]
+    with pytest.raises(ConfigError, match=r"sees its goal in 4 numbers \(steering\), and task speed shows 2"):
+        second.start(resume=False, init=checkpoint.resolve("steering"))
     second.start(resume=False, init=kept)
     seen = first.env.observations["actor"]
     assert np.allclose(first.actor()(seen), second.actor()(seen), atol=1e-6)

@@ -67,11 +67,12 @@ def make_video(
 
 
 def middle_frames(log: FlightLog, count: int, seconds: float = 1.0) -> list[Frame]:
-    """So many moments of a second in the middle of what a film shows. Raises ConfigError for a log without states."""
+    """So many moments of the middle `seconds` of what a film shows, all of it where that is shorter. Raises ConfigError
+    for a log without states."""
     if not log.messages["/state"]:
         raise ConfigError(f"{log.path}: holds no state: the run ended before every sensor was read")
     rows = _rows(log)
-    middle, half = len(rows) / 2, 0.5 * seconds * FPS
+    middle, half = len(rows) / 2, min(0.5 * seconds * FPS, len(rows) / 2)
     picked = np.linspace(middle - half, middle + half, count).round().astype(int)
     return shown_frames(log, rows[np.clip(picked, 0, len(rows) - 1)])
 

@@ -24,6 +24,7 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.policy import checkpoint
 from servoid.policy.mlp import Mlp
+from servoid.policy.priors.goals import GOALS
 from servoid.policy.priors.task_policy import KIND, save_task_policy
 from servoid.policy.rising.policy import KIND as RISING
 from servoid.policy.rising.policy import save_rising_policy
@@ -244,6 +245,12 @@ class PolicyTrainer(PpoTrainer):
         return f"servoid rollout {self.env.task.run} --policy {self.best_path} --episodes 50"
 
     def adopt(self, path: Path) -> None:
+        task, goal = self.env.task, checkpoint.read_header(path).get("config", {}).get("goal")
+        if goal in GOALS and GOALS[goal].size != task.seen.size:
+            raise ConfigError(
+                f"{path}: sees its goal in {GOALS[goal].size} numbers ({goal}), and task {task.name} shows "
+                f"{task.seen.size} ({task.goal}): begin with a policy that sees as many, or with --demonstrations"
+            )
         network, _ = Mlp.load(path, self._kind, self.env.robot, self.env.observations["actor"].shape[1])
         hidden = list(network.sizes[1:-1])
         if hidden != list(self.settings.hidden):
