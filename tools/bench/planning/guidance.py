@@ -63,6 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--variant", action="append", choices=VARIANTS, help="only this variant; may be repeated (default: all)"
     )
+    parser.add_argument(
+        "--steps", type=int, metavar="N", help="network calls a plan, but for `lead` (default: its own)"
+    )
+    parser.add_argument("--checkpoint", metavar="NAME|FILE", help="another model with the same settings")
     add_json_argument(parser)
 
 
@@ -84,6 +88,12 @@ def _run(args: argparse.Namespace, report: Report) -> None:
     robot, settings = load_robot(), load_settings(args.policy)
     if settings.guidance.samples > 1:
         settings = replace(settings, guidance=replace(settings.guidance, samples=1))
+    if args.steps is not None:
+        try:
+            settings = replace(settings, steps=args.steps)
+        except ValueError as error:
+            raise ConfigError(f"--steps {args.steps}: {error}") from None
+    settings = replace(settings, checkpoint=args.checkpoint or settings.checkpoint)
     rows = []
     for name in args.variant or VARIANTS:
         chosen = replace(settings, guidance=replace(settings.guidance, **VARIANTS[name]))
