@@ -60,9 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds", type=positive, default=13.0, metavar="S", help="time to come to a goal (default: %(default)g)"
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
-    parser.add_argument(
-        "--variant", action="append", choices=VARIANTS, help="only this variant; may be repeated (default: all)"
-    )
+    about = f"only this one of {', '.join(VARIANTS)}; may be repeated (default: all)"
+    parser.add_argument("--variant", action="append", choices=VARIANTS, metavar="NAME", help=about)
     parser.add_argument(
         "--steps", type=int, metavar="N", help="network calls a plan, but for `lead` (default: its own)"
     )
