@@ -5,8 +5,9 @@
 PYTHON ?= $(shell for p in python3.11 python3; do $$p -c '' 2>/dev/null && echo $$p && break; done)
 VENV ?= .venv
 BIN := $(VENV)/bin
-# Two processes of one thread each, whatever the machine has: threads that wait for each other are slower.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist worksteal
+# Two processes of one thread each, whatever the machine has: threads that wait for each other are slower. Where Python is
+# told to keep no bytecode, each of the hundreds of commands that tests start would compile all of Servoid again.
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist worksteal
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 .PHONY: demo test quick clean

@@ -49,7 +49,7 @@ VERBS: dict[str, Verb] = {
         },
     ),
     "motions": Verb(
-        "import, author, pose, retarget, list, play, film, check, mirror and blend clips",
+        "make, list, play, film, check, mirror and blend clips",
         verbs={
             "import": Verb("make clips from a file", "servoid.tools.motions.verbs.import_clip"),
             "author": Verb("make clips from keyframes", "servoid.tools.motions.verbs.author"),
@@ -116,9 +116,7 @@ VERBS: dict[str, Verb] = {
             "interrupt": Verb(
                 "press Ctrl-C at any instant and check that torque is off", "servoid.tools.faults.interrupt"
             ),
-            "operator": Verb(
-                "press stop, and lose whoever steers, and measure when the robot rests", "servoid.tools.faults.operator"
-            ),
+            "operator": Verb("press stop, or lose who steers: when the robot rests", "servoid.tools.faults.operator"),
             "bus": Verb("time a control cycle on the servo bus", "servoid.tools.bench.bus"),
             "clients": Verb("check other people's clients against the virtual rig", "servoid.tools.bench.clients"),
             "identify": Verb("identify virtual rigs with hidden servos", "servoid.tools.bench.identify"),

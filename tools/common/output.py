@@ -21,6 +21,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+from servoid.hw.config import ConfigError
 from servoid.tools.common.exit_codes import exit_code, explain
 
 
@@ -235,3 +236,16 @@ def _plain(value: Any) -> Any:
 
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+
+
+def check_writable(path: Path) -> None:
+    """Raise ConfigError where a file cannot be written, before the work begins whose outcome it is for. What is there
+    stays as it is."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        new = not path.exists()
+        path.open("ab").close()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror}): choose another place with --out") from None
+    if new:
+        path.unlink()

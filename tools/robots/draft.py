@@ -136,7 +136,7 @@ def draft(path: Path, choices: Choices) -> Draft:
             "point, left and right; without them write the robot's file by hand"
         )
     imu = choices.imu or _imu(model, base, notes)
-    drafted = tuple(_joint(model, j, joints, places, axes, notes) for j in joints)
+    drafted = _mutual([_joint(model, j, joints, places, axes, notes) for j in joints], notes)
     if loose := [model.joint(j).name for j in joints if not model.jnt_limited[j]]:
         notes.append(f"range of {', '.join(loose)}: the model has none")
     name = path.stem.replace(" ", "-")
@@ -250,3 +250,12 @@ def _joint(
     key = float(model.key_qpos[0, model.jnt_qposadr[joint]]) if model.nkey else 0.0
     sign = 1 if not len(fits) or along[best] > 0 else -1
     return DraftedJoint(name, (low, high), float(np.clip(key, low, high)), model.joint(joints[best]).name, sign)
+
+
+def _mutual(drafted: Sequence[DraftedJoint], notes: list[str]) -> tuple[DraftedJoint, ...]:
+    """The joints, each its own mirror where the one at its image is the image of another: of two in a line across the
+    robot's middle, say, of which only one is on it."""
+    mirrors = {joint.name: joint.mirror for joint in drafted}
+    alone = {name for name, mirror in mirrors.items() if mirrors[mirror] != name}
+    notes.extend(f"mirror of {name}: {mirrors[name]}, at its image, is that of another" for name in sorted(alone))
+    return tuple(replace(joint, mirror=joint.name, sign=1) if joint.name in alone else joint for joint in drafted)

@@ -16,7 +16,7 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
-from servoid.tools.common.output import add_json_argument, reporting
+from servoid.tools.common.output import add_json_argument, check_writable, reporting
 
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
@@ -79,7 +79,7 @@ def main(args: argparse.Namespace) -> int:
         robot = load_robot(args.robot)
         start = gait_of(robot)
         out = args.out or Path(robot.folder) / "gait.yaml"
-        out.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(out)
         trial = GaitTrial(robot, start, args.candidates, args.seconds, args.randomise, args.seed)
         options = {"popsize": args.candidates, "seed": args.seed + 1, "verbose": -9}
         search = cma.CMAEvolutionStrategy(np.zeros(len(NAMES)), _SIGMA, options)

@@ -18,7 +18,7 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.stack.safety.balance import Balance
-from servoid.tools.common.output import add_json_argument, reporting
+from servoid.tools.common.output import add_json_argument, check_writable, reporting
 from servoid.tools.motions.keyframes import Authored, AuthoredClip, JointStep
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def main(args: argparse.Namespace) -> int:
         robot, recipe = load_robot(args.robot), load_authored(args.recipe)
         if len(recipe.clips) != 1 or not recipe.clips[0].steps:
             raise ConfigError(f"--recipe {args.recipe}: must hold one clip, made of steps")
-        args.out.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(args.out)
         space = Space(recipe.clips[0], robot)
         ball: Any = load_task("kick", {}).settings
         trial = KickTrial(robot, args.candidates, args.worlds, ball, randomise=args.randomise, seed=args.seed)

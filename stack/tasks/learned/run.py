@@ -7,7 +7,7 @@ nothing.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -18,6 +18,7 @@ from servoid.hw.contracts.task import Criterion, Episode, Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import Robot, shipped_robot
 from servoid.hw.setting import Setting
+from servoid.stack.navigation.go_to_point import SpeedProfile, go_to_point
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 from servoid.stack.tasks.learned.base import LearnedTask, TaskState
 from servoid.stack.tasks.learned.dodgeball import Dodgeball
@@ -69,6 +70,10 @@ class LearnedRun(BaseTask):
         """What is asked at a draw of the robot, whose base is at `position` `(2,)` m: `(size,)`."""
         return self.asks.draw(np.random.default_rng(episode.seeds[number]), position)
 
+    def told(self, asked: Array, state: State) -> Instruction:
+        """What the robot is told of `asked` `(size,)`."""
+        return self.asks.instruct(asked, state)
+
     def behaviour(self, episode: Draws) -> BaseBehaviour:
         return _AskAnew(episode, self)
 
@@ -110,7 +115,7 @@ class _AskAnew(BaseBehaviour):
         else:
             self._asked = task.asks.advance(self._asked[None], (tick - self._tick) * task.dt)[0]
         self._number, self._tick = number, tick
-        return task.asks.instruct(self._asked, state)
+        return task.told(self._asked, state)
 
 
 def _states(trace: Trace, cycle: int) -> tuple[Array, ...]:
@@ -144,6 +149,12 @@ class RunLocation(LearnedRun):
     name = "location"
     description = "go to a place, and to another every few seconds"
     learned = TargetLocation
+
+    def told(self, asked: Array, state: State) -> Instruction:
+        """The place, and for policies that know no places the velocity that leads there, by a script."""
+        told = super().told(asked, state)
+        velocity = told.velocity if told.goal is None else go_to_point(told.goal, SpeedProfile())
+        return replace(told, velocity=velocity)
 
 
 class RunDodgeball(LearnedRun):

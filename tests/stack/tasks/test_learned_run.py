@@ -67,6 +67,8 @@ def test_the_robot_is_told_what_it_is_judged_by() -> None:
     assert told.goal is not None
     assert np.allclose(told.goal, task.drawn(episode, 0, np.zeros(2)))
     assert GOALS["location"].observe(told, ROBOT.walking).shape == (4,)
+    bearing = np.arctan2(told.goal[1], told.goal[0])
+    assert told.velocity[2] * bearing > 0.0  # a walker that knows no places is led there
     again = asks.instruct(1, state(), PERCEPT)
     assert again.goal is not None
     assert np.allclose(again.goal, told.goal)

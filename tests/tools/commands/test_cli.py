@@ -36,6 +36,19 @@ def test_help_loads_nothing_that_is_slow_to_load() -> None:
         assert verb in result.stdout
 
 
+def test_help_of_every_verb_fits_80_columns(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    words = [[]]
+    for name, verb in cli.VERBS.items():
+        words += [[name], *([name, sub] for sub in verb.verbs or ())]
+    for line in words:
+        assert cli.main([*line, "--help"]) == 0
+        shown = capsys.readouterr().out
+        assert [row for row in shown.splitlines() if len(row) > 80] == [], line
+
+
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
@@ -47,7 +60,7 @@ def test_help_loads_nothing_that_is_slow_to_load() -> None:
         (["tasks", "gaol"], "servoid: unknown task 'gaol': did you mean 'goal'?"),
         (["--jason"], "servoid: unknown option '--jason'"),
         (["rollout", "walk", "--robot=--"], "servoid rollout: argument --robot: '--' is no value"),
-        (["bench"], "servoid bench: command missing; known: text-to-motion, sim, policy, loop"),
+        (["bench"], "servoid bench: command missing; known: text-to-motion, sim, policy, guidance, loop"),
         ([], "servoid: command missing; known: tasks"),
     ],
 )

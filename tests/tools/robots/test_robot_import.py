@@ -63,6 +63,25 @@ def test_an_origin_on_the_ground_is_moved_into_the_trunk(tmp_path: Path, capsys:
     assert "its origin must be in the trunk: give that as `origin`" in capsys.readouterr().err
 
 
+def test_a_joint_whose_image_belongs_to_another_is_its_own_mirror(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A neck's rod beside the servo that moves it made a draft that could not be loaded."""
+    site = '<site name="imu" pos="0 0 0.03"/>'
+    rows = (
+        f'<body pos="0 {y} 0.08"><joint name="{name}" axis="0 1 0"/><geom size="0.01" mass="0.01"/></body>'
+        for name, y in (("nod", 0.0), ("rod", 0.03))
+    )
+    text = (ROBOTS / "wren.xml").read_text()
+    assert site in text
+    (tmp_path / "neck.xml").write_text(text.replace(site, site + "".join(rows)))
+    code, said = imported(capsys, str(tmp_path / "neck.xml"), "--out", str(tmp_path / "neck.yaml"))
+    assert code == 0
+    assert "mirror of rod: nod, at its image, is that of another" in said["todo"]
+    joints = {joint.name: joint.mirror for joint in load_robot(tmp_path / "neck.yaml").joints}
+    assert (joints["nod"], joints["rod"]) == ("nod", "rod")
+
+
 def test_what_does_not_fit_its_model_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy(ROBOTS / "wren.xml", tmp_path)
     text = (ROBOTS / "wren.yaml").read_text()

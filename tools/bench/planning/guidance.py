@@ -60,9 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds", type=positive, default=13.0, metavar="S", help="time to come to a goal (default: %(default)g)"
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    about = f"only this one of {', '.join(VARIANTS)}; may be repeated (default: all)"
+    parser.add_argument("--variant", action="append", choices=VARIANTS, metavar="NAME", help=about)
     parser.add_argument(
-        "--variant", action="append", choices=VARIANTS, help="only this variant; may be repeated (default: all)"
+        "--steps", type=int, metavar="N", help="network calls a plan, but for `lead` (default: its own)"
     )
+    parser.add_argument("--checkpoint", metavar="NAME|FILE", help="another model with the same settings")
     add_json_argument(parser)
 
 
@@ -84,6 +87,12 @@ def _run(args: argparse.Namespace, report: Report) -> None:
     robot, settings = load_robot(), load_settings(args.policy)
     if settings.guidance.samples > 1:
         settings = replace(settings, guidance=replace(settings.guidance, samples=1))
+    if args.steps is not None:
+        try:
+            settings = replace(settings, steps=args.steps)
+        except ValueError as error:
+            raise ConfigError(f"--steps {args.steps}: {error}") from None
+    settings = replace(settings, checkpoint=args.checkpoint or settings.checkpoint)
     rows = []
     for name in args.variant or VARIANTS:
         chosen = replace(settings, guidance=replace(settings.guidance, **VARIANTS[name]))

@@ -10,7 +10,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -106,13 +106,15 @@ def measure(
 
 
 def walked(robot: Robot, makers: Mapping[str, MakePolicy], settings: OdometryTraining) -> dict[str, Array]:
-    """Record walks of every kind, for every way of walking slips in its own: see `record`."""
+    """Record walks of every kind, for every way of walking slips in its own: see `record`. `floor` makes floors
+    more slippery than the robot's own, since feet that hold teach nothing of feet that slip."""
     known = _shipped(robot)
+    slippery = replace(robot, floor_friction=settings.floor * robot.floor_friction)
     data: dict[str, Array] = {}
     for i, (name, make) in enumerate(makers.items()):
         worlds = settings.worlds // len(makers)
         print(f"recording {name}: {worlds} robots, {settings.seconds:g} s ...", file=sys.stderr)
-        part = record(robot, make, worlds, settings.seconds, settings.seed + i, known)
+        part = record(slippery, make, worlds, settings.seconds, settings.seed + i, known)
         data = mixed(data, part, settings.seed) if data else part
     return data
 

@@ -41,7 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     one.add_argument("--licence", metavar="TEXT", help="licence of the clip, such as Apache-2.0")
     for end in ("begins", "ends"):
-        one.add_argument(f"--{end}", choices=POSES, default="upright", help=f"how the clip {end} (default: upright)")
+        about = f"how the clip {end}: {', '.join(POSES)} (default: upright)"
+        one.add_argument(f"--{end}", choices=POSES, default="upright", metavar="POSE", help=about)
     one.add_argument("--loop", action="store_true", help="the last frame leads back to the first")
     add_out_arguments(parser)
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
