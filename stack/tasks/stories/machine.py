@@ -29,6 +29,7 @@ READY_SECONDS = 0.8  # in which a planner comes to a stand before what it is tol
 STAGE = 0.04  # m from there that will do
 FAR = 0.25  # m from there beyond which a robot that had come near walks there anew: turning, it drifts
 AWAY = 0.08  # m farther off that a robot turns its back to a seat: its toes need room
+ROUND = 0.7  # of how far a robot is beside a seat
 REST_AT_END = 1.0  # s, of standing or sitting
 PROFILE = SpeedProfile(reverse=0.1, lateral=0.1)
 
@@ -208,6 +209,8 @@ class Machine(BaseBehaviour):
         if to.back:
             facing = float(yaw_of(thing[3:]))
             edge = to.ahead + (0.0 if seat is None else seat.size[0] / 2) + (0.0 if self._aside else AWAY)
+            if not self._near:  # round the corners: from beside a seat, so much farther before it
+                edge += ROUND * abs(float(turned(state.displacement - thing[:3], -facing)[1]))
             place = thing[:2] + turned(np.array([edge, to.aside]), facing)
         else:
             if act.done.faces is not None:
