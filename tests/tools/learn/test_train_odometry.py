@@ -17,7 +17,7 @@ from servoid.policy.checkpoint import CheckpointError, read, read_header
 from servoid.stack.estimation.odometry import OFFSETS, OdometryFeatures, load_odometry
 from servoid.tools.learn.settings import OdometryTraining
 from servoid.tools.learn.trainers import odometry
-from servoid.tools.learn.trainers.odometry import OdometryTrainer
+from servoid.tools.learn.trainers.odometry import OdometryTrainer, walked
 from servoid.tools.learn.walks import drift, maker, record
 
 ROBOT = load_robot()
@@ -57,6 +57,14 @@ def slipping(recorded: dict[str, np.ndarray]) -> Iterator[dict[str, np.ndarray]]
 
 
 @pytest.mark.slow
+def test_legs_are_off_by_more_on_a_floor_that_is_more_slippery() -> None:
+    def error(floor: float) -> float:
+        walks = walked(ROBOT, {"gait": maker(ROBOT, "gait")}, OdometryTraining(worlds=4, seconds=3.0, floor=floor))
+        return float(np.sqrt(np.square(walks["errors"]).mean()))
+
+    assert error(0.2) > 1.2 * error(1.0)
+
+
 def test_fitting_takes_a_systematic_slip_out(slipping: dict[str, np.ndarray], tmp_path: Path) -> None:
     trainer(slipping, tmp_path / "o.safetensors").run()
     network = load_odometry(ROBOT, tmp_path / "o.safetensors")
