@@ -219,7 +219,19 @@ class PolicyTrainer(PpoTrainer):
         judged = environment(env.task, env.score.prior, style, nominal, _JUDGED, settings.seed + 1)
         self._judged = judged
         self.judge = lambda _: self.measured()
-        measured = ("return", "falls", "achieved", "seconds", "prior_error", "amplitude", "amplitude_error", "cadence")
+        measured = (
+            "return",
+            "falls",
+            "achieved",
+            "seconds",
+            "prior_error",
+            "amplitude",
+            "amplitude_error",
+            "cadence",
+            "style",
+            "upper_style",
+            "lower_style",
+        )
         self.columns = (*self.columns, *measured)
         ours = ("achieved", "seconds") if env.task.achievable else ("falls",)
         manner = () if prior is None else (("prior_error",), ("amplitude", "cadence"))
@@ -264,6 +276,11 @@ class PolicyTrainer(PpoTrainer):
             raise checkpoint.CheckpointError(
                 f"{path}: its hidden layers are {hidden}; give --hidden {' '.join(map(str, hidden))}"
             )
+        theirs = checkpoint.read_header(path)["config"].get("reach")
+        if theirs is not None:  # the same targets, where another prior lets an action go elsewhere
+            (weight, bias), share = network.layers[-1], np.ones(self.env.action_size)
+            share[: len(theirs)] = theirs / self.env.reach
+            network.layers[-1] = weight * share.astype(np.float32), bias * share.astype(np.float32)
         self.begin_with(network)
 
     def imitate(self, folder: Path) -> None:
