@@ -281,8 +281,7 @@ class TrackingSettings:
     get_up_rates: Annotated[Range, "the same of clips that begin lying"] = (1.0, 1.6)
     walk_seconds: Annotated[Range, "seconds of walking between two clips"] = (0.6, 2.5)
     planner: Annotated[
-        str,
-        "settings of a closed loop, closd say, whose plans are followed instead: a name in configs/policies, or a file",
+        str, "settings of a closed loop whose plans are followed instead: a policy's name, or a file"
     ] = ""
     near: Annotated[float, "with a planner: share of its tasks that begin where there is little left to walk"] = 0.5
     words: Annotated[float, "with a planner: share of episodes that are told sentences of clips, and no place"] = 0.2
@@ -327,9 +326,7 @@ class TrackingSettings:
             for name in getattr(self, table):
                 if name not in TERMS:
                     raise ValueError(f"{table}.{name}: no such reward term; {nearest(name, TERMS)}")
-        if not 0.0 <= self.clip_share <= 1.0:
-            raise ValueError(f"clip_share must be 0 to 1, not {self.clip_share:g}")
-        for name in ("near", "words"):
+        for name in ("clip_share", "near", "words"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be 0 to 1, not {getattr(self, name):g}")
         if self.planner and not self.clip_share:

@@ -32,7 +32,7 @@ _NOTHING = Instruction(np.zeros(3))  # of all worlds together: each is asked som
 
 
 class Plans:
-    """Plans that the worlds of a fleet follow; see `Followed`."""
+    """Plans that the worlds of a fleet follow; see `Curriculum`."""
 
     def __init__(self, fleet: Fleet, acts: Acts, settings: ClosedLoopSettings, clips: Sequence[Clip]) -> None:
         """`clips` are those that the tracker has learned. Raises ConfigError where planner or walker do not fit."""

@@ -19,7 +19,7 @@ from servoid.policy.references.gait import Gait
 from servoid.policy.tracker.observation import RESIDUAL, TrackerObservation
 from servoid.policy.tracker.rewards import TERMS, Step
 from servoid.stack.control.fleet import Fleet
-from servoid.tools.learn.envs.followed import Followed
+from servoid.tools.learn.envs.curriculum import Curriculum
 from servoid.tools.learn.envs.motions import Motions
 from servoid.tools.learn.settings import TrackingSettings
 from servoid.tools.learn.terms import Terms
@@ -82,7 +82,7 @@ class Tracking:
     def _fleet(self, odometry: Mlp | None, seed: int) -> Fleet:
         return Fleet(self.robot, self.n, odometry, randomise=self.settings.randomised, seed=seed)
 
-    def _followed(self, clips: Sequence[Clip], seed: int) -> Followed:
+    def _followed(self, clips: Sequence[Clip], seed: int) -> Curriculum:
         share = self.settings.clip_share if clips else 0.0
         settings = replace(self.settings, clip_share=share)
         return Motions(self.robot, clips or [_still(self.robot)], self.n, settings, seed)

@@ -14,7 +14,7 @@ from servoid.policy.motion.clip import Clip
 from servoid.sim.truth import SimulatedTruth
 
 
-class Followed(Protocol):
+class Curriculum(Protocol):
     """What the worlds of a tracker's training follow, and how their episodes begin and end."""
 
     @property
