@@ -9,7 +9,7 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.robot.description import Robot
-from servoid.policy.motion.style import WalkingStyle
+from servoid.policy.references.style import WalkingStyle
 from servoid.stack.control.tracker import ExpertPolicy
 
 _TAKEN_UP = 1.0  # s in which the upper body goes over into the style

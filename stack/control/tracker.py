@@ -10,8 +10,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Reference, State
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import CheckpointError, resolve
-from servoid.policy.motion.style import WalkingStyle
 from servoid.policy.references.gait import Gait
+from servoid.policy.references.style import WalkingStyle
 from servoid.policy.tracker.network import gait_of_tracker, load_tracker
 from servoid.policy.tracker.observation import RESIDUAL, TrackerObservation
 from servoid.stack.control.base import BasePolicy

@@ -11,8 +11,8 @@ import pytest
 from servoid.hw.config import ConfigError, available
 from servoid.hw.contracts.control import Instruction
 from servoid.hw.robot.description import load_robot
-from servoid.policy.motion.style import WalkingStyle, load_style
 from servoid.policy.references.gait import gait_of
+from servoid.policy.references.style import WalkingStyle, load_style
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.styled import StyledExpert
 

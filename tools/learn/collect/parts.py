@@ -71,7 +71,7 @@ class FleetRecipe:
 
     def cutter(self, seed: int) -> EpisodeCutter:
         """A fleet of that seed, to be recorded. Raises ConfigError."""
-        from servoid.policy.motion.style import load_style
+        from servoid.policy.references.style import load_style
         from servoid.stack.control.fleet import Fleet
         from servoid.stack.control.gait import GaitPolicy
         from servoid.stack.control.styled import StyledExpert
