@@ -8,7 +8,7 @@ import pytest
 
 from servoid.hw.robot.description import load_robot
 from servoid.stack.tasks.learned import load_learned_task
-from servoid.tools.bench.ideal import TASKS, Ideal, ideal_return
+from servoid.tools.learn.envs.ideal import TASKS, Ideal, ideal_return
 
 ROBOT = load_robot()
 
