@@ -217,9 +217,18 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
 
 def test_training_rewards_who_is_out_of_a_balls_way_before_it_is_there() -> None:
     ball = LEARNED_TASKS["dodgeball"](ROBOT)
-    thrown = np.array([[1.0, 0.0, -0.4, 0.0, 1.0, 0.0, 0.0]])
-    inside, clear = (ball.guided(thrown, task_state(position=np.array([[0.0, y]])))[0] for y in (0.05, 0.4))
-    assert inside < clear - 0.3
+    thrown = np.array([[1.0, 0.0, -0.4, 0.0, 1.0, 0.0, 0.0]])  # along the x axis, at the origin
+
+    def guided(y: float, velocity: float) -> float:
+        known = task_state(position=np.array([[0.0, y]]), velocity=np.array([[0.0, velocity]]))
+        return float(ball.guided(thrown, known)[0])
+
+    for side in (1.0, -1.0):
+        into, stands, leaves, clear = (
+            guided(*(side * np.array(at))) for at in ((0.1, -0.2), (0.1, 0.0), (0.1, 0.3), (0.4, 0.0))
+        )
+        assert into < stands < leaves < clear
+        assert leaves > stands + 0.2
     assert ball.guided(ball.advance(thrown, 2.2), task_state(position=np.zeros((1, 2))))[0] == 0.0
 
 
