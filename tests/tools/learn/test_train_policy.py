@@ -205,6 +205,11 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
     comes = np.array([[1.0, -0.1, 0.05, -0.4, 0.0], [1.0, 0.1, 0.05, -0.4, 0.0]])  # past it on its right, and its left
     seen = GOALS["ball"].observe(Instruction(np.zeros((2, 3)), obstacles=comes[:, None]), walking)
     assert np.allclose(seen[:, :4], [[0.0, 1.0, 0.0, 1.0], [0.0, -1.0, 0.0, -1.0]])  # aside, away from it
+    across = np.array(
+        [[0.02, 1.0, 0.05, 0.0, -0.4], [0.2, 1.0, 0.05, 0.0, -0.4]]
+    )  # from its left, and well ahead of it
+    seen = GOALS["ball"].observe(Instruction(np.zeros((2, 3)), obstacles=across[:, None]), walking)
+    assert np.allclose(seen[:, 2:4], [[1.0, 0.0], [-1.0, 0.0]])  # straight on, though the other side is nearer, or back
     passed, beside = comes * [-1, 1, 1, 1, 1], comes + np.array([0.0, 0.5, 0.0, 0.0, 0.0])
     for ball in (passed[0], beside[1], comes[0] * [1, 1, 1, 0, 0]):
         seen = GOALS["ball"].observe(Instruction(np.zeros(3), obstacles=ball[None]), walking)
