@@ -247,7 +247,13 @@ def test_a_policy_that_sees_less_begins_another(prior: Path, tmp_path: Path) -> 
     trainer.start(resume=False, init=shipped)
     seen = trainer.env.observations["actor"]
     known, _ = Mlp.load(shipped, "task_policy", ROBOT, seen.shape[1] - 4)
-    assert np.allclose(trainer.actor()(seen), known(seen[:, :-4]), atol=1e-5)
+    theirs, ours = np.array(read_header(shipped)["config"]["reach"]), trainer.env.reach
+    assert np.allclose(ours * trainer.actor()(seen), theirs * known(seen[:, :-4]), atol=1e-5)  # the same targets
+    head, tensors = checkpoint.read(shipped)
+    slow = tmp_path / "slow.safetensors"
+    checkpoint.write(slow, tensors, {**head, "config": {**head["config"], "stride": 4}})
+    with pytest.raises(ConfigError, match="decides every 4 ticks, and here it is every 2"):
+        trainer.adopt(slow)
 
 
 def test_a_task_without_a_reward_is_refused(tmp_path: Path) -> None:
