@@ -242,3 +242,13 @@ def test_the_shipped_prior_knows_motion_of_this_robot() -> None:
     assert score(still).mean() > 2.0 * score(drawn).mean()
     speeds, cadences = found.manner["speed"], found.manner["cadence"]
     assert len(speeds) == len(cadences) >= 3
+
+
+def test_the_shipped_styles_are_told_and_compose() -> None:
+    """Windows drawn with the arms of one style on the legs of another show both."""
+    found = load_prior(checkpoint.resolve("styles", ROBOT), ROBOT, limbs_of(ROBOT))
+    assert found.header["results"]["style"] > 0.95
+    both = Style.parse("zombie+wide")
+    shown = found.shown(generate(found, 32, both, 0), both)
+    assert min(shown["upper_style"], shown["lower_style"]) > 0.9
+    assert found.shown(generate(found, 32, Style.parse("zombie"), 0), both)["lower_style"] < 0.5
