@@ -17,7 +17,7 @@ tests/stack/test_safety*.py:
 7. A stop that leaves time for it (Ctrl-C, the stop button, heat, a low supply, a blocked joint, a full disk, the end of
    a task) lets a walking robot come to rest, for REST_SECONDS at most, and lowers it then: lowered in mid step it often
    falls. With a joint that is blocked it takes no more steps. One that was not brought home, but holds the pose that it
-   was found in, is not lowered: it hangs or lies.
+   was found in, is not lowered: it hangs or lies. Nor is one that sits: it is damped as it sits.
 8. Gains only go down within a run: below what was asked for where servos get hot, the supply low or a joint blocked.
    While a robot that is to recover falls and lies, they are zero, but for its arms as they come in.
 9. A fall is survived only where `recover` was asked for, and only from RUNNING, or READY: it may lie as it begins,
@@ -96,6 +96,7 @@ class Guard:
         self.cause: str | None = None  # kind of the event that ended the run, the first if there were several
         self.recovery = Recovery(robot) if recover else None
         self.down = False  # it fell while it ran, and has not got up
+        self.sits = False  # on a seat, as its task has it: whoever runs the task says so
         self.lowest, self._upright = lowered_pose(robot), Upright(robot)
         self._motors = motors
         self._gain = np.full(len(robot.names), gain)
@@ -164,7 +165,9 @@ class Guard:
             return
         self.cause = self.cause or kind
         self.note(kind, text, joint)
-        if self.phase is Phase.RUNNING and self._stands and kind != BLOCKED:
+        if self.sits:
+            self._enter(Phase.DAMPED, "damped, seated")
+        elif self.phase is Phase.RUNNING and self._stands and kind != BLOCKED:
             self._stopping = self._tick
             self._again.add(kind)
             self._enter(Phase.STOPPING, "coming to rest")
