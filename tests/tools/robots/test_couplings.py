@@ -103,10 +103,11 @@ def test_joints_of_a_differential_are_held_and_named(tmp_path: Path, capsys: pyt
 
 
 ROD = """<body name="crank" pos="0.03 0 0.08"><joint name="crank" axis="0 1 0"/>
-<geom size="0.005" mass="0.005" contype="0" conaffinity="0"/><body name="rod" pos="0 0 0.02">
-<joint name="rod" axis="0 1 0"/><geom size="0.002" mass="0.002" contype="0" conaffinity="0"/><site name="end" pos="0 0 0.05"/></body></body>
-<body name="lid" pos="0.03 0 0.13"><joint name="lid" axis="0 1 0"/><geom size="0.01" mass="0.01" contype="0"
- conaffinity="0"/><site name="pin" pos="0 0 0.02"/></body>"""
+<geom size="0.005" mass="0.005" contype="0" conaffinity="0"/>
+<body name="rod" pos="0 0 0.02"><joint name="rod" axis="0 1 0"/>
+<geom size="0.002" mass="0.002" contype="0" conaffinity="0"/><site name="end" pos="0 0 0.05"/></body></body>
+<body name="lid" pos="0.03 0 0.13"><joint name="lid" axis="0 1 0"/>
+<geom size="0.01" mass="0.01" contype="0" conaffinity="0"/><site name="pin" pos="0 0 0.02"/></body>"""
 
 
 def test_a_closed_loop_is_closed_in_every_pose_that_a_body_begins_in(
