@@ -17,6 +17,7 @@ from servoid.policy import checkpoint
 from servoid.policy.mlp import Mlp
 from servoid.policy.motion.clip import Clip
 from servoid.policy.motion.library import Library
+from servoid.policy.references.gait import load_gait
 from servoid.policy.tracker.network import load_tracker, written
 from servoid.tools.learn.envs.tracking import Tracking
 from servoid.tools.learn.flags import plain, read_settings
@@ -53,11 +54,19 @@ def main(args: argparse.Namespace) -> int:
     odometry = None if settings.plain_odometry else load_odometry(robot)
     torch.manual_seed(settings.seed)
     clips = chosen_clips(robot, settings.clips)
-    env = Tracking(robot, settings.worlds, odometry, settings, settings.seed, clips)
+    env = _environment(settings)(robot, settings.worlds, odometry, settings, settings.seed, clips)
     trainer = TrackerTrainer(env, settings, args.out)
     trainer.start(args.resume, None if args.init is None else checkpoint.resolve(args.init, robot))
     trainer.run()
     return 0
+
+
+def _environment(settings: TrackerTraining) -> type[Tracking]:
+    if not settings.planner:
+        return Tracking
+    from servoid.tools.learn.envs.planned import PlannedTracking
+
+    return PlannedTracking
 
 
 class TrackerTrainer(PpoTrainer):
@@ -123,7 +132,7 @@ class TrackerTrainer(PpoTrainer):
         if self._clips:
             config |= {"clips": [clip.name for clip in self.env.motions.clips], "clip_rewards": s.clip_rewards}
         if s.gait:
-            config["gait"] = written(self.env.reference.gait.settings)
+            config["gait"] = written(load_gait(s.gait))
         about: dict[str, Any] = {
             "data": _SOURCE,
             "licence": "Apache-2.0",
