@@ -18,12 +18,12 @@ from servoid.hw.contracts.world import Start
 from servoid.hw.geometry import headed
 from servoid.hw.robot.description import Imu, Robot
 from servoid.hw.robot.legs import Legs
-from servoid.sim.friction import Friction
 from servoid.sim.ground import Ground
+from servoid.sim.joints.friction import Friction
+from servoid.sim.joints.loops import Loops
 from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.multi_robot import Crowd
 from servoid.sim.objects import ObjectsOf
-from servoid.sim.poses.loops import Loops
 from servoid.sim.randomise import Body, draw, longest
 from servoid.sim.scene import OBJECTS, robot_bodies
 from servoid.sim.truth import SimulatedTruth

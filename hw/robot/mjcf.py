@@ -83,7 +83,8 @@ def read_spec(path: Path) -> mujoco.MjSpec:
             else:
                 spec = mujoco.MjSpec.from_file(str(path))
         except (ValueError, UnicodeDecodeError, ElementTree.ParseError) as error:
-            raise ConfigError(f"{path}: not a valid MJCF or URDF: {' '.join(str(error).split())}") from error
+            remedy = "; no plugin is needed here: take it out of the file" if "plugin" in str(error) else ""
+            raise ConfigError(f"{path}: not a valid MJCF or URDF: {' '.join(str(error).split())}{remedy}") from error
     for text in warned:
         warnings.warn(f"{path}: {text}", stacklevel=2)
     for count, body in enumerate(spec.bodies):

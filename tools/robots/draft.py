@@ -114,6 +114,8 @@ def draft(path: Path, choices: Choices) -> Draft:
     """Raises ConfigError for a model that is no humanoid's, with what is missing."""
     load_servo(choices.servo)
     spec = read_spec(path)
+    for key in spec.keys:
+        key.ctrl = []  # of which only the pose is read, whatever motors it was written for
     if spec.meshes:
         compiled(spec, path)  # says which are missing
     model = compiled(spec, path)

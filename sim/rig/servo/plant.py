@@ -16,10 +16,10 @@ from servoid.hw.contracts.world import Scene, Start
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
 from servoid.hw.seeds import Stream, generator
-from servoid.sim.friction import Friction
 from servoid.sim.ground import Ground
+from servoid.sim.joints.friction import Friction
+from servoid.sim.joints.loops import Loops
 from servoid.sim.model import FLOOR, TIMESTEP, build
-from servoid.sim.poses.loops import Loops
 from servoid.sim.randomise import Body, draw
 from servoid.sim.scene import robot_bodies, scene_sensors
 from servoid.sim.truth import SimulatedTruth

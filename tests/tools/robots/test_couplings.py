@@ -12,8 +12,8 @@ import pytest
 
 from servoid.hw.config import CONFIGS, ConfigError
 from servoid.hw.robot.description import Robot, load_robot, load_servo
+from servoid.sim.joints.loops import Loops
 from servoid.sim.model import build
-from servoid.sim.poses.loops import Loops
 from servoid.sim.rig.servo.plant import Plant
 from servoid.sim.worlds import Worlds
 from servoid.tools.cli import main
