@@ -107,7 +107,11 @@ def _chain(model: mujoco.MjModel, robot: Robot, side: str, marks: Marks) -> _Cha
         if int(model.joint(name).type[0]) != mujoco.mjtJoint.mjJNT_HINGE:
             raise marks.error(key, f"{name!r}, on the way from the base to it, is not a hinge, but a servo turns")
         if name not in robot.names:
-            raise marks.error(key, f"{name!r}, on the way from the base to it, has no servo: its angle is not known")
+            raise marks.error(
+                key,
+                f"{name!r}, on the way from the base to it, has no servo: its angle is not known. Where a servo "
+                "turns it by gears, list it with its `gear`, and the servo's own joint under `held`",
+            )
     if not chain.joints:
         raise marks.error(key, f"no joint leads from the base {robot.base!r} to this foot")
     return chain

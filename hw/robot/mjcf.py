@@ -27,10 +27,30 @@ def read_body(robot: Robot) -> mujoco.MjSpec:
     """The file of a robot's body, with all that the robot's file names. Raises ConfigError naming what it lacks."""
     path = Path(robot.mjcf)
     spec = read_spec(path)
+    _hold(spec, robot, path)
     _check(spec, robot, path)
     if any(robot.origin):
         _move_origin(spec.body(robot.base), robot.origin)
     return spec
+
+
+def _hold(spec: mujoco.MjSpec, robot: Robot, path: Path) -> None:
+    """Take away the joints that the robot holds, and the constraints that name them."""
+    import mujoco
+
+    held = set(robot.held)
+    for name in robot.held:
+        _need(robot, path, "joint", name, [joint.name for joint in spec.joints])
+    for constraint in list(spec.equalities):
+        if constraint.type == mujoco.mjtEq.mjEQ_JOINT and held & {constraint.name1, constraint.name2}:
+            spec.delete(constraint)
+    for tendon in list(spec.tendons):
+        if held & {wrap.target.name for wrap in tendon.path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT}:
+            spec.delete(tendon)
+    for element in [*spec.actuators, *spec.sensors, *spec.keys] if held else []:
+        spec.delete(element)
+    for name in robot.held:
+        spec.delete(spec.joint(name))
 
 
 def _move_origin(body: mujoco.MjsBody, origin: tuple[float, float, float]) -> None:
@@ -63,7 +83,8 @@ def read_spec(path: Path) -> mujoco.MjSpec:
             else:
                 spec = mujoco.MjSpec.from_file(str(path))
         except (ValueError, UnicodeDecodeError, ElementTree.ParseError) as error:
-            raise ConfigError(f"{path}: not a valid MJCF or URDF: {' '.join(str(error).split())}") from error
+            remedy = "; no plugin is needed here: take it out of the file" if "plugin" in str(error) else ""
+            raise ConfigError(f"{path}: not a valid MJCF or URDF: {' '.join(str(error).split())}{remedy}") from error
     for text in warned:
         warnings.warn(f"{path}: {text}", stacklevel=2)
     for count, body in enumerate(spec.bodies):
@@ -104,10 +125,7 @@ def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
     import mujoco
 
     def need(kind: str, wanted: str, present: list[str]) -> None:
-        if wanted not in present:
-            near = get_close_matches(wanted, present, 1)
-            hint = f"; nearest: {near[0]}" if near else ""
-            raise ConfigError(f"{path}: no {kind} named {wanted!r}, which robot {robot.name!r} needs{hint}")
+        _need(robot, path, kind, wanted, present)
 
     need("body", robot.base, [body.name for body in model.bodies])
     base = model.body(robot.base)
@@ -142,6 +160,13 @@ def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
     extra = [name for name in kinds if name not in (*robot.names, *robot.passive, *own)]
     if extra:
         raise ConfigError(f"{path}: joints that robot {robot.name!r} does not list: {', '.join(extra)}")
+
+
+def _need(robot: Robot, path: Path, kind: str, wanted: str, present: list[str]) -> None:
+    if wanted not in present:
+        near = get_close_matches(wanted, present, 1)
+        hint = f"; nearest: {near[0]}" if near else ""
+        raise ConfigError(f"{path}: no {kind} named {wanted!r}, which robot {robot.name!r} needs{hint}")
 
 
 def _is_urdf(path: Path) -> bool:

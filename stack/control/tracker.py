@@ -11,6 +11,7 @@ from servoid.hw.contracts.control import Instruction, Reference, State
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import CheckpointError, resolve
 from servoid.policy.references.gait import Gait
+from servoid.policy.references.style import WalkingStyle
 from servoid.policy.tracker.network import gait_of_tracker, load_tracker
 from servoid.policy.tracker.observation import RESIDUAL, TrackerObservation
 from servoid.stack.control.base import BasePolicy
@@ -111,8 +112,12 @@ class ExpertPolicy(BasePolicy):
     Raises CheckpointError when the tracker does not fit.
     """
 
-    def __init__(self, robot: Robot, checkpoint: str = "expert", shape: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self, robot: Robot, checkpoint: str = "expert", shape: tuple[int, ...] = (), style: WalkingStyle | None = None
+    ) -> None:
         gait = gait_of_tracker(resolve(checkpoint, robot), robot)
+        if style is not None:
+            gait = style.changed(gait)
         self._gait, self._tracker = Gait(robot, shape, gait), Tracker(robot, checkpoint, shape)
 
     def reset(self, where: Array | None, seeds: Array) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -10,11 +11,14 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
+from servoid.hw.robot.mjcf import compiled, read_spec
 from servoid.policy.references.gait import Gait
 from servoid.sim.model import build
+from servoid.tools.robots.couplings import couplings
 
 _POSES = 50
 _EXACT = 1e-6  # m
+_SAME_GEAR = 1e-3  # of a ratio
 _MIRRORED = 0.005  # m that joints may be beside their mirror images
 _LOPSIDED = 0.015  # m more that a body's centre of mass may be: no robot is quite alike on both sides
 _LOADED = 0.6  # share of its stall torque that a servo may need to hold the robot at home
@@ -43,6 +47,7 @@ def findings(robot: Robot) -> list[Comparison]:
             True, "weight and height", f"{mass:.2f} kg, base {robot.standing_height:.3f} m above the ground at home"
         ),
         _kinematics(robot, model, data, joints),
+        *_gears(robot),
         _mirrors(robot, model, data, joints),
         _ranges(robot),
         _soles(robot),
@@ -69,6 +74,20 @@ def _kinematics(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints
         for sole, foot in zip(soles, robot.legs, strict=True):
             worst = max(worst, float(np.abs(data.sensor(f"servoid/{foot}_position").data - sole).max()))
     return Comparison(worst < _EXACT, "kinematics", f"soles {worst:.1e} m from MuJoCo's at {_POSES} random poses")
+
+
+def _gears(robot: Robot) -> list[Comparison]:
+    """Joints whose horn is a joint of the model have the ratio of the two."""
+    if not robot.held:
+        return []
+    path = Path(robot.mjcf)
+    ties = couplings(compiled(read_spec(path), path), path).gears
+    wrong = [
+        f"{joint.name} {joint.gear:g}, by the model {ties[joint.name][1]:g}"
+        for joint in robot.joints
+        if joint.name in ties and abs(joint.gear / ties[joint.name][1] - 1.0) > _SAME_GEAR
+    ]
+    return [Comparison(not wrong, "gears", "; ".join(wrong) or "as the model ties joints to their servos' horns")]
 
 
 def _mirrors(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:

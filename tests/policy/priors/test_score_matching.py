@@ -23,6 +23,7 @@ from servoid.policy.priors.score_matching.generate import generate, starts, upri
 from servoid.policy.priors.score_matching.judged import manner_of
 from servoid.policy.priors.score_matching.model import Prior, Style, load_prior
 from servoid.policy.priors.score_matching.score import RunningMean, Score, likeness
+from servoid.policy.priors.score_matching.styles import StyleClassifier
 from servoid.policy.recording import DatasetError
 from servoid.sim.kinematics import limbs_of
 from servoid.tools.learn.trainers.prior import read_by_style
@@ -82,6 +83,42 @@ def test_styles_are_composed_by_the_body(prior: Prior) -> None:
     free = prior.noise(noisy, levels, Style())
     guided = prior.noise(noisy, levels, Style.parse("low", 2.0))
     assert torch.allclose(guided, free + 2.0 * (low - free), atol=1e-5)
+
+
+def test_a_classifier_tells_styles_by_the_halves_that_show_them(prior: Prior) -> None:
+    """Two styles that differ in what the arms do: the legs cannot tell them."""
+    torch.manual_seed(0)
+    tells, arms = StyleClassifier(prior.config, prior.features), torch.from_numpy(~prior.features.lower)
+    optimiser, generator = torch.optim.Adam(tells.parameters(), 3e-3), torch.Generator().manual_seed(0)
+
+    def drawn(count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        styles = torch.randint(1, 3, (count,), generator=generator)
+        shift = (styles[:, None, None] - 1.5) * 2.0 * arms
+        return torch.randn(count, prior.config.frames, prior.config.size, generator=generator) + shift, styles
+
+    for _ in range(80):
+        optimiser.zero_grad()
+        tells.loss(*drawn(64), generator).backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+    seen, styles = drawn(400)
+    whole, upper, lower = (tells.told(seen) == styles).float().mean(1).tolist()
+    assert min(whole, upper) > 0.95
+    assert lower < 0.65
+    first = seen[styles == 1]
+    assert tells.shares(first, 1, 1)["style"] > 0.95
+    composed = tells.shares(first, 1, 2)
+    assert composed["upper_style"] > 0.95
+    assert composed["style"] <= composed["lower_style"]  # both halves must show theirs
+
+
+def test_a_prior_of_styles_tells_which_is_shown_and_keeps_that(prior: Prior) -> None:
+    assert prior.classifier is not None
+    found = prior.shown(windows(prior), Style.parse("high+low"))
+    assert set(found) == {"style", "upper_style", "lower_style"}
+    assert prior.shown(windows(prior), Style()) == {}
+    with pytest.raises(ConfigError, match="not in this prior"):
+        prior.shown(windows(prior), Style.parse("none"))
+    assert {"style", "upper_style", "lower_style"} <= set(prior.header["results"])
 
 
 def test_an_unknown_style_is_named(prior: Prior) -> None:

@@ -18,6 +18,7 @@ from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError, read_header
+from servoid.policy.mlp import Mlp
 from servoid.policy.priors.adversarial.discriminator import (
     Adversary,
     Discriminator,
@@ -133,7 +134,8 @@ def test_what_is_asked_next_is_no_merit_of_what_was_done(prior: Path) -> None:
 def test_a_place_and_a_ball_are_not_asked_for_where_it_is_to_stand() -> None:
     stand = Instruction(np.zeros(3), stand=True)
     assert np.array_equal(GOALS["location"].observe(stand, ROBOT.walking), [0.0, 0.0, 1.0, 0.0])
-    assert np.hypot(*GOALS["ball"].observe(stand, ROBOT.walking)[:2]) >= 1.0
+    assert np.array_equal(GOALS["ball"].observe(stand, ROBOT.walking)[:4], [0.0, 0.0, 1.0, 0.0])
+    assert np.hypot(*GOALS["ball"].observe(stand, ROBOT.walking)[4:6]) >= 1.0
 
 
 def test_generated_starts_move_and_stand_on_the_ground(prior: Path) -> None:
@@ -161,6 +163,10 @@ def test_rewards_are_highest_for_what_is_asked() -> None:
     assert steering.reward(sideways, state((0, 0), 0.0, (0.0, 0.1)))[0] == pytest.approx(1.0)
     assert steering.reward(sideways, state((0, 0), np.pi / 2, (0.0, 0.1)))[0] == pytest.approx(0.7)
     assert steering.reward(sideways, state((0, 0), 0.0, (0.0, -0.01)))[0] == pytest.approx(0.3)
+    away, aside = (state((0, 0), yaw, (0.0, 0.1)) for yaw in (np.pi, 2.0))
+    assert steering.reward(sideways, aside)[0] == pytest.approx(steering.reward(sideways, away)[0])
+    assert steering.guided(sideways, aside)[0] > steering.guided(sideways, away)[0] + 0.1  # training says where to turn
+    assert steering.guided(sideways, state((0, 0), 0.0, (0.0, 0.1)))[0] == pytest.approx(1.0)
     ball = LEARNED_TASKS["dodgeball"](ROBOT)
     thrown = ball.draw(np.random.default_rng(0), np.array([1.0, -1.0]))[None]
     hit = [bool(ball.ended(ball.advance(thrown, t), state((1, -1), 0.0, (0.0, 0.0)))[0]) for t in np.arange(0, 6, 0.1)]
@@ -195,11 +201,39 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
     assert np.allclose(GOALS["location"].observe(behind, walking), [[-1, 0, -1, 0], [0, 1, 0, 1]])
     things = np.array([[2.0, 0.0, 0.1, -0.5, 0.0], [0.0, -1.0, 0.1, 0.0, 0.25]])
     seen = GOALS["ball"].observe(Instruction(np.zeros(3), obstacles=things), walking)
-    assert np.allclose(seen, [0.0, -1.0, 0.0, 0.5])  # the nearest
-    with pytest.raises(ConfigError, match="run obstacle"):
+    assert np.allclose(seen[4:], [0.0, -1.0, 0.0, 0.5])  # the nearest
+    comes = np.array([[1.0, -0.1, 0.05, -0.4, 0.0], [1.0, 0.1, 0.05, -0.4, 0.0]])  # past it on its right, and its left
+    seen = GOALS["ball"].observe(Instruction(np.zeros((2, 3)), obstacles=comes[:, None]), walking)
+    assert np.allclose(seen[:, :4], [[0.0, 1.0, 0.0, 1.0], [0.0, -1.0, 0.0, -1.0]])  # aside, away from it
+    passed, beside = comes * [-1, 1, 1, 1, 1], comes + np.array([0.0, 0.5, 0.0, 0.0, 0.0])
+    for ball in (passed[0], beside[1], comes[0] * [1, 1, 1, 0, 0]):
+        seen = GOALS["ball"].observe(Instruction(np.zeros(3), obstacles=ball[None]), walking)
+        assert np.allclose(seen[:4], [0.0, 0.0, 1.0, 0.0])  # no reason to go anywhere
+    with pytest.raises(ConfigError, match="run dodgeball"):
         GOALS["ball"].observe(turning, walking)
     with pytest.raises(ConfigError, match="the task gives none"):
         GOALS["location"].observe(turning, walking)
+
+
+def test_training_rewards_who_is_out_of_a_balls_way_before_it_is_there() -> None:
+    ball = LEARNED_TASKS["dodgeball"](ROBOT)
+    thrown = np.array([[1.0, 0.0, -0.4, 0.0, 1.0, 0.0, 0.0]])
+    inside, clear = (ball.guided(thrown, task_state(position=np.array([[0.0, y]])))[0] for y in (0.05, 0.4))
+    assert inside < clear - 0.3
+    assert ball.guided(ball.advance(thrown, 2.2), task_state(position=np.zeros((1, 2))))[0] == 0.0
+
+
+@pytest.mark.slow
+def test_a_policy_that_sees_less_begins_another(prior: Path, tmp_path: Path) -> None:
+    """It does what it did, whatever else there is to see."""
+    trainer = PolicyTrainer(
+        made(prior, "dodgeball", settings := replace(SETTINGS, hidden=(256, 128))), Style(), settings, tmp_path, prior
+    )
+    shipped = checkpoint.resolve("location")
+    trainer.start(resume=False, init=shipped)
+    seen = trainer.env.observations["actor"]
+    known, _ = Mlp.load(shipped, "task_policy", ROBOT, seen.shape[1] - 4)
+    assert np.allclose(trainer.actor()(seen), known(seen[:, :-4]), atol=1e-5)
 
 
 def test_a_task_without_a_reward_is_refused(tmp_path: Path) -> None:

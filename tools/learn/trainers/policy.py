@@ -219,7 +219,19 @@ class PolicyTrainer(PpoTrainer):
         judged = environment(env.task, env.score.prior, style, nominal, _JUDGED, settings.seed + 1)
         self._judged = judged
         self.judge = lambda _: self.measured()
-        measured = ("return", "falls", "achieved", "seconds", "prior_error", "amplitude", "amplitude_error", "cadence")
+        measured = (
+            "return",
+            "falls",
+            "achieved",
+            "seconds",
+            "prior_error",
+            "amplitude",
+            "amplitude_error",
+            "cadence",
+            "style",
+            "upper_style",
+            "lower_style",
+        )
         self.columns = (*self.columns, *measured)
         ours = ("achieved", "seconds") if env.task.achievable else ("falls",)
         manner = () if prior is None else (("prior_error",), ("amplitude", "cadence"))
@@ -245,18 +257,30 @@ class PolicyTrainer(PpoTrainer):
         return f"servoid rollout {self.env.task.run} --policy {self.best_path} --episodes 50"
 
     def adopt(self, path: Path) -> None:
+        """Begin as the policy in `path`: where that sees less of its goal, as if it did not see the rest.
+
+        Raises ConfigError where it sees more, CheckpointError for other hidden layers.
+        """
         task, goal = self.env.task, checkpoint.read_header(path).get("config", {}).get("goal")
-        if goal in GOALS and GOALS[goal].size != task.seen.size:
+        more = task.seen.size - GOALS[goal].size if goal in GOALS else 0
+        if more < 0 or (more and goal not in task.seen.begins_as):
             raise ConfigError(
                 f"{path}: sees its goal in {GOALS[goal].size} numbers ({goal}), and task {task.name} shows "
                 f"{task.seen.size} ({task.goal}): begin with a policy that sees as many, or with --demonstrations"
             )
-        network, _ = Mlp.load(path, self._kind, self.env.robot, self.env.observations["actor"].shape[1])
+        inputs = self.env.observations["actor"].shape[1]
+        network, _ = Mlp.load(path, self._kind, self.env.robot, inputs - more)
+        network = network.widened(more)
         hidden = list(network.sizes[1:-1])
         if hidden != list(self.settings.hidden):
             raise checkpoint.CheckpointError(
                 f"{path}: its hidden layers are {hidden}; give --hidden {' '.join(map(str, hidden))}"
             )
+        theirs = checkpoint.read_header(path)["config"].get("reach")
+        if theirs is not None:  # the same targets, where another prior lets an action go elsewhere
+            (weight, bias), share = network.layers[-1], np.ones(self.env.action_size)
+            share[: len(theirs)] = theirs / self.env.reach
+            network.layers[-1] = weight * share.astype(np.float32), bias * share.astype(np.float32)
         self.begin_with(network)
 
     def imitate(self, folder: Path) -> None:
