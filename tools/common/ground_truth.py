@@ -47,8 +47,8 @@ class GroundTruth:
     """An `on_tick` listener: one row for each tick of the task.
 
     In a world of several robots it follows the first; that any of them fell or touched another counts. `fell_ending`:
-    whether it fell after the task, while it came to rest, was lowered or went limp on a seat. Of a run that may `recover` the trace says of
-    a fall whether the robot is down at the end.
+    whether it fell after the task, while it came to rest, was lowered or went limp on a seat. Of a run that may
+    `recover` the trace says of a fall whether the robot is down at the end.
     """
 
     def __init__(
