@@ -16,8 +16,8 @@ tests/stack/test_safety*.py:
    brought home, tilt beyond `tilt`, where it was not asked to recover.
 7. A stop that leaves time for it (Ctrl-C, the stop button, heat, a low supply, a blocked joint, a full disk, the end of
    a task) lets a walking robot come to rest, for REST_SECONDS at most, and lowers it then: lowered in mid step it often
-   falls. With a joint that is blocked it takes no more steps. One that sits is not lowered, nor one that was not brought
-   home, but holds the pose that it was found in: it hangs or lies.
+   falls. With a joint that is blocked it takes no more steps. One that sits is not lowered, nor one that was not
+   brought home, but holds the pose that it was found in: it hangs or lies.
 8. Gains only go down within a run: below what was asked for where servos get hot, the supply low or a joint blocked.
    While a robot that is to recover falls and lies, they are zero, but for its arms as they come in.
 9. A fall is survived only where `recover` was asked for, and only from RUNNING, or READY: it may lie as it begins,
