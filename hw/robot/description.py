@@ -238,6 +238,7 @@ class Robot:
     walking: Walking = Walking()
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, of the base's frame, in that of its body in the MJCF
     passive: tuple[str, ...] = ()  # joints that no servo drives: not commanded, not read
+    overlapping: tuple[tuple[str, str], ...] = ()  # bodies of the MJCF, drawn into each other, that pass through
     held: tuple[
         str, ...
     ] = ()  # joints of the MJCF that do not turn: a servo's horn beside the joint that it is geared to

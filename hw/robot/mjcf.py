@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -144,6 +145,8 @@ def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
         need("joint", joint.name, list(kinds))
         if kinds[joint.name] != mujoco.mjtJoint.mjJNT_HINGE:
             raise ConfigError(f"{path}: joint {joint.name!r} is not a hinge, but a servo turns")
+    for name in (name for pair in robot.overlapping for name in pair):
+        need("body (that overlaps another)", name, [body.name for body in [base, *base.find_all("body")]])
     for name in robot.loads:
         need("body (that carries a load)", name, [body.name for body in [base, *base.find_all("body")]])
     need("site (the IMU's)", robot.imu_site, [site.name for site in base.find_all("site")])
@@ -181,6 +184,11 @@ def _adapted(path: Path) -> str:
     extension = ElementTree.SubElement(root, "mujoco")
     settings = {"fusestatic": "false", "discardvisual": "false", "strippath": "false", "balanceinertia": "true"}
     ElementTree.SubElement(extension, "compiler", settings)
+    shapes = [part for link in root.iter("link") for kind in ("visual", "collision") for part in link.findall(kind)]
+    named = Counter(part.get("name") for part in shapes)
+    for part in shapes:
+        if named[part.get("name")] > 1:  # xacro calls each of them `collision`, of which MuJoCo warns one by one
+            part.attrib.pop("name", None)
     for link in root.iter("link"):
         for kind in ("visual", "collision"):
             for part in link.findall(kind):

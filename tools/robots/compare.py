@@ -18,6 +18,7 @@ from servoid.tools.robots.couplings import couplings
 
 _POSES = 50
 _EXACT = 1e-6  # m
+_TOUCHING = 1e-4  # m that shapes may overlap
 _SAME_GEAR = 1e-3  # of a ratio
 _MIRRORED = 0.005  # m that joints may be beside their mirror images
 _LOPSIDED = 0.015  # m more that a body's centre of mass may be: no robot is quite alike on both sides
@@ -48,6 +49,7 @@ def findings(robot: Robot) -> list[Comparison]:
         ),
         _kinematics(robot, model, data, joints),
         *_gears(robot),
+        _apart(robot, model),
         _mirrors(robot, model, data, joints),
         _ranges(robot),
         _soles(robot),
@@ -88,6 +90,26 @@ def _gears(robot: Robot) -> list[Comparison]:
         if joint.name in ties and abs(joint.gear / ties[joint.name][1] - 1.0) > _SAME_GEAR
     ]
     return [Comparison(not wrong, "gears", "; ".join(wrong) or "as the model ties joints to their servos' horns")]
+
+
+def overlaps(robot: Robot, model: mujoco.MjModel) -> dict[tuple[str, str], float]:
+    """Pairs of the robot's bodies whose shapes overlap at home, as they collide, and by how much [m]."""
+    data, found = mujoco.MjData(model), dict[tuple[str, str], float]()
+    _put(model, data, np.array([int(model.joint(name).qposadr[0]) for name in robot.names]), robot.home)
+    for contact in data.contact:
+        bodies = (int(model.geom_bodyid[geom]) for geom in contact.geom)
+        first, second = sorted(model.body(body).name for body in bodies)
+        if "world" not in (first, second) and contact.dist < -_TOUCHING:
+            found[first, second] = max(found.get((first, second), 0.0), -float(contact.dist))
+    return found
+
+
+def _apart(robot: Robot, model: mujoco.MjModel) -> Comparison:
+    """No limbs push each other away at home."""
+    wrong = [f"{one} and {other} by {1000 * by:.0f} mm" for (one, other), by in overlaps(robot, model).items()]
+    hint = ": they push each other away; move them apart in the model, or name them as `overlapping`"
+    text = f"overlap: {', '.join(wrong)}{hint}" if wrong else "apart from each other"
+    return Comparison(not wrong, "limbs at home", text)
 
 
 def _mirrors(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
@@ -188,7 +210,8 @@ def _stiffness(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints:
     share = np.linalg.eigvalsh(-np.array(curved).reshape(n, n) / (4 * 0.02**2) / np.outer(root, root)).max(initial=0.0)
     times = 1.0 / max(float(share), 1e-3)
     good = times > _STIFF
-    hint = "" if good else ": it sinks and topples; raise the servos' P gain, and their stiffness with it"
+    more = np.ceil(10.0 * _STIFF / times) / 10.0
+    hint = "" if good else f": it sinks and topples; raise the servos' P gain {more:.1f} times, and their stiffness too"
     return Comparison(good, "stiffness at home", f"{times:.1f} times what it takes to stand{hint}")
 
 

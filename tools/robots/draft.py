@@ -74,6 +74,7 @@ class Draft:
     joints: tuple[DraftedJoint, ...]
     passive: tuple[str, ...]
     held: tuple[str, ...]
+    overlapping: tuple[tuple[str, str], ...]  # bodies that are drawn into each other
     origin: tuple[float, float, float]  # m, of the base in its body: the model's own may be on the ground
     posed: bool  # whether the model has a home pose, as a keyframe
     notes: tuple[str, ...]
@@ -98,6 +99,8 @@ class Draft:
         limits = _BUS_HEAD.format(speed=0.95 * servo.no_load_speed / gear, stale=3, hot=servo.max_temperature - 10)
         origin = f"origin: [{', '.join(f'{x:.4f}' for x in self.origin)}]\n" if any(self.origin) else ""
         passive = f"passive: [{', '.join(self.passive)}]\n" if self.passive else ""
+        pairs = "".join(f"  - [{one}, {other}]\n" for one, other in self.overlapping)
+        passive += f"overlapping: # bodies that the model draws into each other\n{pairs}" if pairs else ""
         passive += f"held: [{', '.join(self.held)}]\n" if self.held else ""
         return (
             f"# {self.name}: drafted by `servoid robot import`. TODO marks what its model does not say.\n"
@@ -174,6 +177,7 @@ def draft(path: Path, choices: Choices) -> Draft:
         joints=drafted,
         passive=tuple(_each(model, passive)),
         held=tuple(_each(model, held)),
+        overlapping=(),
         origin=origin,
         posed=bool(model.nkey),
         notes=tuple(notes),
