@@ -55,21 +55,20 @@ def rerooted(spec: mujoco.MjSpec, base: str, path: Path) -> mujoco.MjSpec:
     world.append(chain[-1])
     for part in reversed(free):
         chain[-1].insert(0, part)
-    for keys in root.findall("keyframe"):
-        root.remove(keys)
     result = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
     if before.nkey:
-        result.add_key(name=before.key(0).name, qpos=_pose(before, result.compile()))
+        after = result.compile()
+        for number, key in enumerate(result.keys):
+            key.qpos = _pose(before, number, after)
     return result
 
 
-def _pose(before: mujoco.MjModel, after: mujoco.MjModel) -> Array:
-    """The joints of the first keyframe in their new order `(nq,)`; where the base is, they do not say."""
+def _pose(before: mujoco.MjModel, number: int, after: mujoco.MjModel) -> Array:
+    """The joints of a keyframe in their new order `(nq,)`; where the base is, they do not say."""
     pose: Array = after.qpos0.copy()
-    for number in range(after.njnt):
-        joint = after.joint(number)
+    for joint in (after.joint(i) for i in range(after.njnt)):
         if len(joint.qpos0) == 1:
-            pose[joint.qposadr[0]] = before.key_qpos[0, before.joint(joint.name).qposadr[0]]
+            pose[joint.qposadr[0]] = before.key_qpos[number, before.joint(joint.name).qposadr[0]]
     return pose
 
 
