@@ -160,7 +160,7 @@ def _check_imu(model: mujoco.MjModel, robot: Robot, marks: Marks) -> None:
         raise marks.error(
             "imu_site",
             f"{robot.imu_site!r} is on body {model.body(on).name!r}, which moves against the base {robot.base!r}: "
-            "name that body as the base, or a site on the base",
+            "name that body as the base, from which the robot hangs then, or a site on the base",
         )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from servoid.hw.config import ConfigError
+from servoid.hw.robot.rerooted import rerooted
 
 if TYPE_CHECKING:
     import mujoco
@@ -27,7 +28,7 @@ EXPECTED = "Attaching a spec with an empty prefix|Attach conflict"
 def read_body(robot: Robot) -> mujoco.MjSpec:
     """The file of a robot's body, with all that the robot's file names. Raises ConfigError naming what it lacks."""
     path = Path(robot.mjcf)
-    spec = read_spec(path)
+    spec = read_spec(path, robot.base)
     _hold(spec, robot, path)
     _check(spec, robot, path)
     if any(robot.origin):
@@ -63,8 +64,8 @@ def _move_origin(body: mujoco.MjsBody, origin: tuple[float, float, float]) -> No
         body.ipos = body.ipos - origin
 
 
-def read_spec(path: Path) -> mujoco.MjSpec:
-    """The editable model of an MJCF or a URDF file.
+def read_spec(path: Path, base: str | None = None) -> mujoco.MjSpec:
+    """The editable model of an MJCF or a URDF file, hanging on the body `base` where that is named.
 
     The root of a URDF becomes a body with a free joint, fixed links stay bodies of their own, and meshes are looked for
     beside the file and above it, however they are named. Raises ConfigError.
@@ -83,6 +84,8 @@ def read_spec(path: Path) -> mujoco.MjSpec:
                     body.add_site(name=body.name)  # a URDF has none: the link of an IMU stands for it
             else:
                 spec = mujoco.MjSpec.from_file(str(path))
+            if base is not None:
+                spec = rerooted(spec, base, path)
         except (ValueError, UnicodeDecodeError, ElementTree.ParseError) as error:
             remedy = "; no plugin is needed here: take it out of the file" if "plugin" in str(error) else ""
             raise ConfigError(f"{path}: not a valid MJCF or URDF: {' '.join(str(error).split())}{remedy}") from error

@@ -83,7 +83,7 @@ def _gears(robot: Robot) -> list[Comparison]:
     if not robot.held:
         return []
     path = Path(robot.mjcf)
-    ties = couplings(compiled(read_spec(path), path), path).gears
+    ties = couplings(compiled(read_spec(path, robot.base), path), path).gears
     wrong = [
         f"{joint.name} {joint.gear:g}, by the model {ties[joint.name][1]:g}"
         for joint in robot.joints

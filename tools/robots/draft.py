@@ -116,7 +116,7 @@ class Draft:
 def draft(path: Path, choices: Choices) -> Draft:
     """Raises ConfigError for a model that is no humanoid's, with what is missing."""
     load_servo(choices.servo)
-    spec = read_spec(path)
+    spec = read_spec(path, choices.base)
     for key in spec.keys:
         key.ctrl = []  # of which only the pose is read, whatever motors it was written for
     if spec.meshes:
@@ -207,9 +207,16 @@ def _base(model: mujoco.MjModel, wanted: str | None, path: Path) -> int:
 
 
 def _imu(model: mujoco.MjModel, base: int, notes: list[str]) -> str:
-    sites = [model.site(s) for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == base]
-    named = [site.name for site in sites if "imu" in site.name.lower() or "gyro" in site.name.lower()]
-    chosen = next(iter(named or [site.name for site in sites]), "")
+    sites = [model.site(s) for s in range(model.nsite) if model.body_rootid[model.site_bodyid[s]] == base]
+    named = [site for site in sites if "imu" in site.name.lower() or "gyro" in site.name.lower()]
+    here = [site.name for site in named or sites if model.body_weldid[site.bodyid[0]] == base]
+    chosen = next(iter(here), "")
+    if named and not chosen:
+        body = model.body(int(named[0].bodyid[0])).name
+        raise ConfigError(
+            f"the IMU's site {named[0].name!r} is on body {body!r}, which moves against {model.body(base).name!r}: "
+            f"give --base {body}, and the robot hangs on that one"
+        )
     if not chosen:
         raise ConfigError(
             f'no site on the base {model.body(base).name!r}: add <site name="imu"/> to that body where the IMU sits'
