@@ -36,6 +36,7 @@ MEASURES: dict[str, Callable[[Record], float | None]] = {
     "success": lambda record: record.get("success"),
     "fell_or_broken_off": fell_or_broken_off,
     "on_its_feet": lambda record: not fell_or_broken_off(record),
+    "fell_ending": lambda record: record.get("fell_ending"),
     "ever_fell": lambda record: fell_or_broken_off(record) or bool(record.get("falls")),
     "rose_in_time": rose_in_time,
     "seconds_to_rise": rose,
@@ -83,6 +84,7 @@ class Metric:
 METRICS: dict[str, Metric] = {
     "success": Metric("success", share=True),
     "falls": Metric("fell_or_broken_off", share=True, lower=True),  # a robot that cannot go on has not stayed up
+    "falls_ending": Metric("fell_ending", share=True, lower=True),  # after the task, as it was lowered or went limp
     "ever_fell": Metric("ever_fell", share=True, lower=True),  # and got up again, perhaps
     "on_its_feet": Metric("on_its_feet", share=True),
     "rose_in_time": Metric("rose_in_time", share=True),

@@ -53,12 +53,19 @@ def _at(place: Array, heading: float) -> State:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("task", "chosen"), [("strike", {"plan": "punch-left"}), ("strike", {"plan": "kick-right"}), ("rise", {})]
+    ("task", "chosen"),
+    [
+        ("strike", {"plan": "punch-left"}),
+        ("strike", {"plan": "kick-right"}),
+        ("rise", {}),
+        ("sit", {"sit": "0.22,0.24", "least_bearing": "3.0"}),
+    ],
 )
 def test_the_robot_does_what_it_is_asked_by_the_truth(task: str, chosen: dict[str, str]) -> None:
     judged = judge(RunSettings(task, policy="expert", seed=1, set=chosen))
     assert judged.row["success"], judged.assignment.criteria(judged.trace)
     assert judged.row["metrics"]["acts_share"] == 1.0
+    assert not judged.row["fell_ending"], "a seat is in the way of whoever is lowered before it"
     assert judged.trace.objects is not None
     nothing = replace(judged.trace, objects=np.repeat(judged.trace.objects[:1], len(judged.trace.objects), 0))
     if task == "strike":
@@ -88,6 +95,29 @@ def test_acts_begin_when_those_before_them_are_done_and_are_judged_in_their_orde
         machine.instruct(ticks, second, Percept("task", 0.0))
         ticks += 1
     assert machine.done(second)
+
+
+def test_whoever_has_risen_steps_away_from_the_seat_before_the_story_ends() -> None:
+    """Lowered just before it, its back met the seat, and it tipped over."""
+    _, episode, machine = _story(plan="sit,rise")
+    seen, seat = Percept("scene", 0.0, objects=_poses(episode)), episode.objects[0]
+    ahead = np.array([np.cos(seat.heading), np.sin(seat.heading)])
+
+    def before(edge: float) -> State:
+        return _at(np.array(seat.place) + (seat.size[0] / 2 + edge) * ahead, seat.heading)
+
+    low = np.array([*before(-0.02).displacement[:2], seat.size[2] + 0.05])
+    for tick in range(60):
+        machine.instruct(tick, replace(before(-0.02), displacement=low), seen)
+    for tick in range(60, 90):
+        asked = machine.instruct(tick, before(0.01), seen)
+    assert [text.split(",")[0] for text in machine.take_events()] == ["'sit' is done", "'rise' is done"]
+    assert asked.velocity[0] > 0.03
+    assert not machine.done(before(0.01))
+    assert machine.instruct(90, before(0.18), seen).stand
+    for tick in range(91, 142):
+        assert machine.instruct(tick, before(0.01), seen).stand, "once it rests it stays"
+    assert machine.done(before(0.18))
 
 
 def test_an_act_that_is_not_done_in_time_ends_the_story_and_says_so() -> None:

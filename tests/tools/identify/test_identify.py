@@ -14,7 +14,7 @@ import pytest
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Observation, Sensors
 from servoid.hw.robot.description import Robot, load_robot, load_servo, save_servo
-from servoid.sim.friction import Friction
+from servoid.sim.joints.friction import Friction
 from servoid.sim.rig.in_process import InProcessBackend
 from servoid.sim.rig.rig import Rig
 from servoid.stack.log.flightlog import read_log

@@ -133,10 +133,9 @@ def _refuse_what_needs_a_prior(args: argparse.Namespace) -> None:
 
 def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> Rival | None:
     """What rewards in the prior's place, where that was asked for. Raises ConfigError."""
-    from servoid.policy.priors.adversarial.discriminator import Adversary, Discriminator, load_discriminator
-    from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.policy.priors.adversarial.discriminator import load_discriminator
     from servoid.tools.learn.envs.score_term import Rival
-    from servoid.tools.learn.trainers.prior import read_by_style
+    from servoid.tools.learn.trainers.prior import learning_rival
 
     if args.discriminator is not None:
         if args.adversarial is not None:
@@ -146,10 +145,7 @@ def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> 
         return None
     if args.resume and (args.out / "resume.pt").exists():
         raise ConfigError(f"{args.out}: a discriminator does not go on where it stopped: use --no-resume")
-    recordings = read_by_style(args.adversarial, prior.features.robot)
-    discriminator = Discriminator(prior)
-    data = PriorWindows(recordings, prior.features, prior.config)
-    return Rival(discriminator, Adversary(discriminator, data, settings.seed))
+    return learning_rival(args.adversarial, prior, settings.seed)
 
 
 def environment(
