@@ -9,6 +9,8 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import turned
 
+ARM = 1.25  # of the base's height at home: no hand reaches higher than that
+
 
 @dataclass(frozen=True, kw_only=True)
 class Planning:

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Plan, PlanRequest
 from servoid.hw.robot.description import Robot
@@ -25,7 +26,7 @@ from servoid.policy.diffusion.prefix import target
 from servoid.policy.diffusion.prefix.frames import Anchor, BodyMotion, Frames, turned
 from servoid.policy.diffusion.prefix.model import PlannerModel
 from servoid.policy.diffusion.prefix.planner import PrefixPlanner
-from servoid.policy.diffusion.prefix.planning import Planning, led
+from servoid.policy.diffusion.prefix.planning import ARM, Planning, led
 from servoid.policy.diffusion.rolling import seeded
 from servoid.policy.diffusion.runtime import one_thread
 from servoid.policy.text.captions import MOTIONS, caption
@@ -57,7 +58,7 @@ class PlannerRuntime:
         """The plan of one robot's request, or of many at once, with one call of the network a step for all of them.
 
         `each`: what each of many is asked, where that is not the same. Raises ValueError where states are not finite,
-        and ConfigError for a sentence without an English word.
+        and ConfigError for a sentence without an English word, or a target that cannot be.
         """
         start, lead = time.perf_counter(), request.states.shape[:-2]
         raw = request.states.reshape(-1, *request.states.shape[-2:])
@@ -164,7 +165,12 @@ class PlannerRuntime:
         if asked.stand:
             return []
         if asked.targets is not None:
-            most = self._planning.turn
+            most, top = self._planning.turn, ARM * self._robot.standing_height
+            for name, values in asked.targets.items():
+                if np.shape(values) == (3,) and values[2] > top:
+                    raise ConfigError(
+                        f"no part reaches {values[2]:.2f} m up, where '{name}' shall be; {top:.2f} m at most"
+                    )
             return [
                 (name, np.atleast_1d(np.clip(values, -most, most) if name == target.HEADING else values))
                 for name, values in asked.targets.items()

@@ -12,12 +12,16 @@ from made_planner import write_planner
 from servoid.hw.config import ConfigError
 from servoid.hw.geometry import up_vector
 from servoid.hw.robot.description import load_robot
+from servoid.policy.checkpoint import resolve
 from servoid.policy.motion.library import Library
 from servoid.policy.tracker.network import load_tracker
 from servoid.tools.learn.envs.acts import NEAR, PLANS, WORDS
 from servoid.tools.learn.envs.planned import PlannedTracking
+from servoid.tools.learn.envs.score_term import AdversarialTerm
+from servoid.tools.learn.prior_settings import ScoreSettings
 from servoid.tools.learn.settings import TrackerTraining
-from servoid.tools.learn.trainers.tracker import TrackerTrainer
+from servoid.tools.learn.trainers.prior import learning_rival
+from servoid.tools.learn.trainers.tracker import TrackerTrainer, environment
 
 ROBOT = load_robot()
 CLIPS = [Library(ROBOT)[name] for name in ("wave", "sit-down")]
@@ -100,6 +104,30 @@ def test_what_is_trained_so_is_a_tracker_of_any_reference(planner: str, tmp_path
     assert {"upright/reach", "upright/sit-rise", "walking"} <= row.keys()
     trainer.ship(tmp_path / "tracker.safetensors", {})
     assert load_tracker(tmp_path / "tracker.safetensors", ROBOT)[1], "it knows clips"
+
+
+@pytest.mark.slow
+def test_half_of_the_reward_is_a_discriminators_that_learns_where_it_is_asked_for(
+    planner: str, synthetic_dataset: Path, tmp_path: Path
+) -> None:
+    from servoid.policy.priors.score_matching.model import Style, load_prior
+    from servoid.sim.kinematics import limbs_of
+
+    plain, styled = _environment(planner, n=4), _environment(planner, n=4)
+    prior = load_prior(resolve("prior"), ROBOT, limbs_of(ROBOT))
+    rival = learning_rival(synthetic_dataset, prior, 0)
+    styled.style = AdversarialTerm(prior, Style(), 4, ScoreSettings(), 0, rival)
+    still = np.zeros((4, 20))
+    for _ in range(3):
+        followed, both = plain.step(still)[0], styled.step(still)[0]
+    liked = 2.0 * both - followed
+    assert (liked >= -1e-9).all(), "the same motion, and half of what it is rewarded by"
+    assert (liked > 0.0).any()
+    before = [weight.clone() for weight in rival.discriminator.parameters()]
+    styled.learn()
+    assert any((a != b).any() for a, b in zip(before, rival.discriminator.parameters(), strict=True))
+    with pytest.raises(ConfigError, match="--adversarial needs --planner"):
+        environment(ROBOT, None, TrackerTraining(), [], synthetic_dataset)
 
 
 @pytest.mark.parametrize(

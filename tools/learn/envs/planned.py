@@ -25,6 +25,7 @@ from servoid.stack.control.closed_loop import ClosedLoopSettings, closed_loop_po
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.tracker import Walker
 from servoid.tools.learn.envs.acts import EVERY, SCENE, Acts
+from servoid.tools.learn.envs.score_term import AdversarialTerm
 from servoid.tools.learn.envs.tracking import Tracking
 
 _LEARNED = 0.03  # of a share of episodes, from one of them
@@ -43,7 +44,7 @@ class Plans:
         self._policy = closed_loop_policy(robot, alone, shape=(n,), each=lambda: self._asked)
         self._walker = Walker(robot, settings.walker, (n,)) if settings.walker else None
         self.on_clip, self.phase, self.closing = np.ones(n, bool), np.zeros(n), np.zeros(n, bool)
-        self._tick = 0
+        self.tick = 0
         self._upright = dict.fromkeys(acts.names, 0.5)  # share of episodes without a fall
         self._walking = 0.0  # share of worlds
         self._state: State
@@ -72,7 +73,7 @@ class Plans:
 
     def look(self, state: State, applied: Array) -> None:
         self._state = state
-        if self._tick % EVERY == 0:
+        if self.tick % EVERY == 0:
             self._acts.look(state, self._fleet.truth)
         if self._policy.plans.due:
             self._asked = self._acts.told
@@ -102,13 +103,32 @@ class Plans:
 
     def go_on(self, ticks: Array, applied: Array, rngs: Sequence[np.random.Generator]) -> None:
         self._policy.advance()
-        self._tick += 1
+        self.tick += 1
 
 
 class PlannedTracking(Tracking):
     """`n` worlds in a closed loop with the planner that the settings name; see `Tracking`."""
 
     motions: Plans
+    style: AdversarialTerm | None = None  # half of the reward, where there is one (AMP)
+    _liked: Array | float = 0.0  # by it, at its last frame
+
+    def learn(self) -> None:
+        if self.style is not None:
+            self.style.learn()
+
+    def _reset(self, where: Array) -> None:
+        super()._reset(where)
+        if self.style is not None:
+            self.style.reset(where)
+
+    def _judge(self, frames: ReferenceFrames, failed: Array) -> Array:
+        reward = super()._judge(frames, failed)
+        if self.style is None:
+            return reward
+        if self.motions.tick % self.style.stride == 0:
+            self._liked = self.style(self.fleet.state)
+        return 0.5 * reward + 0.5 * self._liked
 
     def _fleet(self, odometry: Mlp | None, seed: int) -> Fleet:
         s = self.settings

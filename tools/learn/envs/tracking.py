@@ -97,6 +97,9 @@ class Tracking:
         self.push_scale = min(1.0, 0.25 + 0.75 * progress / 0.2)
         self.motions.schedule(progress)
 
+    def learn(self) -> None:
+        """Once an update of the tracker: what learns along with it. Here nothing does."""
+
     def _reset(self, where: Array) -> None:
         fleet = self.fleet
         fleet.draw(where)

@@ -133,10 +133,9 @@ def _refuse_what_needs_a_prior(args: argparse.Namespace) -> None:
 
 def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> Rival | None:
     """What rewards in the prior's place, where that was asked for. Raises ConfigError."""
-    from servoid.policy.priors.adversarial.discriminator import Adversary, Discriminator, load_discriminator
-    from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.policy.priors.adversarial.discriminator import load_discriminator
     from servoid.tools.learn.envs.score_term import Rival
-    from servoid.tools.learn.trainers.prior import read_by_style
+    from servoid.tools.learn.trainers.prior import learning_rival
 
     if args.discriminator is not None:
         if args.adversarial is not None:
@@ -146,10 +145,7 @@ def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> 
         return None
     if args.resume and (args.out / "resume.pt").exists():
         raise ConfigError(f"{args.out}: a discriminator does not go on where it stopped: use --no-resume")
-    recordings = read_by_style(args.adversarial, prior.features.robot)
-    discriminator = Discriminator(prior)
-    data = PriorWindows(recordings, prior.features, prior.config)
-    return Rival(discriminator, Adversary(discriminator, data, settings.seed))
+    return learning_rival(args.adversarial, prior, settings.seed)
 
 
 def environment(
@@ -259,7 +255,7 @@ class PolicyTrainer(PpoTrainer):
     def adopt(self, path: Path) -> None:
         """Begin as the policy in `path`: where that sees less of its goal, as if it did not see the rest.
 
-        Raises ConfigError where it sees more, CheckpointError for other hidden layers.
+        Raises ConfigError where it sees more or decides at another rate, CheckpointError for other hidden layers.
         """
         task, goal = self.env.task, checkpoint.read_header(path).get("config", {}).get("goal")
         more = task.seen.size - GOALS[goal].size if goal in GOALS else 0
@@ -276,7 +272,13 @@ class PolicyTrainer(PpoTrainer):
             raise checkpoint.CheckpointError(
                 f"{path}: its hidden layers are {hidden}; give --hidden {' '.join(map(str, hidden))}"
             )
-        theirs = checkpoint.read_header(path)["config"].get("reach")
+        config = checkpoint.read_header(path)["config"]
+        if config.get("stride", self.env.stride) != self.env.stride:
+            raise ConfigError(
+                f"{path}: decides every {config['stride']} ticks, and here it is every {self.env.stride}: begin with "
+                "one that learned at the rate of this prior"
+            )
+        theirs = config.get("reach")
         if theirs is not None:  # the same targets, where another prior lets an action go elsewhere
             (weight, bias), share = network.layers[-1], np.ones(self.env.action_size)
             share[: len(theirs)] = theirs / self.env.reach

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from servoid.policy.priors.score_matching.model import Prior
     from servoid.policy.priors.score_matching.windows import PriorWindows
     from servoid.policy.recording import Recording
+    from servoid.tools.learn.envs.score_term import Rival
 
 _WARMUP = 200  # steps
 _TELLING = 1e-3  # learning rate of the classifier of styles
@@ -64,7 +65,7 @@ def main(args: argparse.Namespace) -> int:
     features = PriorFeatures(robot, limbs_of(robot))
     shape = {f.name: getattr(settings, f.name) for f in fields(PriorShape)}
     config = PriorConfig(features.layout.size, **shape, styles=tuple(style for style in recordings if style))
-    windows = PriorWindows(recordings, features, config, settings.standing)
+    windows = PriorWindows(recordings, features, config, settings.standing, settings.seconds)
     sources = [source_of(args.data / style, recording) for style, recording in recordings.items()]
     trainer = PriorTrainer(windows, features, settings, args.out, "; ".join(sources))
     trainer.manner = manner_by_speed(list(recordings.values()), robot)
@@ -84,6 +85,18 @@ def read_by_style(folder: Path, robot: Robot) -> dict[str, Recording]:
     if (folder / "meta").is_dir() or not styles:
         return {"": read_recording(folder, robot)}
     return {style: read_recording(folder / style, robot) for style in styles}
+
+
+def learning_rival(folder: Path, prior: Prior, seed: int) -> Rival:
+    """A discriminator of the datasets in `folder` from what a policy does, for windows like those of `prior`. Raises
+    DatasetError."""
+    from servoid.policy.priors.adversarial.discriminator import Adversary, Discriminator
+    from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.tools.learn.envs.score_term import Rival
+
+    discriminator = Discriminator(prior)
+    data = PriorWindows(read_by_style(folder, prior.features.robot), prior.features, prior.config)
+    return Rival(discriminator, Adversary(discriminator, data, seed))
 
 
 class PriorTrainer(Trainer):

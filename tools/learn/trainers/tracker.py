@@ -39,6 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CHECKPOINT",
         help="start from this tracker (tracker: the shipped one), halfway through the schedules",
     )
+    run.add_argument(
+        "--adversarial",
+        type=Path,
+        metavar="DIR",
+        help="with --planner: half of the reward is a discriminator's, which learns from this dataset (AMP)",
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -54,19 +60,36 @@ def main(args: argparse.Namespace) -> int:
     odometry = None if settings.plain_odometry else load_odometry(robot)
     torch.manual_seed(settings.seed)
     clips = chosen_clips(robot, settings.clips)
-    env = _environment(settings)(robot, settings.worlds, odometry, settings, settings.seed, clips)
+    env = environment(robot, odometry, settings, clips, args.adversarial)
     trainer = TrackerTrainer(env, settings, args.out)
     trainer.start(args.resume, None if args.init is None else checkpoint.resolve(args.init, robot))
     trainer.run()
     return 0
 
 
-def _environment(settings: TrackerTraining) -> type[Tracking]:
+def environment(
+    robot: Robot, odometry: Mlp | None, settings: TrackerTraining, clips: Sequence[Clip], data: Path | None
+) -> Tracking:
+    """The worlds to learn in; `data` is what a discriminator learns from. Raises ConfigError, DatasetError."""
+    given = robot, settings.worlds, odometry, settings, settings.seed, clips
     if not settings.planner:
-        return Tracking
+        if data is not None:
+            raise ConfigError("--adversarial needs --planner: elsewhere a tracker is rewarded for following alone")
+        return Tracking(*given)
     from servoid.tools.learn.envs.planned import PlannedTracking
 
-    return PlannedTracking
+    env = PlannedTracking(*given)
+    if data is not None:
+        from servoid.policy.priors.score_matching.model import Style, load_prior
+        from servoid.sim.kinematics import limbs_of
+        from servoid.tools.learn.envs.score_term import AdversarialTerm
+        from servoid.tools.learn.prior_settings import ScoreSettings
+        from servoid.tools.learn.trainers.prior import learning_rival
+
+        prior = load_prior(checkpoint.resolve("prior", robot), robot, limbs_of(robot))  # whose windows are judged
+        rival = learning_rival(data, prior, settings.seed)
+        env.style = AdversarialTerm(prior, Style(), settings.worlds, ScoreSettings(), settings.seed, rival)
+    return env
 
 
 class TrackerTrainer(PpoTrainer):
@@ -85,6 +108,11 @@ class TrackerTrainer(PpoTrainer):
     def _clips(self) -> bool:
         """Whether it tracks clips, too, and not the gait alone."""
         return self.env.observation.clips
+
+    def learn(self) -> dict[str, float]:
+        row = super().learn()
+        self.env.learn()
+        return row
 
     @property
     def title(self) -> str:
