@@ -363,8 +363,7 @@ class OdometryWalks:
     walk_seconds: Annotated[float, "seconds of each of these walks"] = 30.0
 
     def __post_init__(self) -> None:
-        kinds = (len(self.policy) + 1) * (1 if self.floor == 1.0 else 2)
-        if self.worlds < kinds:
+        if self.worlds < (kinds := (len(self.policy) + 1) * (1 if self.floor == 1.0 else 2)):
             raise ValueError(f"worlds must be at least the {kinds} kinds of walks, not {self.worlds}")
         if min(self.seconds, self.floor, self.walks, self.walk_seconds) <= 0:
             raise ValueError("seconds, floor, walks and walk_seconds must be positive")
