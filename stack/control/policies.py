@@ -114,6 +114,7 @@ def _loop_settings(source: str) -> ClosedLoopSettings:
 # Policies of Servoid's own; besides there are the planner's other settings in configs/policies/.
 POLICIES: dict[str, Maker] = {
     "diffusion": _diffusion,
+    "dodgeball": _task_policy,
     "expert": _expert,
     "fast": _expert,
     "gait": _gait,

@@ -358,13 +358,13 @@ class OdometryWalks:
     policy: Annotated[tuple[str, ...], "policies or checkpoints that walk, besides the gait"] = ("expert", "diffusion")
     worlds: Annotated[int, "simulated robots that walk, over all policies"] = 192
     seconds: Annotated[float, "seconds that each of them walks"] = 60.0
-    floor: Annotated[float, "friction of the floor that they walk on, as a share of the robot's floor_friction"] = 1.0
+    floor: Annotated[float, "friction of the floor that half of them walk on, as a share of the robot's own"] = 1.0
     walks: Annotated[int, "walks of each policy on which the drift is measured"] = 64
     walk_seconds: Annotated[float, "seconds of each of these walks"] = 30.0
 
     def __post_init__(self) -> None:
-        if self.worlds <= len(self.policy):
-            raise ValueError(f"worlds must be more than the {len(self.policy)} policies, not {self.worlds}")
+        if self.worlds < (kinds := (len(self.policy) + 1) * (1 if self.floor == 1.0 else 2)):
+            raise ValueError(f"worlds must be at least the {kinds} kinds of walks, not {self.worlds}")
         if min(self.seconds, self.floor, self.walks, self.walk_seconds) <= 0:
             raise ValueError("seconds, floor, walks and walk_seconds must be positive")
 

@@ -19,6 +19,7 @@ _LENGTH, _SPEED = 0.275, 0.524  # m and m/s here for one of a human
 _SEEN = 0.01  # m, deviation of the error with which a ball is first seen
 _TWICE = 0.1  # s for which it is seen before anything is known of its velocity
 _MARGIN = 0.1  # m from a hit at which it is guided no further
+_BRISK, _SHARPNESS = 0.85, 4.0  # exp(-sharpness (brisk - velocity aside)^2), in shares of the top speed
 _CLEAR = 0.5  # of what training rewards: being out of the way of what comes
 
 
@@ -61,11 +62,15 @@ class Dodgeball(LearnedTask):
         return (0.9 * far + 0.1 * still) * ~self.ended(asked, state)
 
     def guided(self, asked: Array, state: TaskState) -> Array:
-        """The reward, and how far from the way of the ball it is: the reward tells only once the ball is there."""
+        """The reward, and how briskly it leaves the way of the ball: the reward tells only once the ball is there."""
         toward, way = asked[:, :2] - state.position, asked[:, 2:4]
+        way = way / np.linalg.norm(way, axis=-1, keepdims=True)
         comes = np.sum(toward * way, -1) < 0.0
-        miss = np.abs(toward[:, 0] * way[:, 1] - toward[:, 1] * way[:, 0]) / np.linalg.norm(way, axis=-1)
-        clear = np.where(comes, np.minimum(miss / (_WIDTH + _RADIUS + _MARGIN), 1.0), 1.0)
+        side = toward[:, 0] * way[:, 1] - toward[:, 1] * way[:, 0]  # m that the ball passes on its left
+        aside = state.velocity[:, 1] * way[:, 0] - state.velocity[:, 0] * way[:, 1]  # m/s away from there
+        leaving = np.where(side > 0.0, aside, -aside) / self.robot.walking.forward
+        brisk = np.exp(-_SHARPNESS * np.maximum(_BRISK - leaving, 0.0) ** 2)
+        clear = np.where(comes & (np.abs(side) < _WIDTH + _RADIUS + _MARGIN), brisk, 1.0)
         return (1.0 - _CLEAR) * self.reward(asked, state) + _CLEAR * clear * ~self.ended(asked, state)
 
     def _distance(self, asked: Array, state: TaskState) -> Array:

@@ -24,6 +24,7 @@ from servoid.policy.priors.score_matching.judged import manner_of
 from servoid.policy.priors.score_matching.model import Prior, Style, load_prior
 from servoid.policy.priors.score_matching.score import RunningMean, Score, likeness
 from servoid.policy.priors.score_matching.styles import StyleClassifier
+from servoid.policy.priors.score_matching.windows import PriorWindows
 from servoid.policy.recording import DatasetError
 from servoid.sim.kinematics import limbs_of
 from servoid.tools.learn.trainers.prior import read_by_style
@@ -213,6 +214,18 @@ def test_data_without_motion_is_refused(tmp_path: Path) -> None:
         trainer(tmp_path / "single", tmp_path / "out")
 
 
+def test_less_of_the_data_is_learned_from_and_as_much_measured_on(synthetic_dataset: Path, tmp_path: Path) -> None:
+    recordings, made = read_by_style(synthetic_dataset, ROBOT), trainer(synthetic_dataset, tmp_path)
+    whole, span = made.windows, (made.config.frames - 1) * made.config.stride
+    few = PriorWindows(recordings, made.features, made.config, seconds=3.0)
+    ticks = 3 * ROBOT.rate
+    assert ticks - 3 * span <= len(few.training) < ticks - span  # in pieces of two episodes
+    assert set(few.training.tolist()) < set(whole.training.tolist())
+    assert torch.equal(few.validation, whole.validation)
+    with pytest.raises(DatasetError, match=r"seconds 0\.1: shorter than"):
+        PriorWindows(recordings, made.features, made.config, seconds=0.1)
+
+
 def test_folders_of_datasets_are_styles(tmp_path: Path, synthetic_dataset: Path) -> None:
     write_dataset(tmp_path / "data" / "wide", ROBOT, episodes=2, ticks=30)
     assert list(read_by_style(tmp_path / "data", ROBOT)) == ["wide"]
@@ -229,3 +242,13 @@ def test_the_shipped_prior_knows_motion_of_this_robot() -> None:
     assert score(still).mean() > 2.0 * score(drawn).mean()
     speeds, cadences = found.manner["speed"], found.manner["cadence"]
     assert len(speeds) == len(cadences) >= 3
+
+
+def test_the_shipped_styles_are_told_and_compose() -> None:
+    """Windows drawn with the arms of one style on the legs of another show both."""
+    found = load_prior(checkpoint.resolve("styles", ROBOT), ROBOT, limbs_of(ROBOT))
+    assert found.header["results"]["style"] > 0.95
+    both = Style.parse("zombie+wide")
+    shown = found.shown(generate(found, 32, both, 0), both)
+    assert min(shown["upper_style"], shown["lower_style"]) > 0.9
+    assert found.shown(generate(found, 32, Style.parse("zombie"), 0), both)["lower_style"] < 0.5

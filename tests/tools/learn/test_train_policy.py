@@ -205,6 +205,11 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
     comes = np.array([[1.0, -0.1, 0.05, -0.4, 0.0], [1.0, 0.1, 0.05, -0.4, 0.0]])  # past it on its right, and its left
     seen = GOALS["ball"].observe(Instruction(np.zeros((2, 3)), obstacles=comes[:, None]), walking)
     assert np.allclose(seen[:, :4], [[0.0, 1.0, 0.0, 1.0], [0.0, -1.0, 0.0, -1.0]])  # aside, away from it
+    across = np.array(
+        [[0.02, 1.0, 0.05, 0.0, -0.4], [0.2, 1.0, 0.05, 0.0, -0.4]]
+    )  # from its left, and well ahead of it
+    seen = GOALS["ball"].observe(Instruction(np.zeros((2, 3)), obstacles=across[:, None]), walking)
+    assert np.allclose(seen[:, 2:4], [[1.0, 0.0], [-1.0, 0.0]])  # straight on, though the other side is nearer, or back
     passed, beside = comes * [-1, 1, 1, 1, 1], comes + np.array([0.0, 0.5, 0.0, 0.0, 0.0])
     for ball in (passed[0], beside[1], comes[0] * [1, 1, 1, 0, 0]):
         seen = GOALS["ball"].observe(Instruction(np.zeros(3), obstacles=ball[None]), walking)
@@ -217,9 +222,18 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
 
 def test_training_rewards_who_is_out_of_a_balls_way_before_it_is_there() -> None:
     ball = LEARNED_TASKS["dodgeball"](ROBOT)
-    thrown = np.array([[1.0, 0.0, -0.4, 0.0, 1.0, 0.0, 0.0]])
-    inside, clear = (ball.guided(thrown, task_state(position=np.array([[0.0, y]])))[0] for y in (0.05, 0.4))
-    assert inside < clear - 0.3
+    thrown = np.array([[1.0, 0.0, -0.4, 0.0, 1.0, 0.0, 0.0]])  # along the x axis, at the origin
+
+    def guided(y: float, velocity: float) -> float:
+        known = task_state(position=np.array([[0.0, y]]), velocity=np.array([[0.0, velocity]]))
+        return float(ball.guided(thrown, known)[0])
+
+    for side in (1.0, -1.0):
+        into, stands, leaves, clear = (
+            guided(*(side * np.array(at))) for at in ((0.1, -0.2), (0.1, 0.0), (0.1, 0.3), (0.4, 0.0))
+        )
+        assert into < stands < leaves < clear
+        assert leaves > stands + 0.2
     assert ball.guided(ball.advance(thrown, 2.2), task_state(position=np.zeros((1, 2))))[0] == 0.0
 
 
@@ -233,8 +247,13 @@ def test_a_policy_that_sees_less_begins_another(prior: Path, tmp_path: Path) -> 
     trainer.start(resume=False, init=shipped)
     seen = trainer.env.observations["actor"]
     known, _ = Mlp.load(shipped, "task_policy", ROBOT, seen.shape[1] - 4)
-    same = known(seen[:, :-4]) * read_header(shipped)["config"]["reach"] / trainer.env.reach  # the same targets
-    assert np.allclose(trainer.actor()(seen), same, atol=1e-5)
+    theirs, ours = np.array(read_header(shipped)["config"]["reach"]), trainer.env.reach
+    assert np.allclose(ours * trainer.actor()(seen), theirs * known(seen[:, :-4]), atol=1e-5)  # the same targets
+    head, tensors = checkpoint.read(shipped)
+    slow = tmp_path / "slow.safetensors"
+    checkpoint.write(slow, tensors, {**head, "config": {**head["config"], "stride": 4}})
+    with pytest.raises(ConfigError, match="decides every 4 ticks, and here it is every 2"):
+        trainer.adopt(slow)
 
 
 def test_a_task_without_a_reward_is_refused(tmp_path: Path) -> None:

@@ -17,9 +17,8 @@ if TYPE_CHECKING:
     from servoid.hw.contracts.body import Array
     from servoid.stack.tasks.learned import LearnedTask
 
-TASKS = ("speed", "steering", "location")
+TASKS = ("speed", "steering", "location", "dodgeball")
 _QUICK = 1e6  # m/s2 and rad/s2 of what gains speed at once
-_NEAR = 0.3  # m from a place within which it slows down
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
     gait = gait_of(robot)
     gains, step = (gait.acceleration[0], gait.acceleration[2]), gait.cycle / 2.0
     kinds = {"speeds": Ideal(), "speeds, gains": Ideal(gains), "speeds, gains, a step late": Ideal(gains, step)}
-    seconds = {"location": 20.0}
+    seconds = {"location": 20.0, "dodgeball": 20.0}
     with reporting(args.json) as report:
         found = {
             name: [
@@ -72,7 +71,7 @@ def ideal_return(task: LearnedTask, ideal: Ideal, n: int, seconds: float, seed: 
     cycle = round(gait_of(task.robot).cycle / dt)
     place, yaw, velocity, turning = np.zeros((n, 2)), np.zeros(n), np.zeros((n, 2)), np.zeros(n)
     asked, heard, since, due = (np.zeros((n, task.size)), np.zeros((n, task.size)), np.zeros(n), np.zeros(n))
-    listens, places, earned = np.zeros(n, bool), np.zeros((cycle + 1, n, 2)), []
+    listens, over, places, earned = np.zeros(n, bool), np.zeros(n, bool), np.zeros((cycle + 1, n, 2)), []
     for tick in range(round(seconds / dt)):
         for i in np.flatnonzero(tick * dt >= due):
             asked[i] = task.draw(rng, place[i])
@@ -89,29 +88,29 @@ def ideal_return(task: LearnedTask, ideal: Ideal, n: int, seconds: float, seed: 
         yaw = yaw + turning * dt
         body = turned(wanted, -yaw)
         ahead = np.where(body[:, 0] > 0.0, walking.forward, walking.backward)
-        over = np.maximum(np.hypot(body[:, 0] / ahead, body[:, 1] / walking.sideways), 1.0)  # an ellipse, as is asked
-        change = wanted / over[:, None] - velocity
+        faster = np.maximum(np.hypot(body[:, 0] / ahead, body[:, 1] / walking.sideways), 1.0)  # than an ellipse has it
+        change = wanted / faster[:, None] - velocity
         size = np.maximum(np.linalg.norm(change, axis=-1, keepdims=True), 1e-9)
         velocity = velocity + change * np.minimum(1.0, gain * dt / size)
         place = place + velocity * dt
         places = np.concatenate([place[None], places[:-1]])
         mean, height, nothing = (places[0] - places[-1]) / (cycle * dt), np.zeros(n), np.zeros((n, 3))
         state = TaskState(place, yaw, mean, height, nothing, nothing, nothing, nothing)
-        earned.append(task.reward(asked, state))
+        asked, heard = task.advance(asked, dt), task.advance(heard, dt)
+        over |= task.ended(asked, state)
+        earned.append(task.reward(asked, state) * ~over)
     return float(np.mean(earned))
 
 
 def _wanted(task: LearnedTask, asked: Array, place: Array, yaw: Array) -> tuple[Array, Array]:
-    """The velocity over the ground `(n, 2)` m/s, and by how much to turn `(n,)` rad."""
+    """The velocity over the ground `(n, 2)` m/s, and by how much to turn `(n,)` rad, as a policy is told."""
     import numpy as np
 
-    if task.name == "location":
-        way = asked - place
-        distance = np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
-        speed = task.robot.walking.forward * np.minimum(distance / _NEAR, 1.0)
-        wanted, facing = way / distance * speed, np.arctan2(way[:, 1], way[:, 0])
-    elif task.name == "steering":
-        wanted, facing = asked[:, :2], np.arctan2(asked[:, 3], asked[:, 2])
-    else:
-        wanted, facing = np.concatenate([asked, np.zeros_like(asked)], -1), np.zeros(len(yaw))
-    return wanted, (facing - yaw + np.pi) % (2.0 * np.pi) - np.pi
+    from servoid.hw.contracts.control import State
+    from servoid.hw.geometry import turned
+
+    n, nothing = len(yaw), np.zeros((len(yaw), 3))
+    known = State(0, nothing, nothing, yaw, nothing, nothing, np.c_[place, np.zeros(n)], nothing, nothing, nothing)
+    seen = task.seen.observe(task.instruct(asked, known), task.robot.walking)
+    off = -yaw if seen.shape[1] < 4 else np.arctan2(seen[:, 3], seen[:, 2])
+    return turned(seen[:, :2], yaw) * task.robot.walking.forward, (off + np.pi) % (2.0 * np.pi) - np.pi

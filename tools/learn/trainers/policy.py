@@ -255,7 +255,7 @@ class PolicyTrainer(PpoTrainer):
     def adopt(self, path: Path) -> None:
         """Begin as the policy in `path`: where that sees less of its goal, as if it did not see the rest.
 
-        Raises ConfigError where it sees more, CheckpointError for other hidden layers.
+        Raises ConfigError where it sees more or decides at another rate, CheckpointError for other hidden layers.
         """
         task, goal = self.env.task, checkpoint.read_header(path).get("config", {}).get("goal")
         more = task.seen.size - GOALS[goal].size if goal in GOALS else 0
@@ -272,7 +272,13 @@ class PolicyTrainer(PpoTrainer):
             raise checkpoint.CheckpointError(
                 f"{path}: its hidden layers are {hidden}; give --hidden {' '.join(map(str, hidden))}"
             )
-        theirs = checkpoint.read_header(path)["config"].get("reach")
+        config = checkpoint.read_header(path)["config"]
+        if config.get("stride", self.env.stride) != self.env.stride:
+            raise ConfigError(
+                f"{path}: decides every {config['stride']} ticks, and here it is every {self.env.stride}: begin with "
+                "one that learned at the rate of this prior"
+            )
+        theirs = config.get("reach")
         if theirs is not None:  # the same targets, where another prior lets an action go elsewhere
             (weight, bias), share = network.layers[-1], np.ones(self.env.action_size)
             share[: len(theirs)] = theirs / self.env.reach

@@ -65,7 +65,7 @@ def main(args: argparse.Namespace) -> int:
     features = PriorFeatures(robot, limbs_of(robot))
     shape = {f.name: getattr(settings, f.name) for f in fields(PriorShape)}
     config = PriorConfig(features.layout.size, **shape, styles=tuple(style for style in recordings if style))
-    windows = PriorWindows(recordings, features, config, settings.standing)
+    windows = PriorWindows(recordings, features, config, settings.standing, settings.seconds)
     sources = [source_of(args.data / style, recording) for style, recording in recordings.items()]
     trainer = PriorTrainer(windows, features, settings, args.out, "; ".join(sources))
     trainer.manner = manner_by_speed(list(recordings.values()), robot)
