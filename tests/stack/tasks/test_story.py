@@ -86,6 +86,9 @@ def test_acts_begin_when_those_before_them_are_done_and_are_judged_in_their_orde
     for state in (first, second):
         for _ in range(round(0.5 / ROBOT.dt) + 2):
             instruction = machine.instruct(ticks, state, Percept("task", 0.0))
+            assert instruction.stand or instruction.velocity.any(), (
+                "what walks to places is asked for none, or to stand"
+            )
             ticks += 1
     told = [text.split(",")[0] for text in machine.take_events()]
     assert told == ["'reach' is done", "'reach' is done"]

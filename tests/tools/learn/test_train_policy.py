@@ -31,6 +31,7 @@ from servoid.policy.priors.score_matching.model import Style, load_prior
 from servoid.policy.priors.score_matching.windows import PriorWindows
 from servoid.policy.priors.task_policy import TaskPolicy
 from servoid.policy.recording import DatasetError, read_recording
+from servoid.policy.references.style import load_style
 from servoid.sim.kinematics import limbs_of
 from servoid.stack.tasks.learned import LEARNED_TASKS, TaskState, load_learned_task
 from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
@@ -254,6 +255,33 @@ def test_a_policy_that_sees_less_begins_another(prior: Path, tmp_path: Path) -> 
     checkpoint.write(slow, tensors, {**head, "config": {**head["config"], "stride": 4}})
     with pytest.raises(ConfigError, match="decides every 4 ticks, and here it is every 2"):
         trainer.adopt(slow)
+
+
+@pytest.mark.slow
+def test_a_policy_begins_in_the_pose_of_a_style(tmp_path: Path) -> None:
+    """What walked with hanging arms decides the same where they are stretched out, and holds them there."""
+    shipped, styles = checkpoint.resolve("speed"), checkpoint.resolve("styles")
+    known = load_prior(styles, ROBOT, limbs_of(ROBOT))
+    settings, task, style = (
+        replace(SETTINGS, hidden=(256, 128)),
+        load_learned_task("speed", ROBOT),
+        Style.parse("zombie"),
+    )
+    trainer = PolicyTrainer(environment(task, known, style, settings, 6, 0), style, settings, tmp_path, styles)
+    trainer.start(resume=False, init=shipped)
+    before, _ = Mlp.load(shipped, "task_policy", ROBOT, trainer.env.observations["actor"].shape[1])
+    reach, shoulder = np.array(read_header(shipped)["config"]["reach"]), ROBOT.names.index("l_sho_pitch")
+    state, moved = trainer.env.fleet.state, trainer.actor()
+    hanging = np.tile(ROBOT.home, (6, 1))
+    offset = load_style("zombie", ROBOT).held(ROBOT)[1] - ROBOT.home
+    seen = [
+        TaskObservation(ROBOT, task.seen, (6,))(replace(state, position=at), at, np.zeros((6, 2)))
+        for at in (hanging, hanging + offset)
+    ]
+    decided, then = reach * before(seen[0]), trainer.env.reach * moved(seen[1])
+    legs = ROBOT.leg_index.ravel()
+    assert np.abs(then - decided)[:, legs].max() < 0.1
+    assert np.allclose(then[:, shoulder] - decided[:, shoulder], -1.5, atol=0.2)  # from 0.3 rad at home to -1.2
 
 
 def test_a_task_without_a_reward_is_refused(tmp_path: Path) -> None:

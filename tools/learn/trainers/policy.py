@@ -23,8 +23,6 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.policy import checkpoint
-from servoid.policy.mlp import Mlp
-from servoid.policy.priors.goals import GOALS
 from servoid.policy.priors.task_policy import KIND, save_task_policy
 from servoid.policy.rising.policy import KIND as RISING
 from servoid.policy.rising.policy import save_rising_policy
@@ -191,6 +189,7 @@ class PolicyTrainer(PpoTrainer):
 
         digest = None if prior is None else sha256(prior)
         self._prior = None if prior is None else {"name": prior.name, "sha256": digest}
+        self.style = style
         self._style = {"upper": style.upper, "lower": style.lower, "weight": style.weight}
         style_text = f" in style {style.upper}+{style.lower} x {style.weight:g}" if style.lower else ""
         self._under = "without a prior" if prior is None else f"under prior {prior.name}"
@@ -253,37 +252,10 @@ class PolicyTrainer(PpoTrainer):
         return f"servoid rollout {self.env.task.run} --policy {self.best_path} --episodes 50"
 
     def adopt(self, path: Path) -> None:
-        """Begin as the policy in `path`: where that sees less of its goal, as if it did not see the rest.
+        """Begin as the policy in `path`: see `adopted`. Raises ConfigError, or CheckpointError."""
+        from servoid.tools.learn.trainers.adopted import adopted
 
-        Raises ConfigError where it sees more or decides at another rate, CheckpointError for other hidden layers.
-        """
-        task, goal = self.env.task, checkpoint.read_header(path).get("config", {}).get("goal")
-        more = task.seen.size - GOALS[goal].size if goal in GOALS else 0
-        if more < 0 or (more and goal not in task.seen.begins_as):
-            raise ConfigError(
-                f"{path}: sees its goal in {GOALS[goal].size} numbers ({goal}), and task {task.name} shows "
-                f"{task.seen.size} ({task.goal}): begin with a policy that sees as many, or with --demonstrations"
-            )
-        inputs = self.env.observations["actor"].shape[1]
-        network, _ = Mlp.load(path, self._kind, self.env.robot, inputs - more)
-        network = network.widened(more)
-        hidden = list(network.sizes[1:-1])
-        if hidden != list(self.settings.hidden):
-            raise checkpoint.CheckpointError(
-                f"{path}: its hidden layers are {hidden}; give --hidden {' '.join(map(str, hidden))}"
-            )
-        config = checkpoint.read_header(path)["config"]
-        if config.get("stride", self.env.stride) != self.env.stride:
-            raise ConfigError(
-                f"{path}: decides every {config['stride']} ticks, and here it is every {self.env.stride}: begin with "
-                "one that learned at the rate of this prior"
-            )
-        theirs = config.get("reach")
-        if theirs is not None:  # the same targets, where another prior lets an action go elsewhere
-            (weight, bias), share = network.layers[-1], np.ones(self.env.action_size)
-            share[: len(theirs)] = theirs / self.env.reach
-            network.layers[-1] = weight * share.astype(np.float32), bias * share.astype(np.float32)
-        self.begin_with(network)
+        self.begin_with(adopted(path, self._kind, self.env, self.style, self.settings.hidden))
 
     def imitate(self, folder: Path) -> None:
         """Begin with a network that does what the dataset in `folder` shows, and keep it. Raises DatasetError."""
