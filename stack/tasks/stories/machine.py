@@ -184,7 +184,7 @@ class Machine(BaseBehaviour):
                 return walk
             self._acting = self._tick
         if self._performs:
-            return Instruction(np.zeros(3), skill=act.skill)
+            return Instruction(np.zeros(3), skill=act.skill, stand=act.skill is None)
         return self._told(act, state, thing)
 
     def _too_late(self, act: Act) -> bool:
