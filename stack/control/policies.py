@@ -121,6 +121,7 @@ POLICIES: dict[str, Maker] = {
     "location": _task_policy,
     "speed": _task_policy,
     "steering": _task_policy,
+    "zombie": _task_policy,
 }
 _KINDS: dict[str, Maker] = {  # of .safetensors files
     "diffusion": _diffusion,

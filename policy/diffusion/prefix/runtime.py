@@ -26,7 +26,7 @@ from servoid.policy.diffusion.prefix import target
 from servoid.policy.diffusion.prefix.frames import Anchor, BodyMotion, Frames, turned
 from servoid.policy.diffusion.prefix.model import PlannerModel
 from servoid.policy.diffusion.prefix.planner import PrefixPlanner
-from servoid.policy.diffusion.prefix.planning import ARM, Planning, led
+from servoid.policy.diffusion.prefix.planning import HIGHEST, Planning, led
 from servoid.policy.diffusion.rolling import seeded
 from servoid.policy.diffusion.runtime import one_thread
 from servoid.policy.text.captions import MOTIONS, caption
@@ -165,7 +165,7 @@ class PlannerRuntime:
         if asked.stand:
             return []
         if asked.targets is not None:
-            most, top = self._planning.turn, ARM * self._robot.standing_height
+            most, top = self._planning.turn, HIGHEST * self._robot.standing_height
             for name, values in asked.targets.items():
                 if np.shape(values) == (3,) and values[2] > top:
                     raise ConfigError(

@@ -12,7 +12,6 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Criterion, Trace
 from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.description import Robot, shipped_robot
-from servoid.policy.diffusion.prefix.planning import ARM
 from servoid.stack.skills.skill import Skill, load_skills
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, drawn_pushes
 from servoid.stack.tasks.stories.act import Act, drawn, load_acts
@@ -21,6 +20,7 @@ from servoid.stack.tasks.stories.layout import laid_out
 from servoid.stack.tasks.stories.machine import Machine
 from servoid.stack.tasks.stories.told import StoryEpisode, StorySettings
 
+ARM = 1.25  # of the base's height at home: a hand reaches no higher by its skill
 HIP = 0.85  # of the base's height at home: a seat above that is higher than the hip
 
 

@@ -105,7 +105,7 @@ def test_velocity_goal_and_targets_change_a_plan_and_a_far_goal_is_asked_for_in_
         plan(Instruction(np.zeros(3), targets={"tail": np.zeros(3)}))
     with pytest.raises(ConfigError, match="not finite: was it seen"):
         plan(Instruction(np.zeros(3), targets={"left hand": np.full(3, np.nan)}))
-    with pytest.raises(ConfigError, match=r"no part reaches 0\.90 m up, where .left hand. shall be; 0\.32 m at most"):
+    with pytest.raises(ConfigError, match=r"no part reaches 0\.90 m up, where .left hand. shall be; 0\.57 m at most"):
         plan(Instruction(np.zeros(3), targets={"left hand": np.array([0.1, 0.0, 0.9])}))
     with pytest.raises(ConfigError, match="no English word"):
         plan(Instruction(np.zeros(3), text="???"))

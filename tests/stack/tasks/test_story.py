@@ -15,6 +15,7 @@ from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import load_robot
+from servoid.policy.diffusion.prefix.planning import HIGHEST
 from servoid.stack.runtime.run import RunSettings
 from servoid.stack.tasks import load_task
 from servoid.stack.tasks.stories.condition import Moment, moments
@@ -170,6 +171,7 @@ def test_words_ask_for_the_same_acts_by_a_sentence_and_by_where_parts_shall_be()
     assert near.text == "punch with the left hand"
     assert near.targets is not None
     np.testing.assert_allclose(near.targets["left hand"], [0.13, 0.03, 0.33], atol=0.02)
+    assert near.targets["left hand"][2] < HIGHEST * ROBOT.standing_height, "else nothing would be planned"
 
 
 def test_near_the_seat_it_is_asked_to_turn_and_then_to_step_and_not_to_walk_there_anew() -> None:
