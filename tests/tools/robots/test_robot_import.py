@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -207,20 +206,6 @@ def test_shipped_robots_go_by_odometry_of_their_own(name: str) -> None:
     network, warning = odometry_of(load_robot(name))
     assert network is not None
     assert warning is None
-
-
-FOREIGN = [Path(path) for path in os.environ.get("SERVOID_FOREIGN_MODELS", "").split(os.pathsep) if path]
-
-
-@pytest.mark.skipif(not FOREIGN, reason="SERVOID_FOREIGN_MODELS names no models")
-@pytest.mark.parametrize("model", FOREIGN, ids=lambda path: path.stem)
-def test_strangers_models_are_imported_and_their_kinematics_are_mujocos(
-    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, said = imported(capsys, str(model), "--out", str(tmp_path / "own.yaml"))
-    assert code == 0, said
-    (kinematics,) = [one for one in findings(load_robot(tmp_path / "own.yaml")) if one.what == "kinematics"]
-    assert kinematics.good, kinematics.found
 
 
 @pytest.mark.slow
