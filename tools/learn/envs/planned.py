@@ -45,6 +45,7 @@ class Plans:
         self._walker = Walker(robot, settings.walker, (n,)) if settings.walker else None
         self.on_clip, self.phase, self.closing = np.ones(n, bool), np.zeros(n), np.zeros(n, bool)
         self.tick = 0
+        self._begun, self._failed = np.zeros(n, bool), np.zeros(n, bool)
         self._upright = dict.fromkeys(acts.names, 0.5)  # share of episodes without a fall
         self._walking = 0.0  # share of worlds
         self._state: State
@@ -63,6 +64,10 @@ class Plans:
         """Tasks are as hard as they are."""
 
     def begin(self, where: Array, rngs: Sequence[np.random.Generator]) -> Start:
+        for i in np.flatnonzero(where & self._begun).tolist():
+            name = self._acts.name(i)
+            self._upright[name] += _LEARNED * (float(not self._failed[i]) - self._upright[name])
+        self._begun = self._begun | where
         return self._acts.begin(where, rngs)
 
     def enter(self, where: Array, rngs: Sequence[np.random.Generator]) -> None:
@@ -91,12 +96,9 @@ class Plans:
     def failed(self, truth: SimulatedTruth, frames: ReferenceFrames) -> Array:
         """Those that tip over, or touch the ground with anything but their feet: a plan goes on from what was done, so
         that a robot that falls is as its plan says."""
-        failed: Array = (truth.tilt > FALL_TILT) | truth.grounded
-        self.closing = self._acts.over & ~failed
-        for i in np.flatnonzero(failed | self.closing).tolist():
-            name = self._acts.name(i)
-            self._upright[name] += _LEARNED * (float(not failed[i]) - self._upright[name])
-        return failed
+        self._failed = (truth.tilt > FALL_TILT) | truth.grounded
+        self.closing = self._acts.over & ~self._failed
+        return self._failed
 
     def learn(self, measured: Array, asked: Array, failed: Array) -> None:
         """Nothing grows with what is followed."""
