@@ -33,6 +33,13 @@ class Mlp:
                 y = np.where(y > 0, y, np.expm1(np.minimum(y, 0)))
         return y.astype(float)
 
+    def widened(self, inputs: int) -> Mlp:
+        """The same network with so many more inputs at the end, which change nothing yet."""
+        (first, bias), *others = self.layers
+        weight = np.concatenate([first, np.zeros((inputs, first.shape[1]), np.float32)])
+        mean = np.concatenate([self.mean, np.zeros(inputs, np.float32)])
+        return Mlp([(weight, bias), *others], mean, np.concatenate([self.std, np.ones(inputs, np.float32)]))
+
     def to_tensors(self) -> dict[str, Array]:
         """Its arrays by name, float32, as a checkpoint stores them."""
         tensors = {"mean": self.mean, "std": self.std}

@@ -76,6 +76,9 @@ def _add_body(model: mujoco.MjSpec, robot: Robot, number: int) -> None:
     for text in warned:
         if not re.match(EXPECTED, text):
             warnings.warn(f"{path}: {text}", stacklevel=2)
+    for pair in robot.overlapping:
+        first, second = (prefix(number) + name for name in pair)
+        model.add_exclude(name=f"{prefix(number)}{ADDED}{'_'.join(pair)}", bodyname1=first, bodyname2=second)
     for name, load in robot.loads.items():
         carried = model.body(prefix(number) + name).add_body(name=f"{prefix(number)}{ADDED}{name}_load", pos=load.at)
         carried.mass, carried.ipos, carried.inertia = load.mass, [0, 0, 0], [1e-6, 1e-6, 1e-6]

@@ -18,8 +18,9 @@ from servoid.hw.contracts.world import Start
 from servoid.hw.geometry import headed
 from servoid.hw.robot.description import Imu, Robot
 from servoid.hw.robot.legs import Legs
-from servoid.sim.friction import Friction
 from servoid.sim.ground import Ground
+from servoid.sim.joints.friction import Friction
+from servoid.sim.joints.loops import Loops
 from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.multi_robot import Crowd
 from servoid.sim.objects import ObjectsOf
@@ -59,7 +60,7 @@ class Worlds:
             whole = round(1 / TIMESTEP)
             raise ConfigError(f"{robot.name}: rate: {robot.rate} does not divide the physics' {whole} steps a second")
         self.batch: Batch | Crowd = Crowd(self.model, n) if together else Batch(self.model, n, threads)
-        self._legs, self._ground = Legs(robot), Ground(self.model)
+        self._legs, self._ground, self._loops = Legs(robot), Ground(self.model), Loops(self.model, robot)
         self._bodies, self._objects = robot_bodies(self.model), ObjectsOf(self.model, OBJECTS)
         joints = [self.model.joint(name) for name in robot.names]
         self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
@@ -133,6 +134,9 @@ class Worlds:
         objects = np.broadcast_to(self._objects.begin, (len(ids), *self._objects.begin.shape))
         self.put(ids, objects if start.objects is None else start.objects)
         self._state_qpos[ids[:, None], self._qpos] = pose - self._zero[ids]
+        if self._loops.any:
+            for i in ids:
+                self._loops.close(self._state_qpos[i])
         self._put(ids, pose - self._zero[ids], start)
         self._state_qvel[ids] = 0.0
         for dofs, velocity in (

@@ -111,6 +111,7 @@ VERBS: dict[str, Verb] = {
             "sim": Verb("compare the training world with raw MuJoCo", "servoid.tools.bench.sim"),
             "policy": Verb("time the diffusion policy's plans", "servoid.tools.bench.policy"),
             "guidance": Verb("compare ways to guide a planner", "servoid.tools.bench.planning.guidance"),
+            "ideal": Verb("bound the returns of learned tasks by the robot's limits", "servoid.tools.learn.envs.ideal"),
             "loop": Verb("measure how late the control loop is", "servoid.tools.bench.loop"),
             "kill": Verb("kill the controller and check the servo state after", "servoid.tools.faults.kill"),
             "interrupt": Verb(

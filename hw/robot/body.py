@@ -107,7 +107,11 @@ def _chain(model: mujoco.MjModel, robot: Robot, side: str, marks: Marks) -> _Cha
         if int(model.joint(name).type[0]) != mujoco.mjtJoint.mjJNT_HINGE:
             raise marks.error(key, f"{name!r}, on the way from the base to it, is not a hinge, but a servo turns")
         if name not in robot.names:
-            raise marks.error(key, f"{name!r}, on the way from the base to it, has no servo: its angle is not known")
+            raise marks.error(
+                key,
+                f"{name!r}, on the way from the base to it, has no servo: its angle is not known. Where a servo "
+                "turns it by gears, list it with its `gear`, and the servo's own joint under `held`",
+            )
     if not chain.joints:
         raise marks.error(key, f"no joint leads from the base {robot.base!r} to this foot")
     return chain
@@ -156,7 +160,7 @@ def _check_imu(model: mujoco.MjModel, robot: Robot, marks: Marks) -> None:
         raise marks.error(
             "imu_site",
             f"{robot.imu_site!r} is on body {model.body(on).name!r}, which moves against the base {robot.base!r}: "
-            "name that body as the base, or a site on the base",
+            "name that body as the base, from which the robot hangs then, or a site on the base",
         )
 
 

@@ -238,6 +238,10 @@ class Robot:
     walking: Walking = Walking()
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, of the base's frame, in that of its body in the MJCF
     passive: tuple[str, ...] = ()  # joints that no servo drives: not commanded, not read
+    overlapping: tuple[tuple[str, str], ...] = ()  # bodies of the MJCF, drawn into each other, that pass through
+    held: tuple[
+        str, ...
+    ] = ()  # joints of the MJCF that do not turn: a servo's horn beside the joint that it is geared to
     weight: float | None = None  # N; None: the file does not say it
     floor_friction: float = 0.8  # of what it walks on, in simulation
     loads: dict[str, Payload] = field(default_factory=dict)  # what the MJCF lacks, by the body that carries it

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from servoid.hw.config import ConfigError
+from servoid.hw.robot.rerooted import rerooted
 
 if TYPE_CHECKING:
     import mujoco
@@ -26,11 +28,31 @@ EXPECTED = "Attaching a spec with an empty prefix|Attach conflict"
 def read_body(robot: Robot) -> mujoco.MjSpec:
     """The file of a robot's body, with all that the robot's file names. Raises ConfigError naming what it lacks."""
     path = Path(robot.mjcf)
-    spec = read_spec(path)
+    spec = read_spec(path, robot.base)
+    _hold(spec, robot, path)
     _check(spec, robot, path)
     if any(robot.origin):
         _move_origin(spec.body(robot.base), robot.origin)
     return spec
+
+
+def _hold(spec: mujoco.MjSpec, robot: Robot, path: Path) -> None:
+    """Take away the joints that the robot holds, and the constraints that name them."""
+    import mujoco
+
+    held = set(robot.held)
+    for name in robot.held:
+        _need(robot, path, "joint", name, [joint.name for joint in spec.joints])
+    for constraint in list(spec.equalities):
+        if constraint.type == mujoco.mjtEq.mjEQ_JOINT and held & {constraint.name1, constraint.name2}:
+            spec.delete(constraint)
+    for tendon in list(spec.tendons):
+        if held & {wrap.target.name for wrap in tendon.path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT}:
+            spec.delete(tendon)
+    for element in [*spec.actuators, *spec.sensors, *spec.keys] if held else []:
+        spec.delete(element)
+    for name in robot.held:
+        spec.delete(spec.joint(name))
 
 
 def _move_origin(body: mujoco.MjsBody, origin: tuple[float, float, float]) -> None:
@@ -42,8 +64,8 @@ def _move_origin(body: mujoco.MjsBody, origin: tuple[float, float, float]) -> No
         body.ipos = body.ipos - origin
 
 
-def read_spec(path: Path) -> mujoco.MjSpec:
-    """The editable model of an MJCF or a URDF file.
+def read_spec(path: Path, base: str | None = None) -> mujoco.MjSpec:
+    """The editable model of an MJCF or a URDF file, hanging on the body `base` where that is named.
 
     The root of a URDF becomes a body with a free joint, fixed links stay bodies of their own, and meshes are looked for
     beside the file and above it, however they are named. Raises ConfigError.
@@ -62,8 +84,11 @@ def read_spec(path: Path) -> mujoco.MjSpec:
                     body.add_site(name=body.name)  # a URDF has none: the link of an IMU stands for it
             else:
                 spec = mujoco.MjSpec.from_file(str(path))
+            if base is not None:
+                spec = rerooted(spec, base, path)
         except (ValueError, UnicodeDecodeError, ElementTree.ParseError) as error:
-            raise ConfigError(f"{path}: not a valid MJCF or URDF: {' '.join(str(error).split())}") from error
+            remedy = "; no plugin is needed here: take it out of the file" if "plugin" in str(error) else ""
+            raise ConfigError(f"{path}: not a valid MJCF or URDF: {' '.join(str(error).split())}{remedy}") from error
     for text in warned:
         warnings.warn(f"{path}: {text}", stacklevel=2)
     for count, body in enumerate(spec.bodies):
@@ -104,10 +129,7 @@ def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
     import mujoco
 
     def need(kind: str, wanted: str, present: list[str]) -> None:
-        if wanted not in present:
-            near = get_close_matches(wanted, present, 1)
-            hint = f"; nearest: {near[0]}" if near else ""
-            raise ConfigError(f"{path}: no {kind} named {wanted!r}, which robot {robot.name!r} needs{hint}")
+        _need(robot, path, kind, wanted, present)
 
     need("body", robot.base, [body.name for body in model.bodies])
     base = model.body(robot.base)
@@ -126,6 +148,8 @@ def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
         need("joint", joint.name, list(kinds))
         if kinds[joint.name] != mujoco.mjtJoint.mjJNT_HINGE:
             raise ConfigError(f"{path}: joint {joint.name!r} is not a hinge, but a servo turns")
+    for name in (name for pair in robot.overlapping for name in pair):
+        need("body (that overlaps another)", name, [body.name for body in [base, *base.find_all("body")]])
     for name in robot.loads:
         need("body (that carries a load)", name, [body.name for body in [base, *base.find_all("body")]])
     need("site (the IMU's)", robot.imu_site, [site.name for site in base.find_all("site")])
@@ -144,6 +168,13 @@ def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
         raise ConfigError(f"{path}: joints that robot {robot.name!r} does not list: {', '.join(extra)}")
 
 
+def _need(robot: Robot, path: Path, kind: str, wanted: str, present: list[str]) -> None:
+    if wanted not in present:
+        near = get_close_matches(wanted, present, 1)
+        hint = f"; nearest: {near[0]}" if near else ""
+        raise ConfigError(f"{path}: no {kind} named {wanted!r}, which robot {robot.name!r} needs{hint}")
+
+
 def _is_urdf(path: Path) -> bool:
     return path.suffix.lower() == ".urdf" or re.search(rb"<robot[\s>]", path.read_bytes()[:10_000]) is not None
 
@@ -156,6 +187,11 @@ def _adapted(path: Path) -> str:
     extension = ElementTree.SubElement(root, "mujoco")
     settings = {"fusestatic": "false", "discardvisual": "false", "strippath": "false", "balanceinertia": "true"}
     ElementTree.SubElement(extension, "compiler", settings)
+    shapes = [part for link in root.iter("link") for kind in ("visual", "collision") for part in link.findall(kind)]
+    named = Counter(part.get("name") for part in shapes)
+    for part in shapes:
+        if named[part.get("name")] > 1:  # xacro calls each of them `collision`, of which MuJoCo warns one by one
+            part.attrib.pop("name", None)
     for link in root.iter("link"):
         for kind in ("visual", "collision"):
             for part in link.findall(kind):

@@ -14,7 +14,10 @@ from servoid.hw.robot.description import Walking
 from servoid.hw.robot.mirror import Mirror
 
 AHEAD = 1.0  # s of turning that an instruction which gives a yaw rate asks to face
-FARTHEST = 1.0  # m: nothing to keep clear of is nearer, where there is nothing
+FARTHEST = 1.0  # m: no ball is nearer, where there is none
+BESIDE = 1.8  # of the height of the base: as far from the way of a ball, none hits
+FACED = 0.4  # of the height of the base, by which a side may be farther that is faced
+STOPPED = 0.05  # m/s of a ball that goes nowhere, or was not seen for long enough to know
 SLOWING = 0.3  # m from a place within which the velocity that leads to it is less than the top speed
 TURNING = (0.05, 0.2)  # m from a place: nearer than the first it is not faced, from the second on wholly
 
@@ -28,6 +31,7 @@ class SeenGoal:
     mirror: Mirror
     observe: Callable[[Instruction, Walking], Array]
     velocity: bool = False  # whether it is the velocity that is asked: none of it is to stand
+    begins_as: tuple[str, ...] = ()  # goals that its first numbers are like: what sees them can learn to see this
     odometry: bool = True  # whether velocity and height by leg odometry are seen, too: they mean nothing while it lies
 
 
@@ -66,16 +70,29 @@ def _location(instruction: Instruction, walking: Walking) -> Array:
 
 
 def _ball(instruction: Instruction, walking: Walking) -> Array:
-    """Where the nearest thing to keep clear of is [m], and where it goes in shares of the top speed, in the heading
-    frame `(..., 4)`: nothing near, where it is to stand. Raises ConfigError where the task has none."""
+    """The nearest place beside the way of a ball, as `_location` sees one, so that what walks to places can learn to
+    get out of the way; then where the ball is [m], and where it goes in shares of the top speed, in the heading frame
+    `(..., 8)`. Nothing comes near where it is to stand. Raises ConfigError where the task has no ball."""
+    shape = np.shape(instruction.velocity)[:-1]
     if instruction.stand:
-        return np.broadcast_to([FARTHEST, 0.0, 0.0, 0.0], (*np.shape(instruction.velocity)[:-1], 4))
+        return np.broadcast_to([0.0, 0.0, 1.0, 0.0, FARTHEST, 0.0, 0.0, 0.0], (*shape, 8))
     if instruction.obstacles is None or not np.size(instruction.obstacles):
-        raise ConfigError("this policy gets out of a ball's way, and the task has none: run obstacle")
+        raise ConfigError("this policy gets out of a ball's way, and the task has none: run dodgeball")
     things = np.asarray(instruction.obstacles, float)
     distance = np.linalg.norm(things[..., :2], axis=-1)
     nearest = np.take_along_axis(things, np.argmin(distance, -1)[..., None, None], -2)[..., 0, :]
-    return np.concatenate([nearest[..., :2], nearest[..., 3:5] / walking.forward], -1)
+    place, way = nearest[..., :2], nearest[..., 3:5]
+    squared = np.sum(way**2, -1, keepdims=True)
+    seconds = -np.sum(place * way, -1, keepdims=True) / np.maximum(squared, 1e-9)  # until it is nearest
+    passes = place + way * seconds  # there
+    aside = np.stack([-way[..., 1], way[..., 0]], -1) / np.sqrt(np.maximum(squared, 1e-9))
+    # To the side that is nearer, in which a robot is already, or is faced: it walks ahead far faster than to a side.
+    nearer = aside[..., :1] - np.sum(aside * passes, -1, keepdims=True) / (FACED * walking.height)
+    aside = np.where(nearer < 0.0, -aside, aside)
+    left = np.maximum(BESIDE * walking.height + np.sum(aside * passes, -1, keepdims=True), 0.0)  # m to go
+    comes = (squared > STOPPED**2) & (seconds > 0.0)
+    beside = _location(Instruction(instruction.velocity, goal=np.where(comes, left * aside, 0.0)), walking)
+    return np.concatenate([beside, place, way / walking.forward], -1)
 
 
 def nothing(instruction: Instruction, walking: Walking) -> Array:
@@ -89,7 +106,7 @@ GOALS: Mapping[str, SeenGoal] = {
         SeenGoal("velocity", 2, Mirror.PLANAR, _velocity, velocity=True),
         SeenGoal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering, velocity=True),
         SeenGoal("location", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _location),
-        SeenGoal("ball", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _ball),
+        SeenGoal("ball", 8, Mirror.join(*[Mirror.PLANAR] * 4), _ball, begins_as=("location", "steering")),
         SeenGoal("stand", 0, Mirror(np.zeros(0, int), np.zeros(0, np.float32)), nothing, odometry=False),
     )
 }

@@ -31,6 +31,14 @@ class TaskObservation:
         )  # fmt: skip
         self.size = len(self.mirror.index)
 
+    @property
+    def joint_inputs(self) -> Array:
+        """Where the joints are in an observation, now and in the past `(1 + past, n_joints)` int."""
+        n = len(self._home)
+        first = 6 + (3 if self._odometry else 0)
+        past = first + 3 * n + np.arange(_PAST) * (n + 3)
+        return np.r_[first, past][:, None] + np.arange(n)
+
     def reset(self, where: Array | None = None) -> None:
         """Forget the history in the worlds `where` (default: all)."""
         self._fresh = np.ones_like(self._fresh) if where is None else self._fresh | where

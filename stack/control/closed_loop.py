@@ -7,7 +7,7 @@ can be repeated from its log. Until the first plan the robot holds its pose.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from servoid.policy.diffusion.prefix.runtime import PlannerRuntime
 
 _NOW = np.array([0])
+Each = Callable[[], Sequence[Instruction]]  # what each of many worlds is asked by the plan that is due
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +57,8 @@ class ClosedLoopPolicy(BasePolicy):
     ) -> None:  # fmt: skip
         """`stride` are the ticks of a frame, `history` those of states that the planner is given."""
         self.plans = PlanBuffer(planner, pace, shape)
-        self._reference, self._tracker = PlanReference(robot, shape), tracker
+        self.reference = PlanReference(robot, shape)  # what is followed
+        self._tracker = tracker
         self._layout, self._robot, self._shape, self._stride = row_layout(robot), robot, shape, stride
         self._history = History(history, JOINT_TARGETS, shape)
         self._told: tuple[str | None, bool] = (None, False)  # with the last request
@@ -90,6 +92,17 @@ class ClosedLoopPolicy(BasePolicy):
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         """Joint targets `(..., n_joints)` rad for this tick. Raises PlannerError when the planner cannot plan any
         more. A sentence or a target that it cannot plan for is an event, and the last plan goes on."""
+        reference = self.follow(state, applied, instruction)
+        if self._tracker is None:
+            target = reference.frames(_NOW).position[..., 0, :]
+        else:
+            target = self._tracker(state, applied, reference)
+        self.advance()
+        return target
+
+    def follow(self, state: State, applied: Array, instruction: Instruction) -> PlanReference:
+        """Plan where that is due, and go over to a plan that is there: the `reference` at this tick, for whoever tracks
+        it, and calls `advance` then."""
         plans, applied = self.plans, np.array(applied, dtype=float)
         self._see(state, applied)
         plans.adopt()
@@ -101,16 +114,15 @@ class ClosedLoopPolicy(BasePolicy):
             plans.ask(self._history, [], instruction)
         if plans.adopted is not None:
             plan = plans.adopted.plan
-            self._reference.follow(np.asarray(plan.actions, dtype=float)[..., plans.tick - plan.tick :, :])
+            self.reference.follow(np.asarray(plan.actions, dtype=float)[..., plans.tick - plan.tick :, :])
         elif plans.latest is not None and not plans.left:
             plans.end("its last pose is held")
-        if self._tracker is None:
-            target = self._reference.frames(_NOW).position[..., 0, :]
-        else:
-            target = self._tracker(state, applied, self._reference)
-        self._reference.advance()
-        plans.tick += 1
-        return target
+        return self.reference
+
+    def advance(self) -> None:
+        """Go on by a tick."""
+        self.reference.advance()
+        self.plans.tick += 1
 
     def _see(self, state: State, applied: Array) -> None:
         """Take in the state; a world that begins holds its pose until a plan comes that was asked for since."""
@@ -119,9 +131,9 @@ class ClosedLoopPolicy(BasePolicy):
             return
         fresh, self._fresh = self._fresh, np.zeros_like(self._fresh)
         if fresh.all():
-            self._reference.stand(applied)
+            self.reference.stand(applied)
             return
-        self._reference.stand(applied, fresh)
+        self.reference.stand(applied, fresh)
         if self.plans.latest is not None:
             held = np.zeros((*self._shape, self.plans.latest.states.shape[-1]))
             self.plans.hold(fresh, held, self._pose(applied))
@@ -141,9 +153,15 @@ def load_settings(name: str = "closd") -> ClosedLoopSettings:
 
 
 def closed_loop_policy(
-    robot: Robot, settings: ClosedLoopSettings | None = None, *, process: bool = False, shape: tuple[int, ...] = ()
+    robot: Robot,
+    settings: ClosedLoopSettings | None = None,
+    *,
+    process: bool = False,
+    shape: tuple[int, ...] = (),
+    each: Each | None = None,
 ) -> ClosedLoopPolicy:
-    """The policy for `robot`, by default as configs/policies/closd.yaml says; `shape`: of many worlds.
+    """The policy for `robot`, by default as configs/policies/closd.yaml says; `shape`: of many worlds, and `each`: what
+    each of them is asked, where that is not the same.
 
     With `process` a planner runs beside the loop. Raises ConfigError, also where checkpoint, settings and robot do not
     fit, and where the tracker knows the gait alone.
@@ -158,7 +176,7 @@ def closed_loop_policy(
         raise ConfigError(f"closed loop: {'; '.join(wrong)}")
     tracker = Followers(robot, settings.tracker, settings.walker, shape) if settings.tracker else None
     build = partial(_build, robot, str(path), settings)
-    planner: Planner = ProcessPlanner(build) if process else InlinePlanner(build())
+    planner: Planner = ProcessPlanner(build) if process else InlinePlanner(build(each))
     pace = Pace(1, settings.frames * frames.stride, settings.delay, wait=not process)
     history = history_ticks(config.prefix, frames.stride)
     return ClosedLoopPolicy(robot, planner, pace, frames.stride, history, tracker, shape)
@@ -174,20 +192,20 @@ def _checkpoint(name: str, robot: Robot) -> Path:
         ) from None
 
 
-def _build(robot: Robot, path: str, settings: ClosedLoopSettings) -> Answer:
+def _build(robot: Robot, path: str, settings: ClosedLoopSettings, each: Each | None = None) -> Answer:
     from servoid.policy.diffusion.prefix.model import load
     from servoid.policy.diffusion.prefix.runtime import PlannerRuntime
 
     frames = Frames(robot)
     runtime = PlannerRuntime(load(Path(path), robot, frames), robot, frames, settings)
     runtime.warm_up()
-    return partial(_plan, runtime)
+    return partial(_plan, runtime, each)
 
 
-def _plan(runtime: PlannerRuntime, request: PlanRequest) -> Plan:
+def _plan(runtime: PlannerRuntime, each: Each | None, request: PlanRequest) -> Plan:
     """The plan of a request, or why there is none: the last one then goes on, and the robot holds its last pose."""
     try:
-        return runtime.plan(request)
+        return runtime.plan(request, None if each is None else each())
     except ConfigError as error:  # what was asked cannot be understood
         nothing = np.full((1, 1), np.nan)
         return Plan(request.tick, nothing, nothing, nothing, 0.0, str(error))

@@ -32,7 +32,7 @@ class Fleet:
     def __init__(
         self,
         robot: Robot,
-        n: int,
+        n: int | Worlds,
         odometry: Mlp | None,
         *,
         randomise: float = 0.0,
@@ -40,16 +40,17 @@ class Fleet:
         tag: int | None = None,
         threads: int = 0,
     ) -> None:
-        self.robot, self.n = robot, n
+        """`n` may be worlds that are there, with a scene say, which say themselves how they are randomised."""
+        self.worlds = n if isinstance(n, Worlds) else Worlds(robot, n, threads=threads, randomise=randomise)
+        self.robot, self.n = robot, (count := self.worlds.n)
         self._stream = [seed] if tag is None else [seed, tag]
-        self.worlds = Worlds(robot, n, threads=threads, randomise=randomise)
-        self.estimator = Estimator(robot, odometry, (n,))
-        self.applied = np.tile(robot.home, (n, 1))
-        self.rngs = [np.random.default_rng(0)] * n
-        self._episodes = np.zeros(n, int)  # begun
-        self._drawn = np.zeros(n, bool)  # worlds whose next episode has its stream already
+        self.estimator = Estimator(robot, odometry, (count,))
+        self.applied = np.tile(robot.home, (count, 1))
+        self.rngs = [np.random.default_rng(0)] * count
+        self._episodes = np.zeros(count, int)  # begun
+        self._drawn = np.zeros(count, bool)  # worlds whose next episode has its stream already
         self._seed = seed
-        self._ones = np.ones((n, len(robot.joints)))
+        self._ones = np.ones((count, len(robot.joints)))
         self.state: State
 
     @property

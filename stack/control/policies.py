@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import yaml
 
@@ -18,14 +18,15 @@ from servoid.hw.contracts.control import Policy
 from servoid.hw.contracts.task import Task
 from servoid.hw.plugins import Plugin, Portable, installed, load_plugin
 from servoid.hw.robot.description import Robot, shipped_robot
+from servoid.policy.diffusion.settings import DiffusionSettings
 from servoid.stack.control.base import BasePolicy
 
 if TYPE_CHECKING:
-    from servoid.policy.diffusion.settings import DiffusionSettings
     from servoid.policy.references.gait import GaitSettings
     from servoid.stack.control.closed_loop import ClosedLoopSettings
     from servoid.stack.control.diffusion import DiffusionPolicy
 
+PlannerSettings: TypeAlias = "DiffusionSettings | ClosedLoopSettings"  # of a policy that plans
 Maker = Callable[[str, Robot, Task, bool, tuple[int, ...]], Policy]
 GROUP = "servoid.policies"  # of entry points
 
@@ -92,9 +93,13 @@ def _task_policy(source: str, robot: Robot, task: Task, realtime: bool, shape: t
 
 
 def _closed_loop(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
+    return _looped(_loop_settings(source), robot, realtime, shape)
+
+
+def _looped(settings: ClosedLoopSettings, robot: Robot, realtime: bool, shape: tuple[int, ...]) -> Policy:
     from servoid.stack.control.closed_loop import closed_loop_policy
 
-    policy: Policy = closed_loop_policy(robot, _loop_settings(source), process=realtime, shape=shape)
+    policy: Policy = closed_loop_policy(robot, settings, process=realtime, shape=shape)
     return policy
 
 
@@ -109,12 +114,14 @@ def _loop_settings(source: str) -> ClosedLoopSettings:
 # Policies of Servoid's own; besides there are the planner's other settings in configs/policies/.
 POLICIES: dict[str, Maker] = {
     "diffusion": _diffusion,
+    "dodgeball": _task_policy,
     "expert": _expert,
     "fast": _expert,
     "gait": _gait,
     "location": _task_policy,
     "speed": _task_policy,
     "steering": _task_policy,
+    "zombie": _task_policy,
 }
 _KINDS: dict[str, Maker] = {  # of .safetensors files
     "diffusion": _diffusion,
@@ -161,21 +168,23 @@ def make_policy(
     task: Task,
     realtime: bool,
     shape: tuple[int, ...] = (),
-    planner: DiffusionSettings | None = None,
+    planner: PlannerSettings | None = None,
 ) -> Policy:
     """A policy for a robot and a task, or for worlds of any leading `shape`.
 
     Raises ConfigError for an unknown name, or for a checkpoint that does not fit. `name` is one of `names`, the
     .safetensors file of a diffusion model, a tracker, a clip, a planner or a task policy, a .yaml file of settings of
     one that plans, or `FILE.py:Class`. With `realtime` a planner runs beside the loop; without, it answers at the tick
-    that its plan is for. `planner` holds the settings of a recorded diffusion policy: no file is read for them then.
+    that its plan is for. `planner` holds the settings of a recorded policy that plans: no file is read for them then.
     """
-    if planner is not None:
+    if isinstance(planner, DiffusionSettings):
         return _planned(planner, robot, task, realtime, shape)
+    if planner is not None:
+        return _looped(planner, robot, realtime, shape)
     return _maker(name)(name, robot, task, realtime, shape)
 
 
-def skills_known(name: str, robot: Robot, planner: DiffusionSettings | None = None) -> tuple[str, ...]:
+def skills_known(name: str, robot: Robot, planner: PlannerSettings | None = None) -> tuple[str, ...]:
     """Names of the skills that a policy performs by itself, when it is told them: those that its network learned.
 
     `planner` are settings as in `make_policy`. Raises ConfigError.
@@ -185,18 +194,21 @@ def skills_known(name: str, robot: Robot, planner: DiffusionSettings | None = No
     if planner is None and _maker(name) is not _diffusion:
         return ()
     settings = planner or _planner(name)
+    if not isinstance(settings, DiffusionSettings):
+        return ()
     return tuple(read_header(resolve(settings.checkpoint, robot)).get("skills", {}))
 
 
-def sentences_known(name: str, robot: Robot) -> tuple[tuple[str, ...], float]:
+def sentences_known(name: str, robot: Robot, planner: PlannerSettings | None = None) -> tuple[tuple[str, ...], float]:
     """Sentences that the planner of a closed loop was trained with, where it reads others by the nearest of them, and
-    how long from a request to the end of its plan [s]; none of another policy. Raises ConfigError."""
+    how long from a request to the end of its plan [s]; none of another policy. `planner` are settings as in
+    `make_policy`. Raises ConfigError."""
     from servoid.policy.checkpoint import read_header, resolve
     from servoid.policy.diffusion.prefix.frames import RATE
 
-    if _maker(name) is not _closed_loop:
+    if isinstance(planner, DiffusionSettings) or (planner is None and _maker(name) is not _closed_loop):
         return (), 0.0
-    settings = _loop_settings(name)
+    settings = planner or _loop_settings(name)
     head = read_header(resolve(settings.checkpoint, robot))
     if not settings.text_nearest or "sentences" not in head:
         return (), 0.0

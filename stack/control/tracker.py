@@ -11,6 +11,7 @@ from servoid.hw.contracts.control import Instruction, Reference, State
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import CheckpointError, resolve
 from servoid.policy.references.gait import Gait
+from servoid.policy.references.style import WalkingStyle
 from servoid.policy.tracker.network import gait_of_tracker, load_tracker
 from servoid.policy.tracker.observation import RESIDUAL, TrackerObservation
 from servoid.stack.control.base import BasePolicy
@@ -57,13 +58,10 @@ class Followers:
     def __init__(self, robot: Robot, tracker: str, walker: str, shape: tuple[int, ...] = ()) -> None:
         """Raises CheckpointError where a network does not fit, or the first one knows no clips."""
         self._any = Tracker(robot, tracker, shape, clips=True)
-        self._walker = Tracker(robot, walker, shape) if walker else None
-        self._robot, self._share = robot, np.zeros(shape)
-        self._step = robot.dt / OVER_SECONDS
+        self._walker = Walker(robot, walker, shape) if walker else None
 
     def reset(self, where: Array | None = None) -> None:
         """Forget, in the worlds `where` `(...,)` bool (default: all)."""
-        self._share = np.where(True if where is None else where, 0.0, self._share)
         self._any.reset(where)
         if self._walker is not None:
             self._walker.reset(where)
@@ -71,11 +69,28 @@ class Followers:
     def __call__(self, state: State, applied: Array, reference: Reference) -> Array:
         """Joint targets `(..., n_joints)` rad by which the next frame of `reference` is reached. Once a tick."""
         target = self._any(state, applied, reference)
-        if self._walker is None:
-            return target
-        walking = self._walker(state, applied, reference)  # at every tick, so that what it remembers has no gap
-        self._share = np.clip(self._share + np.where(walks(reference, self._robot), self._step, -self._step), 0.0, 1.0)
-        share = self._share[..., None]
+        return target if self._walker is None else self._walker(target, state, applied, reference)
+
+
+class Walker:
+    """A tracker of the gait that takes over from another one, little by little, where a plan walks; of one robot, or of
+    worlds of any leading `shape`."""
+
+    def __init__(self, robot: Robot, checkpoint: str, shape: tuple[int, ...] = ()) -> None:
+        """Raises CheckpointError where the network does not fit."""
+        self._tracker, self._robot = Tracker(robot, checkpoint, shape), robot
+        self.share, self._step = np.zeros(shape), robot.dt / OVER_SECONDS
+
+    def reset(self, where: Array | None = None) -> None:
+        """Forget, in the worlds `where` `(...,)` bool (default: all)."""
+        self.share = np.where(True if where is None else where, 0.0, self.share)
+        self._tracker.reset(where)
+
+    def __call__(self, target: Array, state: State, applied: Array, reference: Reference) -> Array:
+        """Joint targets `(..., n_joints)` rad, where the other one has `target`. Once a tick."""
+        walking = self._tracker(state, applied, reference)  # at every tick, so that what it remembers has no gap
+        self.share = np.clip(self.share + np.where(walks(reference, self._robot), self._step, -self._step), 0.0, 1.0)
+        share = self.share[..., None]
         return np.asarray(share * walking + (1.0 - share) * target)
 
 
@@ -97,8 +112,12 @@ class ExpertPolicy(BasePolicy):
     Raises CheckpointError when the tracker does not fit.
     """
 
-    def __init__(self, robot: Robot, checkpoint: str = "expert", shape: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self, robot: Robot, checkpoint: str = "expert", shape: tuple[int, ...] = (), style: WalkingStyle | None = None
+    ) -> None:
         gait = gait_of_tracker(resolve(checkpoint, robot), robot)
+        if style is not None:
+            gait = style.changed(gait)
         self._gait, self._tracker = Gait(robot, shape, gait), Tracker(robot, checkpoint, shape)
 
     def reset(self, where: Array | None, seeds: Array) -> None:

@@ -20,6 +20,7 @@ from servoid.stack.log.trace_buffer import TraceBuffer
 from servoid.stack.runtime.loop import ControlledRobot
 from servoid.stack.safety.guard import DOWN, Phase
 
+SITS = 0.88  # of the standing height: lower than that, a robot that may sit does
 WAIT_SECONDS = 1.0  # for a first sample from every sensor
 STILL_SECONDS = 0.5  # after homing, when the body has stopped swinging: gravity is taken from there, not from the way
 DONE = "the task is done"
@@ -54,6 +55,7 @@ class Phases:
         surroundings = None if simulation is None else simulation.surroundings
         self._look = behaviour.percept if surroundings is None else surroundings.look
         self._kind = "skill" if assignment.task.performs else "plan"  # of events that the policy tells
+        self._may_sit = assignment.episode.seated
         self._steered, self._recovering = assignment.task.steered, recovering
         self._before = Phase.LIMP  # the guard's phase at the last tick
         self._settled = 0
@@ -78,6 +80,8 @@ class Phases:
                 self._estimator.reset_odometry()
                 self._guard.start()
         elif phase is Phase.RUNNING and state is not None:
+            low = float(state.displacement[2]) < SITS * self._robot.standing_height
+            self._guard.sits = self._may_sit and low
             return self._do_task(state)
         elif phase is Phase.STOPPING and state is not None:
             return self._come_to_rest(state)

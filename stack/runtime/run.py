@@ -236,8 +236,8 @@ class Run:
                 f"policy '{settings.policy}' knows no skills, and what is said asks for some ({asked}): use --policy "
                 "skills, or servoid run skill --set text=..."
             )
-        given = self._policy or self._script.planner  # neither is what the name of the policy says today
-        sentences, seconds = ((), 0.0) if given else sentences_known(settings.policy, robot)
+        planner = self._script.planner
+        sentences, seconds = ((), 0.0) if self._policy else sentences_known(settings.policy, robot, planner)
         if sentences:
             policy = RewordedPolicy(robot, policy, sentences, seconds)
         return SkillPolicy(robot, policy, load_skills(robot)) if assignment.task.performs else policy

@@ -13,7 +13,7 @@ from servoid.hw.contracts.operator import Intent
 from servoid.stack.safety.event import Event
 
 if TYPE_CHECKING:
-    from servoid.policy.diffusion.settings import DiffusionSettings
+    from servoid.stack.control.policies import PlannerSettings
 
 MAX_GAIN = 2.0  # times the firmware's configured gain; above, a servo of this class rings
 
@@ -58,4 +58,4 @@ class Script:
     ended: bool = False  # and whether the person ended the run
     intents: Sequence[Intent] | None = None  # what a person wanted, tick by tick,
     held: bool = False  # and whether that person had to be heard
-    planner: DiffusionSettings | None = None  # what it planned with: the policy's file may have moved or changed
+    planner: PlannerSettings | None = None  # what it planned with: the policy's file may have moved or changed

@@ -16,8 +16,8 @@ tests/stack/test_safety*.py:
    brought home, tilt beyond `tilt`, where it was not asked to recover.
 7. A stop that leaves time for it (Ctrl-C, the stop button, heat, a low supply, a blocked joint, a full disk, the end of
    a task) lets a walking robot come to rest, for REST_SECONDS at most, and lowers it then: lowered in mid step it often
-   falls. With a joint that is blocked it takes no more steps. One that was not brought home, but holds the pose that it
-   was found in, is not lowered: it hangs or lies.
+   falls. With a joint that is blocked it takes no more steps. One that sits is not lowered, nor one that was not
+   brought home, but holds the pose that it was found in: it hangs or lies.
 8. Gains only go down within a run: below what was asked for where servos get hot, the supply low or a joint blocked.
    While a robot that is to recover falls and lies, they are zero, but for its arms as they come in.
 9. A fall is survived only where `recover` was asked for, and only from RUNNING, or READY: it may lie as it begins,
@@ -96,6 +96,7 @@ class Guard:
         self.cause: str | None = None  # kind of the event that ended the run, the first if there were several
         self.recovery = Recovery(robot) if recover else None
         self.down = False  # it fell while it ran, and has not got up
+        self.sits = False  # on a seat, as its task has it; whoever runs that says so
         self.lowest, self._upright = lowered_pose(robot), Upright(robot)
         self._motors = motors
         self._gain = np.full(len(robot.names), gain)
@@ -107,8 +108,7 @@ class Guard:
         self._stopping = 0  # tick at which that began
         self._again: set[str] = set()  # kinds of the wishes to stop that came while stopping
         self._stands = True  # once it is home: so it is upright, and can be lowered
-        self._rejected = 0
-        self._damped_ticks = 0
+        self._rejected = self._damped_ticks = 0
         self._tick = 0  # of the newest decision
         self._accepted = 0  # tick of the last accepted goal
         self._began: int | None = None
@@ -162,15 +162,15 @@ class Guard:
             return
         if self.phase in {Phase.LOWERING, *ENDED}:
             return
-        self.cause = self.cause or kind
+        self.cause, stands = self.cause or kind, self._stands and not self.sits
         self.note(kind, text, joint)
-        if self.phase is Phase.RUNNING and self._stands and kind != BLOCKED:
+        if self.phase is Phase.RUNNING and stands and kind != BLOCKED:
             self._stopping = self._tick
             self._again.add(kind)
             self._enter(Phase.STOPPING, "coming to rest")
-        elif self.phase in {Phase.READY, *FOLLOWING} and self._stands:
+        elif self.phase in {Phase.READY, *FOLLOWING} and stands:
             self._lower()
-        else:  # limp, held, fallen or on the way home: it may hang or lie, and a crouch would be one more motion
+        else:  # seated, limp, held, fallen or on the way home, as it may hang or lie: a crouch would be one more motion
             self._enter(Phase.DAMPED, "damped")
 
     def give_up(self, text: str, joint: str | None = None) -> None:

@@ -95,7 +95,12 @@ def test_a_word_that_readline_cuts_is_completed_behind_the_cut(bash: Path, tmp_p
 def test_files_are_completed_where_a_file_is_asked_for(bash: Path, tmp_path: Path) -> None:
     (tmp_path / "demo.mcap").touch()
     assert answers(bash, "servoid replay d", tmp_path) == ["demo.mcap"]
-    assert answers(bash, "servoid run walk --policy d", tmp_path) == ["diffusion", "diffuse_cloc", "demo.mcap"]
+    assert answers(bash, "servoid run walk --policy d", tmp_path) == [
+        "diffusion",
+        "dodgeball",
+        "diffuse_cloc",
+        "demo.mcap",
+    ]
     assert answers(bash, "servoid run walk --backend d", tmp_path) == ["dynamixel"]
 
 

@@ -28,7 +28,7 @@ from servoid.tools.common.output import add_json_argument, reporting
 from servoid.tools.common.pictures.flightpath import got_up
 
 if TYPE_CHECKING:
-    from servoid.policy.diffusion.settings import DiffusionSettings
+    from servoid.stack.control.policies import PlannerSettings
 
 Tick = dict[str, list[dict[str, Any]]]  # channel -> its messages of one tick
 
@@ -126,6 +126,7 @@ def changes(log: FlightLog) -> list[str]:
     """What is not as it was when the log was written: robot, policy, task, packages, source; as far as the log says."""
     from servoid.hw.robot.description import load_robot
     from servoid.policy.checkpoint import git_commit, resolve
+    from servoid.stack.control.closed_loop import ClosedLoopSettings
     from servoid.stack.control.get_up import fingerprints
     from servoid.stack.control.policies import policy_fingerprint
     from servoid.stack.log.format import plain
@@ -140,9 +141,13 @@ def changes(log: FlightLog) -> list[str]:
     except ConfigError:
         if planner is None:
             raise
-        policy = policy_fingerprint("diffusion") | {"planner": None}  # the file is gone
+        looped = header.get("policy.closed_loop") is not None
+        policy = policy_fingerprint("closd" if looped else "diffusion", robot)  # the file is gone
+        policy |= {"planner": None} if not looped else {"closed_loop": None}
     if planner is not None:  # whatever the file says today
-        policy["checkpoint_sha256"] = sha256(resolve(planner.checkpoint))
+        policy["checkpoint_sha256"] = sha256(resolve(planner.checkpoint, robot))
+        if isinstance(planner, ClosedLoopSettings):
+            policy["tracker_sha256"] = sha256(resolve(planner.tracker, robot)) if planner.tracker else None
     policy["name"] = log.header["settings"]["policy"]  # as it was typed
     now = fingerprint(robot) | _part("policy", policy)
     now["recovery"] = fingerprints(robot) if settings.recover else None
@@ -157,7 +162,7 @@ def changes(log: FlightLog) -> list[str]:
         "policy.checkpoint_sha256": "the policy's checkpoint",
         "policy.odometry_sha256": "the odometry's checkpoint",
         "policy.planner": "the file of the planner's settings (those of the log are used)",
-        "policy.closed_loop": "the settings of the closed loop",
+        "policy.closed_loop": "the file of the closed loop's settings (those of the log are used)",
         "policy.tracker_sha256": "the checkpoint of its tracker",
         "policy.gait": "the gait's settings",
         "task": "the task's settings",
@@ -172,13 +177,17 @@ def changes(log: FlightLog) -> list[str]:
     return [text for key, text in names.items() if key in header and header[key] != now[key]]
 
 
-def _planner(log: FlightLog) -> DiffusionSettings | None:
+def _planner(log: FlightLog) -> PlannerSettings | None:
     """What the run's planner was set to; None for another policy, and in old logs, which do not say. Raises
     ConfigError."""
     from servoid.policy.diffusion.settings import DiffusionSettings
+    from servoid.stack.control.closed_loop import ClosedLoopSettings
 
-    recorded = log.header["policy"].get("planner")
-    return None if recorded is None else from_values(recorded, DiffusionSettings, log.path)
+    recorded = log.header["policy"]
+    if (planner := recorded.get("planner")) is not None:
+        return from_values(planner, DiffusionSettings, log.path)
+    loop = recorded.get("closed_loop")
+    return None if loop is None else from_values(loop, ClosedLoopSettings, log.path)
 
 
 def _part(name: str, values: dict[str, Any]) -> dict[str, Any]:

@@ -47,8 +47,8 @@ class GroundTruth:
     """An `on_tick` listener: one row for each tick of the task.
 
     In a world of several robots it follows the first; that any of them fell or touched another counts. `fell_ending`:
-    whether it fell after the task, while it came to rest or was lowered. Of a run that may `recover` the trace says of
-    a fall whether the robot is down at the end.
+    whether it fell after the task, while it came to rest, was lowered or went limp on a seat. Of a run that may
+    `recover` the trace says of a fall whether the robot is down at the end.
     """
 
     def __init__(
@@ -75,6 +75,7 @@ class GroundTruth:
         if instruction is None:
             if self._rows and not self._fallen:
                 self.fell_ending |= record.phase in (Phase.STOPPING, Phase.LOWERING) and bool(self._down[0])
+                self.fell_ending |= self._seated and record.phase is Phase.DAMPED and bool(self._tilted[0])
                 self.fell_ending |= any(event.kind == "fall" for event in record.events)
             return
         fallen = bool(self._down.any())
@@ -100,8 +101,11 @@ class GroundTruth:
         anything but its feet touches the ground."""
         if not (self._low or self._seated):
             return self._truth.fallen
-        tilted = -self._truth.gravity[:, 2] < math.cos(FALL_TILT)
-        return tilted if self._low else tilted | self._truth.grounded
+        return self._tilted if self._low else self._tilted | self._truth.grounded
+
+    @property
+    def _tilted(self) -> Array:
+        return np.asarray(-self._truth.gravity[:, 2] < math.cos(FALL_TILT))
 
     def trace(self) -> Trace:
         """The run by the truth; without rows if the guard never let the task begin."""

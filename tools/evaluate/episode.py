@@ -16,10 +16,12 @@ from servoid.hw.contracts.task import Trace
 from servoid.tools.common.exit_codes import explain
 
 if TYPE_CHECKING:
+    from servoid.hw.robot.description import Robot
+    from servoid.policy.priors.score_matching.model import Style
     from servoid.stack.runtime.run import RunSettings
     from servoid.tools.evaluate.judge import Judged
 
-_PRIOR = "prior"  # that tells the manner
+_PRIOR, _STYLES = "prior", "styles"  # that tell the manner, and that of a style
 PATH_STEP = 0.2  # s between the points of a path that is kept
 
 
@@ -68,7 +70,7 @@ def record(settings: RunSettings) -> dict[str, Any]:
     return {
         **judged.row,
         "ticks": min(judged.ground_truth.upright, limit),
-        "manner": _manner(judged, settings.robot) if isinstance(assignment.task, LearnedRun) else {},
+        "manner": _manner(judged, settings) if isinstance(assignment.task, LearnedRun) else {},
         "motion": quality(judged.ground_truth.poses(), load_robot(settings.robot)),
         "path": _points(trace.displacement[:, :2], trace.dt),
         "goal": None if goal is None else np.round(goal, 3),
@@ -78,20 +80,33 @@ def record(settings: RunSettings) -> dict[str, Any]:
     }
 
 
-def _manner(judged: Judged, robot: str) -> dict[str, float]:
-    """What the prior of this robot says of it; nothing, where it has none."""
+def _manner(judged: Judged, settings: RunSettings) -> dict[str, float]:
+    """What a prior of this robot says of it, and of the policy's style; nothing, where it has none."""
     from servoid.hw.robot.description import load_robot
     from servoid.policy import checkpoint
     from servoid.policy.priors.score_matching.judged import manner_of
     from servoid.policy.priors.score_matching.model import load_prior
     from servoid.sim.kinematics import limbs_of
 
-    body = load_robot(robot)
+    body = load_robot(settings.robot)
+    style = _style(settings.policy, body)
     try:
-        path = checkpoint.resolve(_PRIOR, body)
+        path = checkpoint.resolve(_PRIOR if style.lower is None else _STYLES, body)
     except checkpoint.CheckpointError:
         return {}
-    return manner_of(np.array(judged.estimates), load_prior(path, body, limbs_of(body)))
+    return manner_of(np.array(judged.estimates), load_prior(path, body, limbs_of(body)), style)
+
+
+def _style(policy: str, robot: Robot) -> Style:
+    """That a task policy learned; any, where it is none."""
+    from servoid.policy import checkpoint
+    from servoid.policy.priors.score_matching.model import Style
+
+    try:
+        style = checkpoint.read_header(checkpoint.resolve(policy, robot)).get("config", {}).get("style")
+    except checkpoint.CheckpointError:
+        style = None
+    return Style(**style) if style else Style()
 
 
 def _points(places: Array, dt: float) -> Array:

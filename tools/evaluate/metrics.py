@@ -36,6 +36,7 @@ MEASURES: dict[str, Callable[[Record], float | None]] = {
     "success": lambda record: record.get("success"),
     "fell_or_broken_off": fell_or_broken_off,
     "on_its_feet": lambda record: not fell_or_broken_off(record),
+    "fell_ending": lambda record: record.get("fell_ending"),
     "ever_fell": lambda record: fell_or_broken_off(record) or bool(record.get("falls")),
     "rose_in_time": rose_in_time,
     "seconds_to_rise": rose,
@@ -43,6 +44,7 @@ MEASURES: dict[str, Callable[[Record], float | None]] = {
     "prior_error": lambda record: record.get("manner", {}).get("prior_error"),
     "amplitude": lambda record: record.get("manner", {}).get("amplitude"),
     "cadence": lambda record: record.get("manner", {}).get("cadence"),
+    "style": lambda record: record.get("manner", {}).get("style"),
     "floating_mm": lambda record: record.get("motion", {}).get("floating_mm"),
     "jerk_mps3": lambda record: record.get("motion", {}).get("jerk_mps3"),
     "foot_slip_mmps": lambda record: record.get("motion", {}).get("foot_slip_mmps"),
@@ -82,6 +84,7 @@ class Metric:
 METRICS: dict[str, Metric] = {
     "success": Metric("success", share=True),
     "falls": Metric("fell_or_broken_off", share=True, lower=True),  # a robot that cannot go on has not stayed up
+    "falls_ending": Metric("fell_ending", share=True, lower=True),  # after the task, as it was lowered or went limp
     "ever_fell": Metric("ever_fell", share=True, lower=True),  # and got up again, perhaps
     "on_its_feet": Metric("on_its_feet", share=True),
     "rose_in_time": Metric("rose_in_time", share=True),
@@ -95,6 +98,8 @@ METRICS: dict[str, Metric] = {
     "prior_error": Metric("prior_error", "of the data's", lower=True),
     "amplitude": Metric("amplitude", "of the data's"),
     "cadence": Metric("cadence", "of the data's"),
+    "style": Metric("style", "of its windows"),
+    "hit": Metric("hit", share=True, lower=True),
     "ticks": Metric("ticks", "ticks", unfinished="whole"),
     "velocity_error": Metric("velocity_error_mps", "m/s", lower=True, unfinished="whole"),
     "seconds_to_goal": Metric("seconds_to_goal", "s", lower=True, unfinished="left out"),

@@ -20,7 +20,7 @@ from servoid.hw.config import ConfigError, nearest
 from servoid.hw.robot.description import Payload, Robot
 from servoid.tools.bringup.line import add_line_arguments, assembled, is_virtual
 from servoid.tools.common import exit_codes
-from servoid.tools.common.output import Report, reporting
+from servoid.tools.common.output import Report, check_writable, reporting
 from servoid.tools.identify.figures import MODELS
 
 if TYPE_CHECKING:
@@ -59,12 +59,13 @@ def main(args: argparse.Namespace) -> int:
         try:
             import cma  # noqa: F401  # before anything moves
         except ImportError as error:
-            raise ConfigError("the fit needs the package cma: pip install --editable '.[tune]'") from error
+            raise ConfigError("the fit needs the package cma: pip install 'servoid[tune]'") from error
         if args.logs is None:
             robot, groups = _checked(args, report)
         else:
             robot, groups = _unmoved(args), []
         out: Path = args.out or Path("identified") / robot.name
+        check_writable(out / "identified.png")
         logs = args.logs or _record(args, robot, groups, out, report)
         if isinstance(logs, int):
             return logs

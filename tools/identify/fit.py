@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,8 +19,11 @@ DETERMINED = 0.1  # of a figure: with a larger spread, the data do not determine
 _NOISE = 0.002  # rad: of an encoder's tick and of what no model has
 _ALIKE = 10  # ticks in a row whose errors are as good as one
 _CANDIDATES, _GENERATIONS = 10, 6
-_ITERATIONS, _STEP = 10, 0.015  # of least squares; of a figure's spread, for the slopes
+_ITERATIONS, _STEP = 20, 0.015  # of least squares; of a figure's spread, for the slopes
+_SETTLED = 1e-3  # of the cost, that an iteration gains at the end
 _DAMPING = (0.0, 0.01, 0.1, 1.0, 10.0)  # tried at each iteration
+_GROWS = ("stribeck_friction", "load_friction")  # of models with more figures
+_FAINTER = (0.0, -1.5, -3.0)  # spreads from the file's, at which they are tried first
 _FARTHEST = 4.0  # spreads that a figure may be from its file's
 _BETTER = 0.98  # of the held-out error, that a model with more figures must come below
 _BLOCK = 1.0  # s of one joint in one motion: errors in it belong together
@@ -43,14 +46,15 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Fit:
-    """What a model of friction makes of the recordings. Errors are RMS over joints that moved [rad]."""
+    """What a model of friction makes of the recordings. Errors are RMS over joints that moved [rad]. `found` is worked
+    out for the model that is taken."""
 
     model: str
     figures: Figures
     point: Array
-    found: tuple[Estimate, ...]
     error: float  # on the motions that it was fitted on
     held_out: float  # on the others
+    found: tuple[Estimate, ...] = ()
 
     @property
     def servos(self) -> dict[str, Servo]:
@@ -69,17 +73,17 @@ def identify(
     if not moved or all(piece.name == HELD_OUT for piece in pieces):
         raise ConfigError("the recording has no motion to fit: record again with servoid identify")
     fits: list[Fit] = []
-    best: Fit | None = None
+    best: tuple[Fit, _Trial] | None = None
     for model in models:
         trial = _Trial(Figures(robot, moved, model), pieces, moved)
-        start = None if best is None else trial.figures.point(fits[0].figures.values(fits[0].point))
-        fits.append(trial.fit(start))
+        fits.append(trial.fit(fits))
         last = fits[-1]
         say(f"friction {model}: off by {np.degrees(last.error):.3f} degrees, {np.degrees(last.held_out):.3f} held out")
-        if best is None or last.held_out < _BETTER * best.held_out:
-            best = last
+        if best is None or last.held_out < _BETTER * best[0].held_out:
+            best = last, trial
     assert best is not None
-    return best, fits
+    fit, trial = best
+    return replace(fit, found=trial.estimates()), fits
 
 
 def moving_joints(robot: Robot, pieces: Sequence[Piece]) -> list[str]:
@@ -97,14 +101,13 @@ class _Trial:
         self._fitted = [piece for piece in pieces if piece.name != HELD_OUT]
         self._others = [piece for piece in pieces if piece.name == HELD_OUT] or self._fitted
         self._rehearsal = Rehearsal(figures.robot, self._fitted)
+        self._scout = Rehearsal(figures.robot, self._fitted[::2])  # enough to tell a basin
 
-    def fit(self, start: Array | None) -> Fit:
-        """From a point, or from the files and then first by CMA-ES."""
-        point = self._search() if start is None else start
-        point, slopes, errors = self._polish(point)
-        found = self._spread(point, slopes, errors)
-        others = _errors(Rehearsal(self.figures.robot, self._others), self._candidates([point]), self._joints)
-        return Fit(self.figures.model, self.figures, point, found, _rms(errors), _rms(others[0]))
+    def fit(self, before: Sequence[Fit]) -> Fit:
+        """From what simpler models found, or where there are none by CMA-ES from the files."""
+        self._polish(self._nearest(before) if before else self._search())
+        others = _errors(Rehearsal(self.figures.robot, self._others), self._candidates([self._point]), self._joints)
+        return Fit(self.figures.model, self.figures, self._point, _rms(self._off), _rms(others[0]))
 
     def _candidates(self, points: Sequence[Array]) -> list[Candidate]:
         return [Candidate(*self.figures.of_joints(point)) for point in points]
@@ -115,6 +118,19 @@ class _Trial:
     def _cost(self, error: Array, point: Array) -> float:
         return float(np.square(error / _NOISE).sum() / _ALIKE + np.square(point).sum())
 
+    def _nearest(self, before: Sequence[Fit]) -> Array:
+        """The best of the points that others found, with the figures that they lack as in the files, or fainter."""
+        points = []
+        for fit in before:
+            values = fit.figures.values(fit.point)
+            point = self.figures.point(values)
+            new = [i for i, f in enumerate(self.figures.all) if (f.servo, f.name) not in values and f.name in _GROWS]
+            for faint in _FAINTER if new else _FAINTER[:1]:
+                points.append(point.copy())
+                points[-1][new] = faint
+        costs = [self._cost(error, point) for error, point in zip(self._residuals(points), points, strict=True)]
+        return points[int(np.argmin(costs))]
+
     def _search(self) -> Array:
         import cma
 
@@ -122,16 +138,18 @@ class _Trial:
         search = cma.CMAEvolutionStrategy(np.zeros(self._n), 0.7, options)
         for _ in range(_GENERATIONS):
             points = search.ask()
-            search.tell(points, [self._cost(e, p) for e, p in zip(self._residuals(points), points, strict=True)])
+            errors = _errors(self._scout, self._candidates(points), self._joints)
+            search.tell(points, [self._cost(e, p) for e, p in zip(errors, points, strict=True)])
         best: Array = np.asarray(search.result.xbest)
         return best
 
-    def _polish(self, point: Array) -> tuple[Array, Array, Array]:
-        """Levenberg and Marquardt's least squares. Returns the point, slopes `(samples, n)` and errors there."""
+    def _polish(self, point: Array) -> None:
+        """Levenberg and Marquardt's least squares. Slopes are measured where the last ones, made to fit the newest step
+        (Broyden, 1965), lead no further: it ends where slopes that were just measured gain nothing."""
         errors = self._residuals([point])[0]
         cost, scale = self._cost(errors, point), 1.0 / (_NOISE * np.sqrt(_ALIKE))
+        slopes, fresh = self._slopes(point, errors), True
         for _ in range(_ITERATIONS):
-            slopes = self._slopes(point, errors)
             hessian = scale**2 * slopes.T @ slopes + np.eye(self._n)
             downhill = scale**2 * slopes.T @ errors + point
             steps = [np.linalg.solve(hessian + d * np.diag(np.diag(hessian)), downhill) for d in _DAMPING]
@@ -139,21 +157,28 @@ class _Trial:
             trials = self._residuals(points)
             costs = [self._cost(e, p) for e, p in zip(trials, points, strict=True)]
             leader = int(np.argmin(costs))
-            gained = cost - costs[leader]
+            gained, moved = cost - costs[leader], points[leader] - point
+            settled = gained < _SETTLED * cost
             if gained > 0:
+                slopes = slopes + np.outer(trials[leader] - errors - slopes @ moved, moved / (moved @ moved))
                 point, errors, cost = points[leader], trials[leader], costs[leader]
-            if gained < 1e-3 * cost:
+            if settled and fresh:
                 break
-        return point, self._slopes(point, errors), errors
+            fresh = settled
+            if fresh:
+                slopes = self._slopes(point, errors)
+        self._point, self._off, self._slope = point, errors, slopes
 
     def _slopes(self, point: Array, errors: Array) -> Array:
         """Change of each error with each figure `(samples, n)`."""
         moved = self._residuals([point + _STEP * step for step in np.eye(self._n)])
         return np.stack([(error - errors) / _STEP for error in moved], -1)
 
-    def _spread(self, point: Array, slopes: Array, errors: Array) -> tuple[Estimate, ...]:
-        """How far each figure may be off, by the curvature of the fit and by what single seconds of single joints say:
-        H^-1 (sum g g' + P) H^-1, g being the slope of the cost in a block and P what was known before."""
+    def estimates(self) -> tuple[Estimate, ...]:
+        """The figures of the last fit, and how far each may be off: by the curvature of the fit and by what single
+        seconds of single joints say: H^-1 (sum g g' + P) H^-1, g being the slope of the cost in a block and P what was
+        known before."""
+        point, slopes, errors = self._point, self._slope, self._off
         weight = 1.0 / (_NOISE**2 * _ALIKE)
         inverse = np.linalg.inv(weight * slopes.T @ slopes + np.eye(self._n))
         pulls = weight * slopes * errors[:, None]

@@ -80,7 +80,7 @@ def write(fit: Fit, pieces: Sequence[Piece], out: Path, report: Report) -> list[
         try:
             _draw(fit, pieces, picture)
         except ModuleNotFoundError:
-            report.line("no picture: drawing needs the 'video' extra: pip install --editable '.[video]'")
+            report.line("no picture: drawing needs the 'video' extra: pip install 'servoid[video]'")
         else:
             files.append(picture)
             report.line(f"measured against simulated: {picture}")

@@ -9,7 +9,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot, Servo
-from servoid.sim.friction import friction
+from servoid.sim.joints.friction import friction
 from servoid.sim.model import TIMESTEP
 from servoid.tools.identify.hanging import BASE, HELD, hanging_model
 from servoid.tools.identify.recording import Piece

@@ -44,6 +44,7 @@ class PriorTraining(DecayedOptimiser, PriorShape, StepRun):
     average: Annotated[float, "decay of the averaged weights, which are the ones saved"] = 0.999
     unstyled: Annotated[float, "share of windows that are shown without their style, for guidance"] = 0.1
     standing: Annotated[bool, "learn from windows in which the robot was asked to stand, too"] = False
+    seconds: Annotated[float, "how much of the data is learned from [s], what is measured on not counted; 0: all"] = 0.0
     licence: Annotated[str, "licence of the data, kept in the checkpoint"] = "Apache-2.0"
 
     def __post_init__(self) -> None:
@@ -51,6 +52,8 @@ class PriorTraining(DecayedOptimiser, PriorShape, StepRun):
             part.__post_init__(self)
         if not 0.0 <= self.unstyled < 1.0:
             raise ValueError(f"unstyled must be a share of 0 to below 1, not {self.unstyled:g}")
+        if self.seconds < 0.0:
+            raise ValueError(f"seconds must not be negative, not {self.seconds:g}")
 
 
 @dataclass(frozen=True)

@@ -280,6 +280,11 @@ class TrackingSettings:
     )
     get_up_rates: Annotated[Range, "the same of clips that begin lying"] = (1.0, 1.6)
     walk_seconds: Annotated[Range, "seconds of walking between two clips"] = (0.6, 2.5)
+    planner: Annotated[
+        str, "settings of a closed loop whose plans are followed instead: a policy's name, or a file"
+    ] = ""
+    near: Annotated[float, "with a planner: share of its tasks that begin where there is little left to walk"] = 0.5
+    words: Annotated[float, "with a planner: share of episodes that are told sentences of clips, and no place"] = 0.2
     rewards: Annotated[dict[str, float], "weights of reward terms, per tick (policy/tracker/rewards.py)"] = field(
         default_factory=lambda: {
             "velocity": 3.0,
@@ -321,8 +326,11 @@ class TrackingSettings:
             for name in getattr(self, table):
                 if name not in TERMS:
                     raise ValueError(f"{table}.{name}: no such reward term; {nearest(name, TERMS)}")
-        if not 0.0 <= self.clip_share <= 1.0:
-            raise ValueError(f"clip_share must be 0 to 1, not {self.clip_share:g}")
+        for name in ("clip_share", "near", "words"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must be 0 to 1, not {getattr(self, name):g}")
+        if self.planner and not self.clip_share:
+            raise ValueError("planner needs a tracker of any reference: clip_share must not be 0")
         for name in ("rates", "get_up_rates", "walk_seconds"):
             low, high = getattr(self, name)
             if not 0.0 < low <= high:
@@ -350,13 +358,13 @@ class OdometryWalks:
     policy: Annotated[tuple[str, ...], "policies or checkpoints that walk, besides the gait"] = ("expert", "diffusion")
     worlds: Annotated[int, "simulated robots that walk, over all policies"] = 192
     seconds: Annotated[float, "seconds that each of them walks"] = 60.0
-    floor: Annotated[float, "friction of the floor that they walk on, as a share of the robot's floor_friction"] = 1.0
+    floor: Annotated[float, "friction of the floor that half of them walk on, as a share of the robot's own"] = 1.0
     walks: Annotated[int, "walks of each policy on which the drift is measured"] = 64
     walk_seconds: Annotated[float, "seconds of each of these walks"] = 30.0
 
     def __post_init__(self) -> None:
-        if self.worlds <= len(self.policy):
-            raise ValueError(f"worlds must be more than the {len(self.policy)} policies, not {self.worlds}")
+        if self.worlds < (kinds := (len(self.policy) + 1) * (1 if self.floor == 1.0 else 2)):
+            raise ValueError(f"worlds must be at least the {kinds} kinds of walks, not {self.worlds}")
         if min(self.seconds, self.floor, self.walks, self.walk_seconds) <= 0:
             raise ValueError("seconds, floor, walks and walk_seconds must be positive")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -10,11 +11,15 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
+from servoid.hw.robot.mjcf import compiled, read_spec
 from servoid.policy.references.gait import Gait
 from servoid.sim.model import build
+from servoid.tools.robots.couplings import couplings
 
 _POSES = 50
 _EXACT = 1e-6  # m
+_TOUCHING = 1e-4  # m that shapes may overlap
+_SAME_GEAR = 1e-3  # of a ratio
 _MIRRORED = 0.005  # m that joints may be beside their mirror images
 _LOPSIDED = 0.015  # m more that a body's centre of mass may be: no robot is quite alike on both sides
 _LOADED = 0.6  # share of its stall torque that a servo may need to hold the robot at home
@@ -43,6 +48,8 @@ def findings(robot: Robot) -> list[Comparison]:
             True, "weight and height", f"{mass:.2f} kg, base {robot.standing_height:.3f} m above the ground at home"
         ),
         _kinematics(robot, model, data, joints),
+        *_gears(robot),
+        _apart(robot, model),
         _mirrors(robot, model, data, joints),
         _ranges(robot),
         _soles(robot),
@@ -69,6 +76,40 @@ def _kinematics(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints
         for sole, foot in zip(soles, robot.legs, strict=True):
             worst = max(worst, float(np.abs(data.sensor(f"servoid/{foot}_position").data - sole).max()))
     return Comparison(worst < _EXACT, "kinematics", f"soles {worst:.1e} m from MuJoCo's at {_POSES} random poses")
+
+
+def _gears(robot: Robot) -> list[Comparison]:
+    """Joints whose horn is a joint of the model have the ratio of the two."""
+    if not robot.held:
+        return []
+    path = Path(robot.mjcf)
+    ties = couplings(compiled(read_spec(path, robot.base), path), path).gears
+    wrong = [
+        f"{joint.name} {joint.gear:g}, by the model {ties[joint.name][1]:g}"
+        for joint in robot.joints
+        if joint.name in ties and abs(joint.gear / ties[joint.name][1] - 1.0) > _SAME_GEAR
+    ]
+    return [Comparison(not wrong, "gears", "; ".join(wrong) or "as the model ties joints to their servos' horns")]
+
+
+def overlaps(robot: Robot, model: mujoco.MjModel) -> dict[tuple[str, str], float]:
+    """Pairs of the robot's bodies whose shapes overlap at home, as they collide, and by how much [m]."""
+    data, found = mujoco.MjData(model), dict[tuple[str, str], float]()
+    _put(model, data, np.array([int(model.joint(name).qposadr[0]) for name in robot.names]), robot.home)
+    for contact in data.contact:
+        bodies = (int(model.geom_bodyid[geom]) for geom in contact.geom)
+        first, second = sorted(model.body(body).name for body in bodies)
+        if "world" not in (first, second) and contact.dist < -_TOUCHING:
+            found[first, second] = max(found.get((first, second), 0.0), -float(contact.dist))
+    return found
+
+
+def _apart(robot: Robot, model: mujoco.MjModel) -> Comparison:
+    """No limbs push each other away at home."""
+    wrong = [f"{one} and {other} by {1000 * by:.0f} mm" for (one, other), by in overlaps(robot, model).items()]
+    hint = ": they push each other away; move them apart in the model, or name them as `overlapping`"
+    text = f"overlap: {', '.join(wrong)}{hint}" if wrong else "apart from each other"
+    return Comparison(not wrong, "limbs at home", text)
 
 
 def _mirrors(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
@@ -169,7 +210,8 @@ def _stiffness(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints:
     share = np.linalg.eigvalsh(-np.array(curved).reshape(n, n) / (4 * 0.02**2) / np.outer(root, root)).max(initial=0.0)
     times = 1.0 / max(float(share), 1e-3)
     good = times > _STIFF
-    hint = "" if good else ": it sinks and topples; raise the servos' P gain, and their stiffness with it"
+    more = np.ceil(10.0 * _STIFF / times) / 10.0
+    hint = "" if good else f": it sinks and topples; raise the servos' P gain {more:.1f} times, and their stiffness too"
     return Comparison(good, "stiffness at home", f"{times:.1f} times what it takes to stand{hint}")
 
 

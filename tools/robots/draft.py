@@ -13,6 +13,7 @@ from servoid.hw.config import ConfigError, nearest
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_servo
 from servoid.hw.robot.mjcf import compiled, read_spec
+from servoid.tools.robots.couplings import Couplings, couplings
 
 _NEAR = 0.01  # m between a joint and the mirror image of another, and of an axis
 _FLAT = 0.004  # m above a foot's lowest point that still is its sole
@@ -57,6 +58,7 @@ class DraftedJoint:
     home: float
     mirror: str
     sign: int
+    gear: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,8 @@ class Draft:
     feet: dict[str, tuple[str, ...]]
     joints: tuple[DraftedJoint, ...]
     passive: tuple[str, ...]
+    held: tuple[str, ...]
+    overlapping: tuple[tuple[str, str], ...]  # bodies that are drawn into each other
     origin: tuple[float, float, float]  # m, of the base in its body: the model's own may be on the ground
     posed: bool  # whether the model has a home pose, as a keyframe
     notes: tuple[str, ...]
@@ -83,17 +87,21 @@ class Draft:
     def text(self, out: Path) -> str:
         """The robot's file, which is to be at `out`."""
         servo, model = load_servo(self.servo), self.model.resolve()
+        gear = max(j.gear for j in self.joints)
         path = model.name if model.parent == out.parent.resolve() else str(model)
         rows = [
             f"  - {{name: {j.name}, servo: {self.servo}, id: {i + 1}, direction: 1, zero: 0.0, "
             f"range: [{j.range[0]:.4f}, {j.range[1]:.4f}], home: {j.home:.4f}, "
-            f"mirror: {j.mirror}, mirror_sign: {j.sign}}}"
+            f"mirror: {j.mirror}, mirror_sign: {j.sign}{f', gear: {j.gear:.6g}' if j.gear != 1.0 else ''}}}"
             for i, j in enumerate(self.joints)
         ]
         feet = [f"  {name}: {{geoms: [{', '.join(geoms)}]}}" for name, geoms in self.feet.items()]
-        limits = _BUS_HEAD.format(speed=0.95 * servo.no_load_speed, stale=3, hot=servo.max_temperature - 10)
+        limits = _BUS_HEAD.format(speed=0.95 * servo.no_load_speed / gear, stale=3, hot=servo.max_temperature - 10)
         origin = f"origin: [{', '.join(f'{x:.4f}' for x in self.origin)}]\n" if any(self.origin) else ""
         passive = f"passive: [{', '.join(self.passive)}]\n" if self.passive else ""
+        pairs = "".join(f"  - [{one}, {other}]\n" for one, other in self.overlapping)
+        passive += f"overlapping: # bodies that the model draws into each other\n{pairs}" if pairs else ""
+        passive += f"held: [{', '.join(self.held)}]\n" if self.held else ""
         return (
             f"# {self.name}: drafted by `servoid robot import`. TODO marks what its model does not say.\n"
             f"name: {self.name}\nmjcf: {path}\nbase: {self.base}\n{origin}imu_site: {self.imu}\n"
@@ -108,23 +116,37 @@ class Draft:
 def draft(path: Path, choices: Choices) -> Draft:
     """Raises ConfigError for a model that is no humanoid's, with what is missing."""
     load_servo(choices.servo)
-    spec = read_spec(path)
+    spec = read_spec(path, choices.base)
+    for key in spec.keys:
+        key.ctrl = []  # of which only the pose is read, whatever motors it was written for
     if spec.meshes:
         compiled(spec, path)  # says which are missing
     model = compiled(spec, path)
     base = _base(model, choices.base, path)
     notes = ["servo, id, direction and zero of every joint", "bus, rate and imu"]
     inside = [b for b in range(model.nbody) if model.body_rootid[b] == model.body_rootid[base]]
-    driven = {model.eq_obj1id[i] for i in range(model.neq) if model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT}
+    ties = couplings(model, path)
+    horns = [horn for horn, _ in ties.gears.values()]
     hinges = [j for j in range(model.njnt) if model.jnt_bodyid[j] in inside and model.jnt_type[j] != _FREE]
-    passive = [j for j in hinges if j in driven or model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE]
-    joints = [j for j in hinges if j not in passive]
+    held = [j for j in hinges if model.joint(j).name in (*horns, *ties.tangled)]
+    moved = {*ties.followers, *ties.looped} - set(ties.gears)
+    passive = [
+        j
+        for j in hinges
+        if j not in held and (model.joint(j).name in moved or model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE)
+    ]
+    joints = [j for j in hinges if j not in (*passive, *held)]
     if not joints:
         raise ConfigError(f"{path}: no hinge below body {model.body(base).name!r}")
     if passive:
         notes.append(f"passive joints, which no servo is taken to drive: {_names(model, passive)}")
-    if model.neq - len(driven):
-        notes.append("closed loops (equality constraints): their passive joints start at 0 whatever the pose")
+    for limb, (horn, gear) in ties.gears.items():
+        notes.append(f"{limb}: {horn} turns it, {gear:.4g} turns for one: the ID and direction are of that servo")
+    if ties.tangled:
+        notes.append(
+            f"{', '.join(ties.tangled)}: tendons tie several of them to several, as in a differential, which no gear "
+            "of one servo says; they are held at 0, so their servos must hold them there"
+        )
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     turn = data.xmat[base].reshape(3, 3)
@@ -136,7 +158,7 @@ def draft(path: Path, choices: Choices) -> Draft:
             "point, left and right; without them write the robot's file by hand"
         )
     imu = choices.imu or _imu(model, base, notes)
-    drafted = _mutual([_joint(model, j, joints, places, axes, notes) for j in joints], notes)
+    drafted = _mutual([_geared(model, _joint(model, j, joints, places, axes, notes), ties) for j in joints], notes)
     if loose := [model.joint(j).name for j in joints if not model.jnt_limited[j]]:
         notes.append(f"range of {', '.join(loose)}: the model has none")
     name = path.stem.replace(" ", "-")
@@ -154,6 +176,8 @@ def draft(path: Path, choices: Choices) -> Draft:
         feet=feet,
         joints=drafted,
         passive=tuple(_each(model, passive)),
+        held=tuple(_each(model, held)),
+        overlapping=(),
         origin=origin,
         posed=bool(model.nkey),
         notes=tuple(notes),
@@ -183,9 +207,16 @@ def _base(model: mujoco.MjModel, wanted: str | None, path: Path) -> int:
 
 
 def _imu(model: mujoco.MjModel, base: int, notes: list[str]) -> str:
-    sites = [model.site(s) for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == base]
-    named = [site.name for site in sites if "imu" in site.name.lower() or "gyro" in site.name.lower()]
-    chosen = next(iter(named or [site.name for site in sites]), "")
+    sites = [model.site(s) for s in range(model.nsite) if model.body_rootid[model.site_bodyid[s]] == base]
+    named = [site for site in sites if "imu" in site.name.lower() or "gyro" in site.name.lower()]
+    here = [site.name for site in named or sites if model.body_weldid[site.bodyid[0]] == base]
+    chosen = next(iter(here), "")
+    if named and not chosen:
+        body = model.body(int(named[0].bodyid[0])).name
+        raise ConfigError(
+            f"the IMU's site {named[0].name!r} is on body {body!r}, which moves against {model.body(base).name!r}: "
+            f"give --base {body}, and the robot hangs on that one"
+        )
     if not chosen:
         raise ConfigError(
             f'no site on the base {model.body(base).name!r}: add <site name="imu"/> to that body where the IMU sits'
@@ -250,6 +281,18 @@ def _joint(
     key = float(model.key_qpos[0, model.jnt_qposadr[joint]]) if model.nkey else 0.0
     sign = 1 if not len(fits) or along[best] > 0 else -1
     return DraftedJoint(name, (low, high), float(np.clip(key, low, high)), model.joint(joints[best]).name, sign)
+
+
+def _geared(model: mujoco.MjModel, joint: DraftedJoint, ties: Couplings) -> DraftedJoint:
+    """The joint with its gear, and within the range of its horn."""
+    if joint.name not in ties.gears:
+        return joint
+    horn, gear = ties.gears[joint.name]
+    low, high = joint.range
+    if model.joint(horn).limited[0]:
+        room = float(np.abs(model.joint(horn).range).min()) / gear
+        low, high = max(low, -room), min(high, room)
+    return replace(joint, gear=gear, range=(low, high), home=float(np.clip(joint.home, low, high)))
 
 
 def _mutual(drafted: Sequence[DraftedJoint], notes: list[str]) -> tuple[DraftedJoint, ...]:

@@ -8,6 +8,7 @@ IDs, is guessed and marked with TODO.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,6 +54,8 @@ def main(args: argparse.Namespace) -> int:
                 report.line(f"no picture: {error}")
                 draws = False
         from servoid.hw.robot.description import load_robot
+        from servoid.sim.model import build
+        from servoid.tools.robots.compare import overlaps
         from servoid.tools.robots.draft import Choices, draft
         from servoid.tools.robots.home import bent_home
         from servoid.tools.robots.pictures import poses
@@ -69,8 +72,17 @@ def main(args: argparse.Namespace) -> int:
                 notes.append("home of every joint: the model has no keyframe; on straight knees no robot can walk")
             else:
                 notes.append("home of every joint: the model has no keyframe; its knees were bent by geometry")
-                _write(found.at_home(home), out)
+                found = found.at_home(home)
+                _write(found, out)
                 robot = load_robot(out)
+        if pairs := overlaps(robot, build(robot)):
+            notes.append(
+                f"{', '.join(f'{one} and {other}' for one, other in pairs)}: their shapes overlap at home, and would "
+                "push each other away; listed as `overlapping`, they pass through each other"
+            )
+            found = replace(found, overlapping=tuple(pairs))
+            _write(found, out)
+            robot = load_robot(out)
         report.line(
             f"wrote {out}: {len(found.joints)} joints, feet {', '.join(found.feet) or 'none'}, base {found.base}"
         )

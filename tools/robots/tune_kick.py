@@ -64,7 +64,7 @@ def main(args: argparse.Namespace) -> int:
         try:
             import cma
         except ImportError as error:
-            raise ConfigError("the search needs the package cma: pip install --editable '.[tune]'") from error
+            raise ConfigError("the search needs the package cma: pip install 'servoid[tune]'") from error
         from servoid.hw.robot.description import load_robot
         from servoid.stack.tasks import load_task
         from servoid.tools.motions.keyframes import load_authored

@@ -9,6 +9,8 @@ import numpy as np
 from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import turned
 
+HIGHEST = 2.2  # of the base's height at home: no hand of an OP3 comes higher than that, however its joints are
+
 
 @dataclass(frozen=True, kw_only=True)
 class Planning:

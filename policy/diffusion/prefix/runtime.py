@@ -11,11 +11,14 @@ A pure function of the request, its seed and the network. In a `Plan` the action
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Plan, PlanRequest
 from servoid.hw.robot.description import Robot
@@ -23,7 +26,7 @@ from servoid.policy.diffusion.prefix import target
 from servoid.policy.diffusion.prefix.frames import Anchor, BodyMotion, Frames, turned
 from servoid.policy.diffusion.prefix.model import PlannerModel
 from servoid.policy.diffusion.prefix.planner import PrefixPlanner
-from servoid.policy.diffusion.prefix.planning import Planning, led
+from servoid.policy.diffusion.prefix.planning import HIGHEST, Planning, led
 from servoid.policy.diffusion.rolling import seeded
 from servoid.policy.diffusion.runtime import one_thread
 from servoid.policy.text.captions import MOTIONS, caption
@@ -51,9 +54,12 @@ class PlannerRuntime:
             prefix = torch.zeros(1, self._model.config.prefix, size)
             self._planner.plan(prefix, words, target.none(self._frames, 1), [seeded(0)], 1)
 
-    def plan(self, request: PlanRequest) -> Plan:
-        """The plan of one robot's request, or of many at once. Raises ValueError where states are not finite, and
-        ConfigError for a sentence without an English word."""
+    def plan(self, request: PlanRequest, each: Sequence[Instruction] | None = None) -> Plan:
+        """The plan of one robot's request, or of many at once, with one call of the network a step for all of them.
+
+        `each`: what each of many is asked, where that is not the same. Raises ValueError where states are not finite,
+        and ConfigError for a sentence without an English word, or a target that cannot be.
+        """
         start, lead = time.perf_counter(), request.states.shape[:-2]
         raw = request.states.reshape(-1, *request.states.shape[-2:])
         if not np.isfinite(raw).all():
@@ -65,7 +71,8 @@ class PlannerRuntime:
         generators = [seeded(int(seed), int(age)) for seed, age in zip(seeds, ages, strict=True)]
         now = Anchor.before(executed, -1)
         with one_thread():
-            text, wanted = self._asked(request.instruction, len(raw), now, begin)
+            asked = each or [_of(request.instruction, i, len(raw)) for i in range(len(raw))]
+            text, wanted = self._asked(asked, now, begin)
             # All that the network says, also where the next plan comes sooner: trackers look ahead.
             count = max(self._planning.frames, self._model.config.frames)
             planned = self._planner.plan(
@@ -136,23 +143,12 @@ class PlannerRuntime:
     # -- what is asked -------------------------------------------------------------------------------------------------
 
     def _asked(
-        self, instruction: Instruction, batch: int, now: Anchor, begin: BodyMotion
+        self, asked: Sequence[Instruction], now: Anchor, begin: BodyMotion
     ) -> tuple[Tensor | None, target.BodyTarget]:
-        """Sentence and target, seen from where the plan begins."""
-        top = self._robot.walking.scale
-        velocity = np.broadcast_to(instruction.velocity, (batch, 3))
-        wanted: list[list[tuple[str, Array]]] = [[] for _ in range(batch)]
-        if instruction.stand:
-            sentences = [_STAND] * batch
-        elif instruction.text is not None:
-            sentences = [instruction.text] * batch
-        else:
-            sentences = [caption(twist, top) for twist in velocity]
-        if not instruction.stand:
-            self._add_places(wanted, instruction, velocity, batch)
-        told = [self._sentence(text) for text in sentences if text.strip()]
-        text = torch.cat(told) if len(told) == batch else None
-        targets = [target.of_points(self._frames, asked) for asked in wanted]
+        """Sentences and targets of what each is asked, seen from where its plan begins."""
+        told = [self._sentence(said) for one in asked if (said := self._said(one)).strip()]
+        text = torch.cat(told) if len(told) == len(asked) else None
+        targets = [target.of_points(self._frames, self._places(one)) for one in asked]
         whole = target.BodyTarget(
             *(torch.cat([getattr(one, name) for one in targets]) for name in ("places", "heading", "asked"))
         )
@@ -160,37 +156,42 @@ class PlannerRuntime:
         turn = begin.heading[:, -1] - now.heading
         return text, whole.moved(torch.from_numpy(away).float(), torch.from_numpy(turn).float())
 
-    def _add_places(
-        self, wanted: list[list[tuple[str, Array]]], instruction: Instruction, velocity: Array, batch: int
-    ) -> None:
-        if instruction.targets is not None:
-            for name, values in instruction.targets.items():
-                each = np.broadcast_to(values, (batch, *np.shape(values)[-1:]) if np.ndim(values) else (batch,))
-                if name == target.HEADING:
-                    each = np.clip(each, -self._planning.turn, self._planning.turn)
-                for asked, value in zip(wanted, each, strict=True):
-                    asked.append((name, np.atleast_1d(value)))
-        elif instruction.text is None and (instruction.goal is None or velocity.any()):
-            for asked, place, angle in zip(wanted, *self._led(instruction, velocity), strict=True):
-                asked += [("ground", place), (target.HEADING, np.atleast_1d(angle))]
-        elif instruction.goal is not None:
-            goal = np.broadcast_to(instruction.goal, (batch, 2))
-            for asked, place in zip(wanted, _within(goal, self._planning.reach), strict=True):
-                asked.append(("ground", place))
+    def _said(self, asked: Instruction) -> str:
+        if asked.stand:
+            return _STAND
+        return caption(asked.velocity, self._robot.walking.scale) if asked.text is None else asked.text
 
-    def _led(self, instruction: Instruction, velocity: Array) -> tuple[Array, Array]:
-        """Where the velocity leads to by the end of a plan, along an arc: places `(batch, 2)` m and turns `(batch,)`.
+    def _places(self, asked: Instruction) -> list[tuple[str, Array]]:
+        if asked.stand:
+            return []
+        if asked.targets is not None:
+            most, top = self._planning.turn, HIGHEST * self._robot.standing_height
+            for name, values in asked.targets.items():
+                if np.shape(values) == (3,) and values[2] > top:
+                    raise ConfigError(
+                        f"no part reaches {values[2]:.2f} m up, where '{name}' shall be; {top:.2f} m at most"
+                    )
+            return [
+                (name, np.atleast_1d(np.clip(values, -most, most) if name == target.HEADING else values))
+                for name, values in asked.targets.items()
+            ]
+        if asked.text is None and (asked.goal is None or asked.velocity.any()):
+            place, angle = self._led(asked)
+            return [("ground", place), (target.HEADING, np.atleast_1d(angle))]
+        return [] if asked.goal is None else [("ground", _within(asked.goal, self._planning.reach))]
+
+    def _led(self, asked: Instruction) -> tuple[Array, Array]:
+        """Where the velocity leads to by the end of a plan, along an arc: a place `(2,)` m and a turn `()`.
 
         A velocity that leads to a goal is one for this moment: a plan goes no further than the goal, and toward it, and
         turns no further than to face it.
         """
         seconds = (self._model.config.frames + self._planning.delay / self._frames.stride) * self._frames.dt
-        place, angle = led(velocity, seconds)
-        if instruction.goal is None:
+        place, angle = led(asked.velocity, seconds)
+        if asked.goal is None:
             return place, angle
-        goal = np.broadcast_to(instruction.goal, place.shape)
-        bearing = np.abs(np.arctan2(goal[:, 1], goal[:, 0]))
-        return _within(goal, np.linalg.norm(place, axis=-1, keepdims=True)), np.clip(angle, -bearing, bearing)
+        bearing = np.abs(np.arctan2(asked.goal[1], asked.goal[0]))
+        return _within(asked.goal, float(np.linalg.norm(place))), np.clip(angle, -bearing, bearing)
 
     def _sentence(self, text: str) -> Tensor:
         if text not in self._read:
@@ -203,7 +204,24 @@ class PlannerRuntime:
         return self._read[text]
 
 
-def _within(goal: Array, reach: float | Array) -> Array:
-    """Places `(batch, 2)` on the way to goals `(batch, 2)`, so far off at most."""
-    distance = np.linalg.norm(goal, axis=-1, keepdims=True)
-    return np.asarray(goal * np.minimum(reach / np.maximum(distance, 1e-9), 1.0))
+def _of(asked: Instruction, i: int, batch: int) -> Instruction:
+    """What one of many that are asked for the same is asked; values may be its own."""
+
+    def own(values: Array, *size: int) -> Array:
+        return np.asarray(np.broadcast_to(values, (batch, *size))[i])
+
+    targets = {
+        name: own(values) if name == target.HEADING else own(values, np.shape(values)[-1])
+        for name, values in (asked.targets or {}).items()
+    }
+    return replace(
+        asked,
+        velocity=own(asked.velocity, 3),
+        goal=None if asked.goal is None else own(asked.goal, 2),
+        targets=None if asked.targets is None else targets,
+    )
+
+
+def _within(goal: Array, reach: float) -> Array:
+    """A place `(2,)` m on the way to a goal `(2,)`, so far off at most."""
+    return np.asarray(goal * min(reach / max(float(np.linalg.norm(goal)), 1e-9), 1.0))

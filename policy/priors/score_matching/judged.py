@@ -15,9 +15,10 @@ from servoid.policy.priors.score_matching.score import Score
 SETTLED = 2.0  # s from the start that are not judged: to walk from standing takes a while
 
 
-def manner_of(raw: Array, prior: Prior) -> dict[str, float]:
+def manner_of(raw: Array, prior: Prior, style: Style | None = None) -> dict[str, float]:
     """Of a run's estimates, raw rows `(ticks, raw size)`: `prior_error` in multiples of held-out data's, and what
-    `beside` says of its joints at its mean speed, which means something where one speed was asked for all the time.
+    `beside` says of its joints at its mean speed, which means something where one speed was asked for all the time;
+    of a policy with a `style`, how often that is what it shows.
 
     Empty for a run too short to tell.
     """
@@ -28,11 +29,13 @@ def manner_of(raw: Array, prior: Prior) -> dict[str, float]:
         return {}
     frames, yaw = prior.features.of(raw)
     rows = last[:, None] + np.arange(-config.frames + 1, 1) * config.stride
-    windows = seen_from_last(frames[rows], yaw[rows]).astype(np.float32)
-    error = Score(prior, Style(), 0)(torch.from_numpy(windows)).mean(0)
+    style = style or Style()
+    windows = torch.from_numpy(seen_from_last(frames[rows], yaw[rows]).astype(np.float32))
+    error = Score(prior, style, 0)(windows).mean(0)
     names = ("error_high", "error_middle", "error_low")
     ratio = (error / [float(prior.header["results"][name]) for name in names]).mean()
     row = raw_layout(len(robot.joints)).split(raw[first:])
     way = row["displacement"][-1, :2] - row["displacement"][0, :2]
     speed = float(np.linalg.norm(way)) * robot.rate / max(len(raw) - first - 1, 1)
-    return {"prior_error": float(ratio), **beside(prior.manner, robot, row["position"][None], speed)}
+    shown = {**beside(prior.manner, robot, row["position"][None], speed), **prior.shown(windows, style)}
+    return {"prior_error": float(ratio), **shown}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError, Origin
 from servoid.policy.priors.features import PriorFeatures
 from servoid.policy.priors.score_matching.network import PriorConfig, PriorNetwork
+from servoid.policy.priors.score_matching.styles import StyleClassifier
 
 KIND = "prior"  # of a checkpoint
 _LIMB_TOLERANCE = 1e-4  # m by which a limb may differ from that of the robot that the prior was trained for
@@ -49,6 +50,7 @@ class Prior:
     std: Tensor
     manner: Mapping[str, Any]  # of the data by speed: see `servoid.policy.priors.manner`
     header: Mapping[str, Any]
+    classifier: StyleClassifier | None = None  # of a prior that knows styles
 
     @property
     def config(self) -> PriorConfig:
@@ -64,6 +66,16 @@ class Prior:
 
     def decode(self, windows: Tensor) -> Tensor:
         return windows * self.std + self.mean
+
+    def shown(self, windows: Tensor, style: Style) -> Mapping[str, float]:
+        """Shares of windows in physical units that show `style`, by the classifier: see `StyleClassifier.shares`.
+
+        Empty where no style is asked for. Raises ConfigError for an unknown one.
+        """
+        upper, lower = self.config.style(style.upper), self.config.style(style.lower)
+        if self.classifier is None or not (upper and lower):
+            return {}
+        return self.classifier.shares(self.encode(windows), upper, lower)
 
     def noise(self, noisy: Tensor, levels: Tensor, style: Style) -> Tensor:
         """The noise in normalised windows `(batch, frames, size)` at `levels` `(batch,)`, under a style.
@@ -95,6 +107,7 @@ class TrainedPrior:
     mean: Tensor
     std: Tensor
     manner: Mapping[str, Any]
+    classifier: Mapping[str, Tensor] = field(default_factory=dict)  # weights of what tells its styles, if any
 
 
 def save_prior(path: Path, trained: TrainedPrior, origin: Origin) -> None:
@@ -111,6 +124,7 @@ def save_prior(path: Path, trained: TrainedPrior, origin: Origin) -> None:
         manner=dict(trained.manner),
     )
     tensors = {f"network.{k}": v.detach().float().cpu().numpy() for k, v in trained.weights.items()}
+    tensors |= {f"classifier.{k}": v.detach().float().numpy() for k, v in trained.classifier.items()}
     tensors |= {"mean": trained.mean.numpy(), "std": trained.std.numpy()}
     checkpoint.write(path, tensors, head)
 
@@ -140,6 +154,13 @@ def load_prior(path: Path, robot: Robot, limbs: Limbs | None = None) -> Prior:
         missing = {name for name, _ in network.named_parameters()} - weights.keys()
         if missing:
             raise KeyError(sorted(missing)[0])
+        classifier = None
+        if config.styles:
+            classifier = StyleClassifier(config, features)
+            classifier.load_state_dict(
+                {k: torch.from_numpy(v) for k, v in checkpoint.part(tensors, "classifier").items()}
+            )
+            classifier.eval().requires_grad_(False)
         mean, std = (torch.from_numpy(tensors[name]) for name in ("mean", "std"))
     except CheckpointError:
         raise
@@ -150,7 +171,7 @@ def load_prior(path: Path, robot: Robot, limbs: Limbs | None = None) -> Prior:
             f"{path}: made for {head['robot']}, whose limbs are not those of {robot.name}: train a prior for this robot"
         )
     network.eval().requires_grad_(False)
-    return Prior(network, features, mean, std, head.get("manner", {}), head)
+    return Prior(network, features, mean, std, head.get("manner", {}), head, classifier)
 
 
 def _alike(a: Limbs, b: Limbs) -> bool:

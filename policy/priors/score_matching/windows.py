@@ -21,12 +21,14 @@ class PriorWindows:
     """Windows, an index of their last frame each: they are gathered and mirrored when a batch is drawn."""
 
     def __init__(
-        self, recordings: Mapping[str, Recording], features: PriorFeatures, config: PriorConfig, standing: bool = False
-    ) -> None:
+        self, recordings: Mapping[str, Recording], features: PriorFeatures, config: PriorConfig, standing: bool = False,
+        seconds: float = 0.0,
+    ) -> None:  # fmt: skip
         """`recordings` by style; those of one that has none are under an empty name.
 
-        With `standing` False, windows in which the robot was asked to stand throughout are left out. Raises
-        DatasetError where nothing is left to train on.
+        With `standing` False, windows in which the robot was asked to stand throughout are left out. Of each style so
+        many `seconds` are learned from, 0 being all; those that are held out stay the same. Raises DatasetError where
+        nothing is left to train on.
         """
         self.config, self.features = config, features
         span = (config.frames - 1) * config.stride
@@ -48,12 +50,19 @@ class PriorWindows:
             if len(presents) < 2:
                 raise DatasetError(f"{style or 'data'}: one episode alone: two are needed, one of them to measure on")
             every = max(2, round(1 / HELD_OUT))
+            left = round(seconds * features.robot.rate) or len(recording.raw)  # ticks
             for number, rows_of_episode in enumerate(presents):
-                (validation if number % every == 1 else training).append(rows_of_episode + start)
+                if number % every == 1:
+                    validation.append(rows_of_episode + start)
+                elif left > span:
+                    training.append(rows_of_episode[: left - span] + start)
+                    left -= len(training[-1]) + span
             styles.append(np.full(len(recording.raw), config.style(style or None)))
             start += len(recording.raw)
         self._frames, self._yaw = torch.from_numpy(np.concatenate(frames)), torch.from_numpy(np.concatenate(yaws))
         self._styles = torch.from_numpy(np.concatenate(styles))
+        if not training:
+            raise DatasetError(f"seconds {seconds:g}: shorter than the {span + 1} ticks of a window; learn from more")
         self.training, self.validation = (torch.from_numpy(np.concatenate(x)) for x in (training, validation))
         self._back = torch.arange(-config.frames + 1, 1) * config.stride
         generator = torch.Generator().manual_seed(0)

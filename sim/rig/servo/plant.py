@@ -16,8 +16,9 @@ from servoid.hw.contracts.world import Scene, Start
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
 from servoid.hw.seeds import Stream, generator
-from servoid.sim.friction import Friction
 from servoid.sim.ground import Ground
+from servoid.sim.joints.friction import Friction
+from servoid.sim.joints.loops import Loops
 from servoid.sim.model import FLOOR, TIMESTEP, build
 from servoid.sim.randomise import Body, draw
 from servoid.sim.scene import robot_bodies, scene_sensors
@@ -47,7 +48,7 @@ class Plant:
         robot = self.robot
         self.model = build(robot, scene)
         self.data = mujoco.MjData(self.model)
-        self._ground = Ground(self.model)
+        self._ground, self._loops = Ground(self.model), Loops(self.model, robot)
         self._bodies, self._scene = robot_bodies(self.model), scene_sensors(self.model)
         joints = [self.model.joint(name) for name in robot.names]
         self._qpos = np.array([int(joint.qposadr[0]) for joint in joints])
@@ -104,6 +105,7 @@ class Plant:
         data = self.data
         data.qvel[:] = 0.0
         data.qpos[self._qpos] = pose - self.body.zero
+        self._loops.close(data.qpos)
         data.qpos[0:2] = 0.0
         data.qpos[2], data.qpos[3:7] = self._stance()
         data.qpos[2] += CLEARANCE

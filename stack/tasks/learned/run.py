@@ -161,3 +161,13 @@ class RunDodgeball(LearnedRun):
     name = "dodgeball"
     description = "get out of the way of balls, which are not there in physics"
     learned = Dodgeball
+
+    def criteria(self, trace: Trace, episode: Draws) -> list[Criterion]:
+        return [Criterion.never("fell", trace.fallen), Criterion.never("was hit", self._hit(trace, episode))]
+
+    def metrics(self, trace: Trace, episode: Draws) -> dict[str, float]:
+        return {**super().metrics(trace, episode), "hit": float(self._hit(trace, episode))}
+
+    def _hit(self, trace: Trace, episode: Draws) -> bool:
+        """Whether a ball hit: from there on nothing is earned, and until then something is."""
+        return not self.rewards(trace, episode)[-1:].all()

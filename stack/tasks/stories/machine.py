@@ -31,6 +31,9 @@ FAR = 0.25  # m from there beyond which a robot that had come near walks there a
 AWAY = 0.08  # m farther off that a robot turns its back to a seat: its toes need room
 ROUND = 0.7  # of how far a robot is beside a seat
 REST_AT_END = 1.0  # s, of standing or sitting
+# m of the base before a seat's front edge as a story ends: lowered nearer to it, its back meets the seat and it tips.
+CLEAR_OF_SEAT = 0.16
+LEAVE_SECONDS = 8.0  # at most, to get there
 PROFILE = SpeedProfile(reverse=0.1, lateral=0.1)
 
 
@@ -59,6 +62,7 @@ class Machine(BaseBehaviour):
         self._events: list[str] = []
         self._lost: str | None = None
         self._over: int | None = None  # tick at which the story ended, done or given up
+        self._rests: int | None = None  # and from which on it rests then
         self._tick = 0
 
     def take_events(self) -> tuple[str, ...]:
@@ -66,13 +70,13 @@ class Machine(BaseBehaviour):
         return taken
 
     def done(self, state: State) -> bool:
-        return self._over is not None and self._tick - self._over >= self._ticks(REST_AT_END)
+        return self._rests is not None and self._tick - self._rests >= self._ticks(REST_AT_END)
 
     def instruct(self, tick: int, state: State, percept: Percept) -> Instruction:
         self._tick = tick
         self._recent.append(state)
         if self._over is not None:
-            return self._rest()
+            return self._end(tick - self._over, state, percept)
         thing, lost = self._see(percept)
         self._say(lost)
         act = self._act
@@ -117,6 +121,29 @@ class Machine(BaseBehaviour):
         text = self._act.sentence if seated and not self._performs else None
         return Instruction(np.zeros(3), skill=skill, text=text, stand=skill is None and text is None)
 
+    def _end(self, since: int, state: State, percept: Percept) -> Instruction:
+        """Step away from a seat, `since` so many ticks, and rest."""
+        if self._rests is None:
+            away = self._away(state, percept) if since < self._ticks(LEAVE_SECONDS) else None
+            if away is not None:
+                return Instruction(go_to_pose(away, 0.0, PROFILE, STAGE, NEAR), goal=away)
+            self._rests = self._tick
+        return self._rest()
+
+    def _away(self, state: State, percept: Percept) -> Array | None:
+        """Where to stand `(2,)` m, in the heading frame, for a robot just before a seat; None: it is not."""
+        number = next((i for i, thing in enumerate(self.episode.objects) if thing.kind == "seat"), None)
+        if number is None or percept.objects is None or self._act.done.seated:
+            return None
+        seat, (depth, width, _) = percept.objects[number], self.episode.objects[number].size
+        facing = float(yaw_of(seat[3:]))
+        x, y = turned(state.displacement[:2] - seat[:2], -facing)
+        before = x - depth / 2  # NaN where it is not seen
+        if not (-depth / 2 <= before < CLEAR_OF_SEAT and abs(y) < width / 2 + CLEAR_OF_SEAT):
+            return None
+        place = seat[:2] + turned(np.array([depth / 2 + CLEAR_OF_SEAT + STAGE, y]), facing)
+        return to_heading(place[None], state)[0]
+
     # -- what is seen --------------------------------------------------------------------------------------------------
 
     def _see(self, percept: Percept) -> tuple[Array, str | None]:
@@ -157,7 +184,7 @@ class Machine(BaseBehaviour):
                 return walk
             self._acting = self._tick
         if self._performs:
-            return Instruction(np.zeros(3), skill=act.skill)
+            return Instruction(np.zeros(3), skill=act.skill, stand=act.skill is None)
         return self._told(act, state, thing)
 
     def _too_late(self, act: Act) -> bool:

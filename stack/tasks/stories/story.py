@@ -20,8 +20,8 @@ from servoid.stack.tasks.stories.layout import laid_out
 from servoid.stack.tasks.stories.machine import Machine
 from servoid.stack.tasks.stories.told import StoryEpisode, StorySettings
 
+ARM = 1.25  # of the base's height at home: a hand reaches no higher by its skill
 HIP = 0.85  # of the base's height at home: a seat above that is higher than the hip
-ARM = 1.25  # of it: no hand reaches higher than that
 
 
 class Story(BaseTask):

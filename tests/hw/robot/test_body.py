@@ -191,8 +191,11 @@ def test_a_sole_in_another_frame_is_refused_and_one_left_out_is_found(tmp_path: 
 def test_a_urdf_is_the_same_robot_as_its_mjcf(tmp_path: Path) -> None:
     """With fixed links kept, and a mesh that only shows it and that MuJoCo cannot read left out."""
     inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
-    box = '<collision><origin xyz="0.02 0 -0.1"/><geometry><box size="0.1 0.06 0.02"/></geometry></collision>'
+    # Files made by xacro call every shape `collision`, and MuJoCo warned of each, in a screen full of lines.
+    shape = '<collision name="collision"><origin xyz="{}"/><geometry><box size="{}"/></geometry></collision>'
+    box = shape.format("0.02 0 -0.1", "0.1 0.06 0.02")
     shell = '<visual><geometry><mesh filename="package://own/shell.dae"/></geometry></visual>'
+    shell += shape.format("0 0 0", "0.01 0.01 0.01")
     torso, shank = f'<link name="torso">{inertial}{shell}</link>', f'<link name="shank">{inertial}{box}</link>'
     links = f'{torso}<link name="imu_link"/>{shank}'
     joints = """<joint name="f" type="fixed"><parent link="torso"/><child link="imu_link"/></joint>

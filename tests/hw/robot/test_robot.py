@@ -129,6 +129,7 @@ ROLL = "{name: l_sho_roll, servo: xm430-w350, id: 4, direction: 1, zero: 0.0, ra
         (ROLL, ROLL.replace("id: 4", "id: 2"), "duplicate servo ID 2: l_sho_roll and l_sho_pitch have it"),
         (ROLL, ROLL.replace("id: 4", "id: 200"), "duplicate servo ID 200: l_sho_roll and the board"),
         (ROLL, ROLL.replace("id: 4", "id: 253"), "servo IDs are 0..252, not 253"),
+        (ROLL, ROLL.replace("home: 1.2", "gear: 0, home: 1.2"), "joints[3].gear: must be positive, not 0"),
         (ROLL, ROLL.replace("direction: 1", "direction: 0"), "direction: l_sho_roll: must be 1 or -1, not 0"),
         (ROLL, ROLL.replace("xm430-w350", "xm430-w250"), "unknown servo 'xm430-w250'; did you mean 'xm430-w350'"),
         (ROLL, ROLL.replace("zero: 0.0", "zreo: 0.0"), "joints[3].zreo: unknown key; did you mean 'zero'"),

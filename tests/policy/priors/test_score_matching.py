@@ -23,6 +23,8 @@ from servoid.policy.priors.score_matching.generate import generate, starts, upri
 from servoid.policy.priors.score_matching.judged import manner_of
 from servoid.policy.priors.score_matching.model import Prior, Style, load_prior
 from servoid.policy.priors.score_matching.score import RunningMean, Score, likeness
+from servoid.policy.priors.score_matching.styles import StyleClassifier
+from servoid.policy.priors.score_matching.windows import PriorWindows
 from servoid.policy.recording import DatasetError
 from servoid.sim.kinematics import limbs_of
 from servoid.tools.learn.trainers.prior import read_by_style
@@ -82,6 +84,42 @@ def test_styles_are_composed_by_the_body(prior: Prior) -> None:
     free = prior.noise(noisy, levels, Style())
     guided = prior.noise(noisy, levels, Style.parse("low", 2.0))
     assert torch.allclose(guided, free + 2.0 * (low - free), atol=1e-5)
+
+
+def test_a_classifier_tells_styles_by_the_halves_that_show_them(prior: Prior) -> None:
+    """Two styles that differ in what the arms do: the legs cannot tell them."""
+    torch.manual_seed(0)
+    tells, arms = StyleClassifier(prior.config, prior.features), torch.from_numpy(~prior.features.lower)
+    optimiser, generator = torch.optim.Adam(tells.parameters(), 3e-3), torch.Generator().manual_seed(0)
+
+    def drawn(count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        styles = torch.randint(1, 3, (count,), generator=generator)
+        shift = (styles[:, None, None] - 1.5) * 2.0 * arms
+        return torch.randn(count, prior.config.frames, prior.config.size, generator=generator) + shift, styles
+
+    for _ in range(80):
+        optimiser.zero_grad()
+        tells.loss(*drawn(64), generator).backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+    seen, styles = drawn(400)
+    whole, upper, lower = (tells.told(seen) == styles).float().mean(1).tolist()
+    assert min(whole, upper) > 0.95
+    assert lower < 0.65
+    first = seen[styles == 1]
+    assert tells.shares(first, 1, 1)["style"] > 0.95
+    composed = tells.shares(first, 1, 2)
+    assert composed["upper_style"] > 0.95
+    assert composed["style"] <= composed["lower_style"]  # both halves must show theirs
+
+
+def test_a_prior_of_styles_tells_which_is_shown_and_keeps_that(prior: Prior) -> None:
+    assert prior.classifier is not None
+    found = prior.shown(windows(prior), Style.parse("high+low"))
+    assert set(found) == {"style", "upper_style", "lower_style"}
+    assert prior.shown(windows(prior), Style()) == {}
+    with pytest.raises(ConfigError, match="not in this prior"):
+        prior.shown(windows(prior), Style.parse("none"))
+    assert {"style", "upper_style", "lower_style"} <= set(prior.header["results"])
 
 
 def test_an_unknown_style_is_named(prior: Prior) -> None:
@@ -176,6 +214,18 @@ def test_data_without_motion_is_refused(tmp_path: Path) -> None:
         trainer(tmp_path / "single", tmp_path / "out")
 
 
+def test_less_of_the_data_is_learned_from_and_as_much_measured_on(synthetic_dataset: Path, tmp_path: Path) -> None:
+    recordings, made = read_by_style(synthetic_dataset, ROBOT), trainer(synthetic_dataset, tmp_path)
+    whole, span = made.windows, (made.config.frames - 1) * made.config.stride
+    few = PriorWindows(recordings, made.features, made.config, seconds=3.0)
+    ticks = 3 * ROBOT.rate
+    assert ticks - 3 * span <= len(few.training) < ticks - span  # in pieces of two episodes
+    assert set(few.training.tolist()) < set(whole.training.tolist())
+    assert torch.equal(few.validation, whole.validation)
+    with pytest.raises(DatasetError, match=r"seconds 0\.1: shorter than"):
+        PriorWindows(recordings, made.features, made.config, seconds=0.1)
+
+
 def test_folders_of_datasets_are_styles(tmp_path: Path, synthetic_dataset: Path) -> None:
     write_dataset(tmp_path / "data" / "wide", ROBOT, episodes=2, ticks=30)
     assert list(read_by_style(tmp_path / "data", ROBOT)) == ["wide"]
@@ -192,3 +242,13 @@ def test_the_shipped_prior_knows_motion_of_this_robot() -> None:
     assert score(still).mean() > 2.0 * score(drawn).mean()
     speeds, cadences = found.manner["speed"], found.manner["cadence"]
     assert len(speeds) == len(cadences) >= 3
+
+
+def test_the_shipped_styles_are_told_and_compose() -> None:
+    """Windows drawn with the arms of one style on the legs of another show both."""
+    found = load_prior(checkpoint.resolve("styles", ROBOT), ROBOT, limbs_of(ROBOT))
+    assert found.header["results"]["style"] > 0.95
+    both = Style.parse("zombie+wide")
+    shown = found.shown(generate(found, 32, both, 0), both)
+    assert min(shown["upper_style"], shown["lower_style"]) > 0.9
+    assert found.shown(generate(found, 32, Style.parse("zombie"), 0), both)["lower_style"] < 0.5

@@ -7,22 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from made_planner import write_planner
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, PlanRequest
 from servoid.hw.robot.description import load_robot
-from servoid.policy.checkpoint import Origin
-from servoid.policy.diffusion.prefix import target
-from servoid.policy.diffusion.prefix.config import PlannerConfig
 from servoid.policy.diffusion.prefix.frames import Frames
-from servoid.policy.diffusion.prefix.model import PlannerModel, load, save
-from servoid.policy.diffusion.prefix.network import PlannerNetwork
+from servoid.policy.diffusion.prefix.model import load
 from servoid.policy.diffusion.prefix.runtime import PlannerRuntime
-from servoid.policy.features import Normaliser, raw_layout
+from servoid.policy.features import raw_layout
 from servoid.policy.references.plan import PlanReference, row_layout
-from servoid.policy.text.encoder import load_encoder
 from servoid.stack.control.closed_loop import ClosedLoopSettings, closed_loop_policy, load_settings
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.policies import make_policy, policy_fingerprint
@@ -34,29 +29,9 @@ FRAMES = Frames(ROBOT)
 STILL = Instruction(np.zeros(3), text="wave")
 
 
-def _standing() -> Array:
-    """A frame of standing at home `(size,)`."""
-    place = np.tile([0.0, 0.0, ROBOT.standing_height], (2, 1))
-    motion = FRAMES.motion(place, np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)), np.tile(ROBOT.home, (2, 1)))
-    frame: Array = FRAMES.to_relative(motion)[0]
-    return frame
-
-
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A planner of 6 frames whose plans hardly leave standing: its weights are random and its deviations small."""
-    torch.manual_seed(0)
-    size, encoder = FRAMES.layout.size, load_encoder("words")
-    config = PlannerConfig(
-        layers=1, width=32, prefix=4, frames=6, levels=5, words=6,
-        size=size, target_size=target.size(FRAMES), text="words", text_size=encoder.token_size,
-    )  # fmt: skip
-    path = tmp_path_factory.mktemp("planner") / "planner.safetensors"
-    around = Normaliser(_standing().astype(np.float32), np.full(size, 0.01, np.float32)).to_torch()
-    model = PlannerModel(PlannerNetwork(config), around, ("wave", "kick", "walk forward", "stand still"))
-    weights = dict(model.network.named_parameters())
-    save(path, weights, model, FRAMES, Origin("nothing", "Apache-2.0", {}, {}))
-    return str(path)
+    return write_planner(tmp_path_factory.mktemp("planner") / "planner.safetensors", ROBOT)
 
 
 def _settings(checkpoint: str, **changes: object) -> ClosedLoopSettings:
@@ -128,6 +103,10 @@ def test_velocity_goal_and_targets_change_a_plan_and_a_far_goal_is_asked_for_in_
     np.testing.assert_allclose(far, further, atol=1e-6)
     with pytest.raises(ConfigError, match="tail"):
         plan(Instruction(np.zeros(3), targets={"tail": np.zeros(3)}))
+    with pytest.raises(ConfigError, match="not finite: was it seen"):
+        plan(Instruction(np.zeros(3), targets={"left hand": np.full(3, np.nan)}))
+    with pytest.raises(ConfigError, match=r"no part reaches 0\.90 m up, where .left hand. shall be; 0\.57 m at most"):
+        plan(Instruction(np.zeros(3), targets={"left hand": np.array([0.1, 0.0, 0.9])}))
     with pytest.raises(ConfigError, match="no English word"):
         plan(Instruction(np.zeros(3), text="???"))
 
@@ -150,6 +129,20 @@ def test_a_velocity_that_leads_to_a_goal_is_planned_for_no_further_than_it(check
     most, more, less = (plan((0.0, 0.0, 0.0), targets=asked) for asked in targets)
     np.testing.assert_allclose(most, more, atol=1e-6)
     assert not np.allclose(most, less, atol=1e-5)
+
+
+def test_many_that_are_asked_for_different_things_plan_as_each_does_alone(checkpoint: str) -> None:
+    runtime, one = _runtime(checkpoint), _request()
+    asked = [
+        STILL,
+        Instruction(np.array([0.2, 0.0, 0.0])),
+        Instruction(np.zeros(3), text="kick", targets={"left hand": np.array([0.1, 0.1, 0.3])}),
+        Instruction(np.zeros(3), stand=True),
+    ]
+    many = replace(one, states=np.repeat(one.states[None], 4, 0), seeds=np.zeros(4, int))
+    together = runtime.plan(many, asked)
+    for plan, instruction in zip(together.actions, asked, strict=True):
+        np.testing.assert_allclose(plan, runtime.plan(replace(one, instruction=instruction)).actions, atol=1e-5)
 
 
 def test_a_sentence_is_read_as_the_nearest_of_the_training(checkpoint: str) -> None:

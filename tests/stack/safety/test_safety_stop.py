@@ -47,6 +47,21 @@ def test_a_robot_that_stops_follows_its_policy_until_it_rests_and_is_lowered_the
     assert rig.guard.cause == "interrupt"
 
 
+def test_a_robot_that_sits_is_damped_as_it_sits():
+    """Asked to stand, or lowered, it would push itself off the seat."""
+    rig = Rig().running()
+    rig.step(ROBOT.home)
+    rig.guard.sits = True
+    rig.guard.stop("interrupt", "Ctrl-C")
+    assert rig.guard.phase is Phase.DAMPED
+    rig.step(ROBOT.home)
+    assert rig.body.sent[-1].mode is Mode.DAMP
+    rig = Rig().running()
+    rig.guard.sits, rig.guard.sits = True, False  # it has risen since
+    rig.guard.stop("task", "done")
+    assert rig.guard.phase is Phase.STOPPING
+
+
 def test_a_robot_that_does_not_come_to_rest_is_lowered_all_the_same():
     rig = Rig().running()
     rig.guard.stop("interrupt", "Ctrl-C")

@@ -86,6 +86,25 @@ def test_a_ball_that_hits_ends_what_is_earned() -> None:
     assert far is not None
     assert near is not None
     assert np.hypot(*near[0, :2]) < 0.3 < np.hypot(*far[0, :2])
+    assert not task.success(trace(np.zeros((1000, 2))), episode)
+    assert task.metrics(trace(np.zeros((1000, 2))), episode)["hit"] == 1.0
+    away = trace(np.full((hit - 1, 2), 50.0) * np.arange(hit - 1)[:, None] / hit)  # far from any
+    assert task.success(away, episode)
+    assert not task.success(replace(away, fallen=True), episode)
+
+
+def test_what_is_told_of_a_ball_is_what_was_seen_of_it() -> None:
+    """Its velocity is known once it was seen twice, and with the error of where it was first seen."""
+    task = RunDodgeball(LearnedSettings(seconds=20.0), DT, ROBOT)
+    thrown = task.behaviour(replace(task.scenario(np.random.default_rng(2)), ticks=np.array([0])))
+    seen = [thrown.instruct(tick, state(), PERCEPT).obstacles for tick in range(60)]
+    assert all(balls is not None for balls in seen)
+    balls = np.array(seen)[:, 0]
+    assert not balls[:5, 3:].any()
+    truth = (balls[59, :2] - balls[0, :2]) / (59 * DT)
+    errors = np.linalg.norm(balls[6:, 3:] - truth, axis=1)
+    assert 0.0 < errors[-1] < errors[0] < 0.5
+    assert errors[-1] < 0.05
 
 
 def test_draws_are_the_same_for_every_policy() -> None:

@@ -15,6 +15,7 @@ from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import load_robot
+from servoid.policy.diffusion.prefix.planning import HIGHEST
 from servoid.stack.runtime.run import RunSettings
 from servoid.stack.tasks import load_task
 from servoid.stack.tasks.stories.condition import Moment, moments
@@ -53,12 +54,19 @@ def _at(place: Array, heading: float) -> State:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("task", "chosen"), [("strike", {"plan": "punch-left"}), ("strike", {"plan": "kick-right"}), ("rise", {})]
+    ("task", "chosen"),
+    [
+        ("strike", {"plan": "punch-left"}),
+        ("strike", {"plan": "kick-right"}),
+        ("rise", {}),
+        ("sit", {"sit": "0.22,0.24", "least_bearing": "3.0"}),
+    ],
 )
 def test_the_robot_does_what_it_is_asked_by_the_truth(task: str, chosen: dict[str, str]) -> None:
     judged = judge(RunSettings(task, policy="expert", seed=1, set=chosen))
     assert judged.row["success"], judged.assignment.criteria(judged.trace)
     assert judged.row["metrics"]["acts_share"] == 1.0
+    assert not judged.row["fell_ending"], "a seat is in the way of whoever is lowered before it"
     assert judged.trace.objects is not None
     nothing = replace(judged.trace, objects=np.repeat(judged.trace.objects[:1], len(judged.trace.objects), 0))
     if task == "strike":
@@ -79,6 +87,9 @@ def test_acts_begin_when_those_before_them_are_done_and_are_judged_in_their_orde
     for state in (first, second):
         for _ in range(round(0.5 / ROBOT.dt) + 2):
             instruction = machine.instruct(ticks, state, Percept("task", 0.0))
+            assert instruction.stand or instruction.velocity.any(), (
+                "what walks to places is asked for none, or to stand"
+            )
             ticks += 1
     told = [text.split(",")[0] for text in machine.take_events()]
     assert told == ["'reach' is done", "'reach' is done"]
@@ -88,6 +99,29 @@ def test_acts_begin_when_those_before_them_are_done_and_are_judged_in_their_orde
         machine.instruct(ticks, second, Percept("task", 0.0))
         ticks += 1
     assert machine.done(second)
+
+
+def test_whoever_has_risen_steps_away_from_the_seat_before_the_story_ends() -> None:
+    """Lowered just before it, its back met the seat, and it tipped over."""
+    _, episode, machine = _story(plan="sit,rise")
+    seen, seat = Percept("scene", 0.0, objects=_poses(episode)), episode.objects[0]
+    ahead = np.array([np.cos(seat.heading), np.sin(seat.heading)])
+
+    def before(edge: float) -> State:
+        return _at(np.array(seat.place) + (seat.size[0] / 2 + edge) * ahead, seat.heading)
+
+    low = np.array([*before(-0.02).displacement[:2], seat.size[2] + 0.05])
+    for tick in range(60):
+        machine.instruct(tick, replace(before(-0.02), displacement=low), seen)
+    for tick in range(60, 90):
+        asked = machine.instruct(tick, before(0.01), seen)
+    assert [text.split(",")[0] for text in machine.take_events()] == ["'sit' is done", "'rise' is done"]
+    assert asked.velocity[0] > 0.03
+    assert not machine.done(before(0.01))
+    assert machine.instruct(90, before(0.18), seen).stand
+    for tick in range(91, 142):
+        assert machine.instruct(tick, before(0.01), seen).stand, "once it rests it stays"
+    assert machine.done(before(0.18))
 
 
 def test_an_act_that_is_not_done_in_time_ends_the_story_and_says_so() -> None:
@@ -137,6 +171,7 @@ def test_words_ask_for_the_same_acts_by_a_sentence_and_by_where_parts_shall_be()
     assert near.text == "punch with the left hand"
     assert near.targets is not None
     np.testing.assert_allclose(near.targets["left hand"], [0.13, 0.03, 0.33], atol=0.02)
+    assert near.targets["left hand"][2] < HIGHEST * ROBOT.standing_height, "else nothing would be planned"
 
 
 def test_near_the_seat_it_is_asked_to_turn_and_then_to_step_and_not_to_walk_there_anew() -> None:

@@ -6,8 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from made_planner import write_planner
 
 from servoid.hw.config import ConfigError
+from servoid.hw.robot.description import load_robot
 from servoid.stack.control.policies import policy_fingerprint
 from servoid.stack.log.flightlog import as_now, read_log
 from servoid.stack.log.format import FORMAT
@@ -50,6 +52,21 @@ def test_what_a_policy_is_made_of_is_in_the_log_and_changes_are_named(tmp_path: 
     assert as_now(log.header | {"policy": log.header["policy"] | {"planner": older}}) == log.header
     del log.header["policy"]["planner"], log.header["policy"]["odometry_sha256"]  # of an older program
     assert changes(log) == []
+
+
+def test_a_closed_loop_is_repeated_by_the_settings_of_its_log(tmp_path: Path) -> None:
+    checkpoint, mine = write_planner(tmp_path / "planner.safetensors", load_robot()), tmp_path / "mine.yaml"
+    mine.write_text(f"checkpoint: {checkpoint}\ntracker: ''\nframes: 6\ndelay: 2\n")
+    turn = {"sentence": "turn left"}  # which is told as the planner knows it
+    run(RunSettings("text", policy=str(mine), seconds=0.4, set=turn, record=tmp_path / "a.mcap"))
+    log = read_log(tmp_path / "a.mcap")
+    assert log.messages["/plan"]
+    assert changes(log) == []
+    mine.write_text(f"checkpoint: {checkpoint}\ntracker: ''\nframes: 4\ndelay: 4\n")
+    said = ["the file of the closed loop's settings (those of the log are used)"]
+    assert changes(log) == said
+    mine.unlink()
+    assert (changes(log), replay(log)[1]) == (said, None)
 
 
 @pytest.mark.slow

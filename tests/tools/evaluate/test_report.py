@@ -103,7 +103,7 @@ def test_a_time_that_no_episode_came_to_was_not_reached() -> None:
 def test_a_metric_that_the_task_does_not_have_is_not_taken_for_episodes_that_ended_early() -> None:
     line = one(replace(ERROR, metric=Metric("eror_m")), Measured(records(5, 5)))
     assert "the task measures no 'eror_m', but " in line["note"]
-    assert ", error_m, ever_fell, fell_or_broken_off, " in line["note"]
+    assert ", error_m, ever_fell, fell_ending, fell_or_broken_off, " in line["note"]
     assert "had ended" not in line["note"]
 
 

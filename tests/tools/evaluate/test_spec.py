@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from servoid.hw.config import ConfigError
+from servoid.hw.config import ConfigError, available
 from servoid.tools.cli import main
 from servoid.tools.evaluate.metrics import METRICS, Metric
 from servoid.tools.evaluate.spec import Beside, load_evaluation
@@ -111,3 +111,8 @@ def test_the_example_of_the_documentation_is_one(tmp_path: Path) -> None:
     assert [row.name for row in rows] == ["mine/goal", "mine/slow", "mine/way", "mine/goal@randomised"]
     for name in METRICS:
         assert f"`{name}`" in page
+
+
+def test_every_shipped_evaluation_can_be_read() -> None:
+    for name in available("evaluation"):
+        assert load_evaluation(name).rows

@@ -14,7 +14,7 @@ import pytest
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Observation, Sensors
 from servoid.hw.robot.description import Robot, load_robot, load_servo, save_servo
-from servoid.sim.friction import Friction
+from servoid.sim.joints.friction import Friction
 from servoid.sim.rig.in_process import InProcessBackend
 from servoid.sim.rig.rig import Rig
 from servoid.stack.log.flightlog import read_log
@@ -180,6 +180,7 @@ def test_on_a_virtual_rig_the_command_writes_servo_files_that_load(
         (["--port", "virtual", "--load", "l_kne_link=1"], "no body (that carries a load) named 'l_kne_link'"),
         (["--port", "virtual", "--from", "a.mcap"], "--from fits what was recorded, and --port is for recording"),
         (["--from", "nowhere.mcap"], "nowhere.mcap: cannot be read"),
+        (["--from", "nowhere.mcap", "--out", "/dev/null/x"], "cannot be written (Not a directory)"),
         ([], "port missing"),
     ],
 )

@@ -388,6 +388,8 @@ def test_files_are_split_by_size_and_found_again(tmp_path: Path, monkeypatch: py
         ("--append --force", "drop one of them"),
         ("--crouched 2", "must be between 0 and 1"),
         ("--crouched 0.5 --skills", "walks upright"),
+        ("--style zombie", "how the expert walks upright"),
+        ("--style zomby --policy expert", "did you mean 'zombie'"),
     ],
 )
 def test_options_that_cannot_be(option: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

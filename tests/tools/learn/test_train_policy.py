@@ -18,6 +18,7 @@ from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError, read_header
+from servoid.policy.mlp import Mlp
 from servoid.policy.priors.adversarial.discriminator import (
     Adversary,
     Discriminator,
@@ -30,6 +31,7 @@ from servoid.policy.priors.score_matching.model import Style, load_prior
 from servoid.policy.priors.score_matching.windows import PriorWindows
 from servoid.policy.priors.task_policy import TaskPolicy
 from servoid.policy.recording import DatasetError, read_recording
+from servoid.policy.references.style import load_style
 from servoid.sim.kinematics import limbs_of
 from servoid.stack.tasks.learned import LEARNED_TASKS, TaskState, load_learned_task
 from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
@@ -133,7 +135,8 @@ def test_what_is_asked_next_is_no_merit_of_what_was_done(prior: Path) -> None:
 def test_a_place_and_a_ball_are_not_asked_for_where_it_is_to_stand() -> None:
     stand = Instruction(np.zeros(3), stand=True)
     assert np.array_equal(GOALS["location"].observe(stand, ROBOT.walking), [0.0, 0.0, 1.0, 0.0])
-    assert np.hypot(*GOALS["ball"].observe(stand, ROBOT.walking)[:2]) >= 1.0
+    assert np.array_equal(GOALS["ball"].observe(stand, ROBOT.walking)[:4], [0.0, 0.0, 1.0, 0.0])
+    assert np.hypot(*GOALS["ball"].observe(stand, ROBOT.walking)[4:6]) >= 1.0
 
 
 def test_generated_starts_move_and_stand_on_the_ground(prior: Path) -> None:
@@ -161,6 +164,10 @@ def test_rewards_are_highest_for_what_is_asked() -> None:
     assert steering.reward(sideways, state((0, 0), 0.0, (0.0, 0.1)))[0] == pytest.approx(1.0)
     assert steering.reward(sideways, state((0, 0), np.pi / 2, (0.0, 0.1)))[0] == pytest.approx(0.7)
     assert steering.reward(sideways, state((0, 0), 0.0, (0.0, -0.01)))[0] == pytest.approx(0.3)
+    away, aside = (state((0, 0), yaw, (0.0, 0.1)) for yaw in (np.pi, 2.0))
+    assert steering.reward(sideways, aside)[0] == pytest.approx(steering.reward(sideways, away)[0])
+    assert steering.guided(sideways, aside)[0] > steering.guided(sideways, away)[0] + 0.1  # training says where to turn
+    assert steering.guided(sideways, state((0, 0), 0.0, (0.0, 0.1)))[0] == pytest.approx(1.0)
     ball = LEARNED_TASKS["dodgeball"](ROBOT)
     thrown = ball.draw(np.random.default_rng(0), np.array([1.0, -1.0]))[None]
     hit = [bool(ball.ended(ball.advance(thrown, t), state((1, -1), 0.0, (0.0, 0.0)))[0]) for t in np.arange(0, 6, 0.1)]
@@ -195,11 +202,86 @@ def test_what_a_policy_sees_of_an_instruction() -> None:
     assert np.allclose(GOALS["location"].observe(behind, walking), [[-1, 0, -1, 0], [0, 1, 0, 1]])
     things = np.array([[2.0, 0.0, 0.1, -0.5, 0.0], [0.0, -1.0, 0.1, 0.0, 0.25]])
     seen = GOALS["ball"].observe(Instruction(np.zeros(3), obstacles=things), walking)
-    assert np.allclose(seen, [0.0, -1.0, 0.0, 0.5])  # the nearest
-    with pytest.raises(ConfigError, match="run obstacle"):
+    assert np.allclose(seen[4:], [0.0, -1.0, 0.0, 0.5])  # the nearest
+    comes = np.array([[1.0, -0.1, 0.05, -0.4, 0.0], [1.0, 0.1, 0.05, -0.4, 0.0]])  # past it on its right, and its left
+    seen = GOALS["ball"].observe(Instruction(np.zeros((2, 3)), obstacles=comes[:, None]), walking)
+    assert np.allclose(seen[:, :4], [[0.0, 1.0, 0.0, 1.0], [0.0, -1.0, 0.0, -1.0]])  # aside, away from it
+    across = np.array(
+        [[0.02, 1.0, 0.05, 0.0, -0.4], [0.2, 1.0, 0.05, 0.0, -0.4]]
+    )  # from its left, and well ahead of it
+    seen = GOALS["ball"].observe(Instruction(np.zeros((2, 3)), obstacles=across[:, None]), walking)
+    assert np.allclose(seen[:, 2:4], [[1.0, 0.0], [-1.0, 0.0]])  # straight on, though the other side is nearer, or back
+    passed, beside = comes * [-1, 1, 1, 1, 1], comes + np.array([0.0, 0.5, 0.0, 0.0, 0.0])
+    for ball in (passed[0], beside[1], comes[0] * [1, 1, 1, 0, 0]):
+        seen = GOALS["ball"].observe(Instruction(np.zeros(3), obstacles=ball[None]), walking)
+        assert np.allclose(seen[:4], [0.0, 0.0, 1.0, 0.0])  # no reason to go anywhere
+    with pytest.raises(ConfigError, match="run dodgeball"):
         GOALS["ball"].observe(turning, walking)
     with pytest.raises(ConfigError, match="the task gives none"):
         GOALS["location"].observe(turning, walking)
+
+
+def test_training_rewards_who_is_out_of_a_balls_way_before_it_is_there() -> None:
+    ball = LEARNED_TASKS["dodgeball"](ROBOT)
+    thrown = np.array([[1.0, 0.0, -0.4, 0.0, 1.0, 0.0, 0.0]])  # along the x axis, at the origin
+
+    def guided(y: float, velocity: float) -> float:
+        known = task_state(position=np.array([[0.0, y]]), velocity=np.array([[0.0, velocity]]))
+        return float(ball.guided(thrown, known)[0])
+
+    for side in (1.0, -1.0):
+        into, stands, leaves, clear = (
+            guided(*(side * np.array(at))) for at in ((0.1, -0.2), (0.1, 0.0), (0.1, 0.3), (0.4, 0.0))
+        )
+        assert into < stands < leaves < clear
+        assert leaves > stands + 0.2
+    assert ball.guided(ball.advance(thrown, 2.2), task_state(position=np.zeros((1, 2))))[0] == 0.0
+
+
+@pytest.mark.slow
+def test_a_policy_that_sees_less_begins_another(prior: Path, tmp_path: Path) -> None:
+    """It does what it did, whatever else there is to see."""
+    trainer = PolicyTrainer(
+        made(prior, "dodgeball", settings := replace(SETTINGS, hidden=(256, 128))), Style(), settings, tmp_path, prior
+    )
+    shipped = checkpoint.resolve("location")
+    trainer.start(resume=False, init=shipped)
+    seen = trainer.env.observations["actor"]
+    known, _ = Mlp.load(shipped, "task_policy", ROBOT, seen.shape[1] - 4)
+    theirs, ours = np.array(read_header(shipped)["config"]["reach"]), trainer.env.reach
+    assert np.allclose(ours * trainer.actor()(seen), theirs * known(seen[:, :-4]), atol=1e-5)  # the same targets
+    head, tensors = checkpoint.read(shipped)
+    slow = tmp_path / "slow.safetensors"
+    checkpoint.write(slow, tensors, {**head, "config": {**head["config"], "stride": 4}})
+    with pytest.raises(ConfigError, match="decides every 4 ticks, and here it is every 2"):
+        trainer.adopt(slow)
+
+
+@pytest.mark.slow
+def test_a_policy_begins_in_the_pose_of_a_style(tmp_path: Path) -> None:
+    """What walked with hanging arms decides the same where they are stretched out, and holds them there."""
+    shipped, styles = checkpoint.resolve("speed"), checkpoint.resolve("styles")
+    known = load_prior(styles, ROBOT, limbs_of(ROBOT))
+    settings, task, style = (
+        replace(SETTINGS, hidden=(256, 128)),
+        load_learned_task("speed", ROBOT),
+        Style.parse("zombie"),
+    )
+    trainer = PolicyTrainer(environment(task, known, style, settings, 6, 0), style, settings, tmp_path, styles)
+    trainer.start(resume=False, init=shipped)
+    before, _ = Mlp.load(shipped, "task_policy", ROBOT, trainer.env.observations["actor"].shape[1])
+    reach, shoulder = np.array(read_header(shipped)["config"]["reach"]), ROBOT.names.index("l_sho_pitch")
+    state, moved = trainer.env.fleet.state, trainer.actor()
+    hanging = np.tile(ROBOT.home, (6, 1))
+    offset = load_style("zombie", ROBOT).held(ROBOT)[1] - ROBOT.home
+    seen = [
+        TaskObservation(ROBOT, task.seen, (6,))(replace(state, position=at), at, np.zeros((6, 2)))
+        for at in (hanging, hanging + offset)
+    ]
+    decided, then = reach * before(seen[0]), trainer.env.reach * moved(seen[1])
+    legs = ROBOT.leg_index.ravel()
+    assert np.abs(then - decided)[:, legs].max() < 0.1
+    assert np.allclose(then[:, shoulder] - decided[:, shoulder], -1.5, atol=0.2)  # from 0.3 rad at home to -1.2
 
 
 def test_a_task_without_a_reward_is_refused(tmp_path: Path) -> None:

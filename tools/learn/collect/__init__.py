@@ -7,6 +7,9 @@ copies are not stored, because training mirrors each window as it reads it: the 
 With `--crouched` a share of the commands asks for a walk lower than upright, by up to an eighth of the standing height:
 what a planner learns from that passes under a bar.
 
+With `--style` they walk in a style of configs/styles, arms spread or crouched, say: data for a motion prior that knows
+styles (`servoid train prior`), one dataset for each in a folder of its name.
+
 With `--skills` the worlds also perform the skills of configs/skills that take nothing but the ground, each for as many
 ticks, and go from any of them to any other and to walking, some in mid motion. Each tick says what was told, and how
 long a skill has lasted: what a model learns from that follows sentences about skills.
@@ -66,6 +69,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=0.0,
         metavar="SHARE",
         help="share of the commands that ask for a walk lower than upright (default: 0)",
+    )
+    parser.add_argument(
+        "--style", metavar="NAME|FILE", help="walk in this style, of configs/styles (default: as the expert walks)"
     )
     parser.add_argument(
         "--seconds", type=positive, default=15.0, metavar="S", help="length of an episode (default: %(default)g)"
@@ -131,6 +137,8 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError("--crouched does not go with --skills, which are begun from walks upright: drop one of them")
     if not 0.0 <= args.noise[0] <= args.noise[1] < math.inf:
         raise ConfigError(f"--noise {args.noise[0]:g} {args.noise[1]:g}: must not be negative, the lower one first")
+    if args.style is not None and (args.skills or args.crouched or args.policy == "gait"):
+        raise ConfigError("--style is how the expert walks upright: drop --skills, --crouched or --policy gait")
     if args.skills and args.policy == "gait":
         raise ConfigError("--skills goes with --policy expert or a tracker: the gait cannot walk on from a skill")
     if args.workers < 0:
@@ -165,6 +173,7 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
         noise=(args.noise[0], args.noise[1]),
         plain_odometry=args.plain_odometry,
         crouched=args.crouched,
+        style=args.style,
         threads=args.threads or (1 if args.workers > 1 or args.ray is not None else 0),
     )
     performances, tally = how.performances(1), RecordingTally()

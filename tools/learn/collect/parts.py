@@ -40,6 +40,7 @@ class FleetRecipe:
     plain_odometry: bool
     threads: int
     crouched: float = 0.0
+    style: str | None = None
 
     @property
     def disturbances(self) -> DisturbanceSettings:
@@ -54,6 +55,8 @@ class FleetRecipe:
             "policy": {"name": "gait"} if self.policy == "gait" else _source(resolve(self.policy, robot)),
             "odometry": {"name": "legs"} if self.plain_odometry else _source(resolve("odometry", robot)),
         }
+        if self.style is not None:
+            found["style"] = _style_source(self.style)
         return found | ({"tracker": _source(resolve(self.tracker, robot))} if self.skills else {})
 
     def performances(self, worlds: int) -> Performances | None:
@@ -68,8 +71,10 @@ class FleetRecipe:
 
     def cutter(self, seed: int) -> EpisodeCutter:
         """A fleet of that seed, to be recorded. Raises ConfigError."""
+        from servoid.policy.references.style import load_style
         from servoid.stack.control.fleet import Fleet
         from servoid.stack.control.gait import GaitPolicy
+        from servoid.stack.control.styled import StyledExpert
         from servoid.stack.control.tracker import ExpertPolicy
         from servoid.stack.estimation.odometry import load_odometry
 
@@ -77,6 +82,8 @@ class FleetRecipe:
         policy: Policy
         if told is not None:
             policy = told
+        elif self.style is not None:
+            policy = StyledExpert(robot, load_style(self.style, robot), self.policy, shape)
         else:
             policy = GaitPolicy(robot, shape) if self.policy == "gait" else ExpertPolicy(robot, self.policy, shape)
         odometry = None if self.plain_odometry else load_odometry(robot)
@@ -197,6 +204,14 @@ def recorded(
 
     yield from cutter.episodes(part.frames, told)
     tally.add(cutter.begun, cutter.fell, cutter.walked)
+
+
+def _style_source(name: str) -> dict[str, str]:
+    """Raises ConfigError."""
+    from servoid.hw.config import resolve
+
+    path = resolve("styles", name)
+    return {"name": path.stem, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
 def _source(path: Path) -> dict[str, str]:

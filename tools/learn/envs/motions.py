@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.contracts.control import ReferenceFrames
+from servoid.hw.contracts.control import ReferenceFrames, State
 from servoid.hw.contracts.world import Start
 from servoid.hw.geometry import up_vector
 from servoid.hw.robot.description import Robot, Walking
@@ -73,9 +73,14 @@ class Motions:
         return self.reference.on_clip
 
     @property
-    def successes(self) -> Mapping[str, float]:
-        """Share of tries that did well, of each clip, over the last some thirty."""
-        return {clip.name: 1.0 - float(chance) for clip, chance in zip(self.clips, self._chances, strict=True)}
+    def phase(self) -> Array:
+        return np.where(self.on_clip, self.reference.clip.phase, 0.0)
+
+    @property
+    def measures(self) -> Mapping[str, float]:
+        """Share of tries that do well, of each clip, over the last some thirty, and how fast worlds are asked to go."""
+        chances = {clip.name: float(chance) for clip, chance in zip(self.clips, self._chances, strict=True)}
+        return {f"success/{name}": 1.0 - chance for name, chance in chances.items()} | dict(self.speeds.measures)
 
     def schedule(self, progress: float) -> None:
         """How fast clips are played grows over the first half of the training."""
@@ -164,6 +169,16 @@ class Motions:
         self._done_at[where], self._after[where] = -1, False
 
     # -- a tick --------------------------------------------------------------------------------------------------------
+
+    def look(self, state: State, applied: Array) -> None:
+        """Nothing that is followed depends on it."""
+
+    def led(self, target: Array) -> Array:
+        return self.reference.led(target)
+
+    def learn(self, measured: Array, asked: Array, failed: Array) -> None:
+        walks = ~self.on_clip
+        self.speeds.learn(asked[walks], measured[walks], failed[walks])
 
     def failed(self, truth: SimulatedTruth, frames: ReferenceFrames) -> Array:
         """Worlds `(n,)` whose episode is over, after a tick in which `frames` were to be reached."""

@@ -50,6 +50,10 @@ class Manner(StatefulTerm[State]):
         """What is logged of it."""
         return {}
 
+    def shown(self, where: Array) -> Mapping[str, float]:
+        """How often the worlds `where` `(n,)` bool show the style that is asked for, now; nothing where none is."""
+        return {}
+
     def reset(self, where: Array) -> None:
         """New episodes in the worlds `where` `(n,)` bool."""
 
@@ -88,7 +92,8 @@ class ScoreTerm(Manner):
         super().__init__(n, prior.config.stride, np.clip(_REACH * deviation, SMALLEST_REACH, LARGEST_REACH))
         self.prior: Prior = prior
         self._settings = settings
-        self._score = Score(prior, style, seed, settings.random_level)
+        self._score, self._style = Score(prior, style, seed, settings.random_level), style
+        self._judged: Tensor | None = None  # windows of the last call
         self._running = RunningMean(self._score.count)
         self.data_error = np.array([float(prior.header["results"]["error"])] * self._score.count)
         if not settings.random_level:
@@ -129,8 +134,11 @@ class ScoreTerm(Manner):
         first, last = self._settings.sharpness
         self.sharpness = first * (last / first) ** progress
 
+    def shown(self, where: Array) -> Mapping[str, float]:
+        return {} if self._judged is None else self.prior.shown(self._judged[where], self._style)
+
     def __call__(self, step: State) -> Array:
-        windows = self._windows(step)
+        windows = self._judged = self._windows(step)
         errors = self._score(windows)
         self.ratio = self.ratio + _SMOOTHING * ((errors / self.data_error).mean(-1) - self.ratio)
         return self._reward(windows, errors)

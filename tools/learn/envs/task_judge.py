@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -26,20 +27,26 @@ class Walks:
     joints: Array  # (decisions, n, n_joints) rad, the truth
     velocity: Array  # (decisions, n, 2) m/s over the ground
     achieved: Array  # (decisions, n) whether the task was
+    shown: dict[str, float]  # shares of windows that show the style that is asked for, from 2 s on; empty: none is
 
 
 def walk(env: TaskEnvironment, actor: Actor, asked: Array | None = None) -> Walks:
     """One episode in every world from its beginning; `asked` `(size,)` is what is asked all the time, where given."""
     env.reset()
     rows: list[tuple[Array, ...]] = []
-    alive = np.ones(env.n, bool)
-    for _ in range(env.limit):
+    alive, shown = np.ones(env.n, bool), defaultdict[str, list[float]](list)
+    for tick in range(env.limit):
         if asked is not None:
             env.ask(asked)  # an episode that has just begun asks for what it draws
         _, done, late = env.step(actor(env.observations))
         rows.append((env.task_reward * alive, alive, env.score.ratio, env.joints, env.ground, env.achieved))
+        if tick * env.dt >= _SETTLED and alive.any():
+            for name, share in env.score.shown(alive).items():
+                shown[name].append(share)
         alive = alive & ~(done & ~late)
-    return Walks(*(np.stack(column) for column in zip(*rows, strict=True)))
+    means = {name: float(np.mean(shares)) for name, shares in shown.items()}
+    reward, was, ratio, joints, velocity, achieved = (np.stack(column) for column in zip(*rows, strict=True))
+    return Walks(reward, was, ratio, joints, velocity, achieved, means)
 
 
 def measure(env: TaskEnvironment, actor: Actor) -> dict[str, float]:
@@ -59,6 +66,7 @@ def measure(env: TaskEnvironment, actor: Actor) -> dict[str, float]:
         if prior is not None and later.any()
         else float("nan"),
     }
+    results |= walks.shown
     if env.task.achievable:
         first = np.argmax(walks.achieved, 0)[walks.achieved.any(0)]
         results["achieved"] = float(walks.achieved.any(0).mean())

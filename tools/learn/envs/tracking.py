@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +15,11 @@ from servoid.hw.robot.legs import Legs
 from servoid.hw.robot.mirror import Mirror
 from servoid.policy.mlp import Mlp
 from servoid.policy.motion.clip import About, Clip
+from servoid.policy.references.gait import Gait
 from servoid.policy.tracker.observation import RESIDUAL, TrackerObservation
 from servoid.policy.tracker.rewards import TERMS, Step
 from servoid.stack.control.fleet import Fleet
+from servoid.tools.learn.envs.curriculum import Curriculum
 from servoid.tools.learn.envs.motions import Motions
 from servoid.tools.learn.settings import TrackingSettings
 from servoid.tools.learn.terms import Terms
@@ -40,9 +42,8 @@ class Tracking:
         """Call `reset` first. Without `clips` it follows the gait alone, and sees no more than that takes where the
         `clip_share` is 0."""
         self.robot, self.n, self.settings = robot, n, settings
-        self.fleet = Fleet(robot, n, odometry, randomise=settings.randomised, seed=seed)
-        share = settings.clip_share if clips else 0.0
-        self.motions = Motions(robot, clips or [_still(robot)], n, replace(settings, clip_share=share), seed)
+        self.fleet = self._fleet(odometry, seed)
+        self.motions = self._followed(clips, seed)
         self.reference = self.motions.reference
         self.observation = TrackerObservation(robot, (n,), clips=settings.clip_share > 0.0)
         joints, feet = Mirror.joints(robot), Mirror.feet(robot)
@@ -62,7 +63,7 @@ class Tracking:
         self.terms: dict[str, float] = {}
         self._next_push = np.zeros(n, int)
         # Of the last cycle, newest at `ticks % cycle`: velocity and yaw rate, measured and asked.
-        self._cycle = self.reference.gait.cycle_ticks  # over which velocity is judged: within one, a walk sways
+        self._cycle = Gait(robot).cycle_ticks  # over which velocity is judged: within one, a walk sways
         self._twists = np.zeros((self._cycle, n, 6))
         self._twist = np.zeros((n, 6))
         self._targets = np.zeros((3, n, len(robot.joints)))  # the last three, newest first
@@ -75,12 +76,16 @@ class Tracking:
         return (*self._walk_reward.names, *(f"clip/{name}" for name in self._clip_reward.names))
 
     @property
-    def measures(self) -> dict[str, float]:
-        """Share of tries that do well, of each clip, and how fast worlds are asked to go."""
-        return {
-            **{f"success/{name}": value for name, value in self.motions.successes.items()},
-            **self.motions.speeds.measures,
-        }
+    def measures(self) -> Mapping[str, float]:
+        return self.motions.measures
+
+    def _fleet(self, odometry: Mlp | None, seed: int) -> Fleet:
+        return Fleet(self.robot, self.n, odometry, randomise=self.settings.randomised, seed=seed)
+
+    def _followed(self, clips: Sequence[Clip], seed: int) -> Curriculum:
+        share = self.settings.clip_share if clips else 0.0
+        settings = replace(self.settings, clip_share=share)
+        return Motions(self.robot, clips or [_still(self.robot)], self.n, settings, seed)
 
     def reset(self) -> None:
         """Begin a new episode in every world."""
@@ -91,6 +96,9 @@ class Tracking:
         """Pushes grow over the first fifth of the training."""
         self.push_scale = min(1.0, 0.25 + 0.75 * progress / 0.2)
         self.motions.schedule(progress)
+
+    def learn(self) -> None:
+        """Once an update of the tracker: what learns along with it. Here nothing does."""
 
     def _reset(self, where: Array) -> None:
         fleet = self.fleet
@@ -105,6 +113,7 @@ class Tracking:
 
     def _observe(self) -> None:
         state = self.fleet.observe()
+        self.motions.look(state, self.fleet.applied)
         frames = self.reference.frames(self.observation.ahead)
         self.frames = frames
         self._upright = -up_vector(frames.root_orientation[:, 0])
@@ -126,7 +135,7 @@ class Tracking:
                 ),
                 np.array([b.zero for b in bodies if b]) * 30,
                 self.motions.on_clip[:, None],
-                np.where(self.motions.on_clip, self.reference.clip.phase, 0.0)[:, None],
+                self.motions.phase[:, None],
                 truth.gravity - self._upright,
                 (truth.position[:, 2:] - frames.height[:, :1]) * (2.5 / self.robot.walking.height),
             ],
@@ -168,7 +177,7 @@ class Tracking:
     def step(self, action: Array) -> tuple[Array, Array, Array]:
         """Act for a tick with residuals `(n, n_joints)`. Returns reward a tick, done and time-out `(n,)`."""
         frames, residual = self.frames, RESIDUAL * action * self.acting
-        self.fleet.step(self.reference.led(frames.position[:, 0] + residual))
+        self.fleet.step(self.motions.led(frames.position[:, 0] + residual))
         for past, now in ((self._targets, self.fleet.applied), (self._residuals, residual)):
             past[1:] = past[:-1].copy()
             past[0] = now
@@ -176,8 +185,7 @@ class Tracking:
         truth = self.fleet.truth
         failed = self.motions.failed(truth, frames)
         self._measure()
-        walks = ~self.motions.on_clip
-        self.motions.speeds.learn(self._twist[walks, 3:], self._twist[walks, :3], failed[walks])
+        self.motions.learn(self._twist[:, :3], self._twist[:, 3:], failed)
         reward = self._judge(frames, failed)
         late = ((self.ticks >= self.limit) | self.motions.closing) & ~failed
         done = failed | late

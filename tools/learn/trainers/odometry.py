@@ -106,15 +106,18 @@ def measure(
 
 
 def walked(robot: Robot, makers: Mapping[str, MakePolicy], settings: OdometryTraining) -> dict[str, Array]:
-    """Record walks of every kind, for every way of walking slips in its own: see `record`. `floor` makes floors
-    more slippery than the robot's own, since feet that hold teach nothing of feet that slip."""
+    """Record walks of every kind, for every way of walking slips in its own: see `record`. With a `floor` half of them
+    are on a more slippery one, since feet that hold teach nothing of feet that slip, nor these of those."""
     known = _shipped(robot)
-    slippery = replace(robot, floor_friction=settings.floor * robot.floor_friction)
+    grounds = [robot]
+    if settings.floor != 1.0:
+        grounds.append(replace(robot, floor_friction=settings.floor * robot.floor_friction))
+    kinds = [(name, make, ground) for name, make in makers.items() for ground in grounds]
     data: dict[str, Array] = {}
-    for i, (name, make) in enumerate(makers.items()):
-        worlds = settings.worlds // len(makers)
+    for i, (name, make, ground) in enumerate(kinds):
+        worlds = settings.worlds // len(kinds)
         print(f"recording {name}: {worlds} robots, {settings.seconds:g} s ...", file=sys.stderr)
-        part = record(slippery, make, worlds, settings.seconds, settings.seed + i, known)
+        part = record(ground, make, worlds, settings.seconds, settings.seed + i, known)
         data = mixed(data, part, settings.seed) if data else part
     return data
 

@@ -23,8 +23,6 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.policy import checkpoint
-from servoid.policy.mlp import Mlp
-from servoid.policy.priors.goals import GOALS
 from servoid.policy.priors.task_policy import KIND, save_task_policy
 from servoid.policy.rising.policy import KIND as RISING
 from servoid.policy.rising.policy import save_rising_policy
@@ -133,10 +131,9 @@ def _refuse_what_needs_a_prior(args: argparse.Namespace) -> None:
 
 def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> Rival | None:
     """What rewards in the prior's place, where that was asked for. Raises ConfigError."""
-    from servoid.policy.priors.adversarial.discriminator import Adversary, Discriminator, load_discriminator
-    from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.policy.priors.adversarial.discriminator import load_discriminator
     from servoid.tools.learn.envs.score_term import Rival
-    from servoid.tools.learn.trainers.prior import read_by_style
+    from servoid.tools.learn.trainers.prior import learning_rival
 
     if args.discriminator is not None:
         if args.adversarial is not None:
@@ -146,10 +143,7 @@ def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> 
         return None
     if args.resume and (args.out / "resume.pt").exists():
         raise ConfigError(f"{args.out}: a discriminator does not go on where it stopped: use --no-resume")
-    recordings = read_by_style(args.adversarial, prior.features.robot)
-    discriminator = Discriminator(prior)
-    data = PriorWindows(recordings, prior.features, prior.config)
-    return Rival(discriminator, Adversary(discriminator, data, settings.seed))
+    return learning_rival(args.adversarial, prior, settings.seed)
 
 
 def environment(
@@ -195,6 +189,7 @@ class PolicyTrainer(PpoTrainer):
 
         digest = None if prior is None else sha256(prior)
         self._prior = None if prior is None else {"name": prior.name, "sha256": digest}
+        self.style = style
         self._style = {"upper": style.upper, "lower": style.lower, "weight": style.weight}
         style_text = f" in style {style.upper}+{style.lower} x {style.weight:g}" if style.lower else ""
         self._under = "without a prior" if prior is None else f"under prior {prior.name}"
@@ -219,7 +214,19 @@ class PolicyTrainer(PpoTrainer):
         judged = environment(env.task, env.score.prior, style, nominal, _JUDGED, settings.seed + 1)
         self._judged = judged
         self.judge = lambda _: self.measured()
-        measured = ("return", "falls", "achieved", "seconds", "prior_error", "amplitude", "amplitude_error", "cadence")
+        measured = (
+            "return",
+            "falls",
+            "achieved",
+            "seconds",
+            "prior_error",
+            "amplitude",
+            "amplitude_error",
+            "cadence",
+            "style",
+            "upper_style",
+            "lower_style",
+        )
         self.columns = (*self.columns, *measured)
         ours = ("achieved", "seconds") if env.task.achievable else ("falls",)
         manner = () if prior is None else (("prior_error",), ("amplitude", "cadence"))
@@ -245,19 +252,10 @@ class PolicyTrainer(PpoTrainer):
         return f"servoid rollout {self.env.task.run} --policy {self.best_path} --episodes 50"
 
     def adopt(self, path: Path) -> None:
-        task, goal = self.env.task, checkpoint.read_header(path).get("config", {}).get("goal")
-        if goal in GOALS and GOALS[goal].size != task.seen.size:
-            raise ConfigError(
-                f"{path}: sees its goal in {GOALS[goal].size} numbers ({goal}), and task {task.name} shows "
-                f"{task.seen.size} ({task.goal}): begin with a policy that sees as many, or with --demonstrations"
-            )
-        network, _ = Mlp.load(path, self._kind, self.env.robot, self.env.observations["actor"].shape[1])
-        hidden = list(network.sizes[1:-1])
-        if hidden != list(self.settings.hidden):
-            raise checkpoint.CheckpointError(
-                f"{path}: its hidden layers are {hidden}; give --hidden {' '.join(map(str, hidden))}"
-            )
-        self.begin_with(network)
+        """Begin as the policy in `path`: see `adopted`. Raises ConfigError, or CheckpointError."""
+        from servoid.tools.learn.trainers.adopted import adopted
+
+        self.begin_with(adopted(path, self._kind, self.env, self.style, self.settings.hidden))
 
     def imitate(self, folder: Path) -> None:
         """Begin with a network that does what the dataset in `folder` shows, and keep it. Raises DatasetError."""

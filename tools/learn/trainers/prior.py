@@ -3,7 +3,9 @@
 The folder of --data is a dataset of `servoid collect`, or holds one for each style, in a folder named after it. A
 prior is judged by the error of the noise that it predicts in windows that it did not see (`error`). Beside it is what
 it makes of what they are not: the same windows played backward (`reversed_error`), at rest in their last frame
-(`still_error`) and with three tenths of their amplitude (`shuffling_error`).
+(`still_error`) and with three tenths of their amplitude (`shuffling_error`). Where there are styles, a small classifier
+learns beside it to tell them: `style`, `upper_style` and `lower_style` are the shares of those windows in which it
+does, by the whole body and by each half.
 
 Ctrl-C saves, and the same command continues. The best network is prior.safetensors.
 """
@@ -25,13 +27,17 @@ from servoid.tools.learn.prior_settings import PriorShape, PriorTraining
 from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments, require_same, source_of
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from servoid.hw.robot.description import Robot
     from servoid.policy.priors.features import PriorFeatures
     from servoid.policy.priors.score_matching.model import Prior
     from servoid.policy.priors.score_matching.windows import PriorWindows
     from servoid.policy.recording import Recording
+    from servoid.tools.learn.envs.score_term import Rival
 
 _WARMUP = 200  # steps
+_TELLING = 1e-3  # learning rate of the classifier of styles
 _SHUFFLE = 0.3  # of the amplitude: what walks under a weak prior does so
 
 
@@ -59,7 +65,7 @@ def main(args: argparse.Namespace) -> int:
     features = PriorFeatures(robot, limbs_of(robot))
     shape = {f.name: getattr(settings, f.name) for f in fields(PriorShape)}
     config = PriorConfig(features.layout.size, **shape, styles=tuple(style for style in recordings if style))
-    windows = PriorWindows(recordings, features, config, settings.standing)
+    windows = PriorWindows(recordings, features, config, settings.standing, settings.seconds)
     sources = [source_of(args.data / style, recording) for style, recording in recordings.items()]
     trainer = PriorTrainer(windows, features, settings, args.out, "; ".join(sources))
     trainer.manner = manner_by_speed(list(recordings.values()), robot)
@@ -81,6 +87,18 @@ def read_by_style(folder: Path, robot: Robot) -> dict[str, Recording]:
     return {style: read_recording(folder / style, robot) for style in styles}
 
 
+def learning_rival(folder: Path, prior: Prior, seed: int) -> Rival:
+    """A discriminator of the datasets in `folder` from what a policy does, for windows like those of `prior`. Raises
+    DatasetError."""
+    from servoid.policy.priors.adversarial.discriminator import Adversary, Discriminator
+    from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.tools.learn.envs.score_term import Rival
+
+    discriminator = Discriminator(prior)
+    data = PriorWindows(read_by_style(folder, prior.features.robot), prior.features, prior.config)
+    return Rival(discriminator, Adversary(discriminator, data, seed))
+
+
 class PriorTrainer(Trainer):
     """Trains the denoiser; checkpoints hold the averaged network."""
 
@@ -100,10 +118,14 @@ class PriorTrainer(Trainer):
         "reversed_error",
         "still_error",
         "shuffling_error",
+        "style",
+        "upper_style",
+        "lower_style",
     )
     panels = (
         ("loss", "error", "reversed_error", "still_error", "shuffling_error"),
         ("error_high", "error_middle", "error_low"),
+        ("style", "upper_style", "lower_style"),
     )
 
     def __init__(
@@ -114,6 +136,7 @@ class PriorTrainer(Trainer):
         from servoid.policy.diffusion.objective import Average
         from servoid.policy.diffusion.schedule import cosine_signal
         from servoid.policy.priors.score_matching.network import PriorNetwork
+        from servoid.policy.priors.score_matching.styles import StyleClassifier
 
         super().__init__(out, settings, source)
         torch.manual_seed(settings.seed)
@@ -123,6 +146,9 @@ class PriorTrainer(Trainer):
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), settings.learning_rate, betas=(0.9, 0.99), weight_decay=settings.weight_decay
         )
+        self.classifier = StyleClassifier(self.config, features) if self.config.styles else None
+        tells = [] if self.classifier is None else list(self.classifier.parameters())
+        self._tells = torch.optim.Adam(tells, _TELLING) if tells else None
         self.signal = torch.as_tensor(cosine_signal(self.config.levels), dtype=torch.float32)
         self.generator = torch.Generator().manual_seed(settings.seed)
 
@@ -145,6 +171,7 @@ class PriorTrainer(Trainer):
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         clean, styles = self.windows.draw(s.batch, self.generator)
+        self._tell(clean, styles)
         styles = styles * (torch.rand(len(styles), generator=self.generator) >= s.unstyled)
         levels = torch.randint(1, self.config.levels + 1, (len(clean),), generator=self.generator)
         signal = self.signal[levels][:, None, None]
@@ -161,6 +188,15 @@ class PriorTrainer(Trainer):
         self.step += 1
         return {"loss": loss.item(), "learning_rate": rate}
 
+    def _tell(self, windows: Tensor, styles: Tensor) -> None:
+        """The classifier, if any, learns from a batch, too."""
+        if self.classifier is None or self._tells is None:
+            return
+        loss = self.classifier.loss(windows, styles, self.generator)
+        self._tells.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self._tells.step()
+
     def shown(self, means: Mapping[str, float], steps_per_s: float) -> tuple[dict[str, float], str]:
         return {"steps_per_s": steps_per_s}, f"loss {means['loss']:.4f}, {steps_per_s:.0f} steps/s"
 
@@ -171,7 +207,8 @@ class PriorTrainer(Trainer):
         from servoid.policy.priors.score_matching.score import Score
 
         prior = self._prior()
-        windows = prior.decode(self.windows.held_out(count)[0])
+        normalised, styles = self.windows.held_out(count)
+        windows = prior.decode(normalised)
         errors = Score(prior, Style(), 0)(windows).mean(0)
         speeds = [self.features.layout.slice(name) for name in ("velocity", "angular_velocity")]
         backward, still = windows.flip(1), windows[:, -1:].expand_as(windows).clone()
@@ -186,7 +223,15 @@ class PriorTrainer(Trainer):
             "error": float(errors.mean()),
             **{name: float(error) for name, error in zip(names, errors, strict=True)},
             **{name: float(Score(prior, Style(), 0)(unlike).mean()) for name, unlike in named.items()},
+            **self._told(normalised, styles),
         }
+
+    def _told(self, windows: Tensor, styles: Tensor) -> dict[str, float]:
+        """Shares of held-out windows whose style the classifier tells, by the body and by its halves."""
+        if self.classifier is None:
+            return {}
+        right = (self.classifier.told(windows) == styles).float().mean(1)
+        return dict(zip(("style", "upper_style", "lower_style"), right.tolist(), strict=True))
 
     def _prior(self) -> Prior:
         """The averaged network as it is used."""
@@ -196,13 +241,14 @@ class PriorTrainer(Trainer):
         network = PriorNetwork(self.config)
         network.load_state_dict(self.average.weights, strict=False)
         network.eval().requires_grad_(False)
-        return Prior(network, self.features, self.windows.mean, self.windows.std, self.manner, {})
+        return Prior(network, self.features, self.windows.mean, self.windows.std, self.manner, {}, self.classifier)
 
     def ship(self, path: Path, results: Mapping[str, Any]) -> None:
         from servoid.policy.priors.score_matching.model import TrainedPrior, save_prior
 
         windows = self.windows
-        trained = TrainedPrior(self.average.weights, self.config, self.features, windows.mean, windows.std, self.manner)
+        weights, tells = self.average.weights, {} if self.classifier is None else self.classifier.state_dict()
+        trained = TrainedPrior(weights, self.config, self.features, windows.mean, windows.std, self.manner, tells)
         save_prior(path, trained, Origin(self.source, self.settings.licence, results, plain(self.settings)))
 
     def state(self) -> dict[str, Any]:
@@ -212,6 +258,8 @@ class PriorTrainer(Trainer):
             "average": self.average.weights,
             "updates": self.average.updates,
             "optimiser": self.optimiser.state_dict(),
+            "classifier": None if self.classifier is None else self.classifier.state_dict(),
+            "tells": None if self._tells is None else self._tells.state_dict(),
             "generator": self.generator.get_state(),
         }
 
@@ -222,4 +270,7 @@ class PriorTrainer(Trainer):
         self.average.weights = saved["average"]
         self.average.updates = saved["updates"]
         self.optimiser.load_state_dict(saved["optimiser"])
+        if self.classifier is not None and self._tells is not None:
+            self.classifier.load_state_dict(saved["classifier"])
+            self._tells.load_state_dict(saved["tells"])
         self.generator.set_state(saved["generator"])

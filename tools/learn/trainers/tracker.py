@@ -17,6 +17,7 @@ from servoid.policy import checkpoint
 from servoid.policy.mlp import Mlp
 from servoid.policy.motion.clip import Clip
 from servoid.policy.motion.library import Library
+from servoid.policy.references.gait import load_gait
 from servoid.policy.tracker.network import load_tracker, written
 from servoid.tools.learn.envs.tracking import Tracking
 from servoid.tools.learn.flags import plain, read_settings
@@ -38,6 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CHECKPOINT",
         help="start from this tracker (tracker: the shipped one), halfway through the schedules",
     )
+    run.add_argument(
+        "--adversarial",
+        type=Path,
+        metavar="DIR",
+        help="with --planner: half of the reward is a discriminator's, which learns from this dataset (AMP)",
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -53,11 +60,36 @@ def main(args: argparse.Namespace) -> int:
     odometry = None if settings.plain_odometry else load_odometry(robot)
     torch.manual_seed(settings.seed)
     clips = chosen_clips(robot, settings.clips)
-    env = Tracking(robot, settings.worlds, odometry, settings, settings.seed, clips)
+    env = environment(robot, odometry, settings, clips, args.adversarial)
     trainer = TrackerTrainer(env, settings, args.out)
     trainer.start(args.resume, None if args.init is None else checkpoint.resolve(args.init, robot))
     trainer.run()
     return 0
+
+
+def environment(
+    robot: Robot, odometry: Mlp | None, settings: TrackerTraining, clips: Sequence[Clip], data: Path | None
+) -> Tracking:
+    """The worlds to learn in; `data` is what a discriminator learns from. Raises ConfigError, DatasetError."""
+    given = robot, settings.worlds, odometry, settings, settings.seed, clips
+    if not settings.planner:
+        if data is not None:
+            raise ConfigError("--adversarial needs --planner: elsewhere a tracker is rewarded for following alone")
+        return Tracking(*given)
+    from servoid.tools.learn.envs.planned import PlannedTracking
+
+    env = PlannedTracking(*given)
+    if data is not None:
+        from servoid.policy.priors.score_matching.model import Style, load_prior
+        from servoid.sim.kinematics import limbs_of
+        from servoid.tools.learn.envs.score_term import AdversarialTerm
+        from servoid.tools.learn.prior_settings import ScoreSettings
+        from servoid.tools.learn.trainers.prior import learning_rival
+
+        prior = load_prior(checkpoint.resolve("prior", robot), robot, limbs_of(robot))  # whose windows are judged
+        rival = learning_rival(data, prior, settings.seed)
+        env.style = AdversarialTerm(prior, Style(), settings.worlds, ScoreSettings(), settings.seed, rival)
+    return env
 
 
 class TrackerTrainer(PpoTrainer):
@@ -76,6 +108,11 @@ class TrackerTrainer(PpoTrainer):
     def _clips(self) -> bool:
         """Whether it tracks clips, too, and not the gait alone."""
         return self.env.observation.clips
+
+    def learn(self) -> dict[str, float]:
+        row = super().learn()
+        self.env.learn()
+        return row
 
     @property
     def title(self) -> str:
@@ -123,7 +160,7 @@ class TrackerTrainer(PpoTrainer):
         if self._clips:
             config |= {"clips": [clip.name for clip in self.env.motions.clips], "clip_rewards": s.clip_rewards}
         if s.gait:
-            config["gait"] = written(self.env.reference.gait.settings)
+            config["gait"] = written(load_gait(s.gait))
         about: dict[str, Any] = {
             "data": _SOURCE,
             "licence": "Apache-2.0",
