@@ -154,7 +154,7 @@ class _GoBetween(BaseBehaviour):
                 velocity=go_to_point(far, s.approach),
                 goal=goal,
                 obstacles=np.pad(to_heading(pillars, state), ((0, 0), (0, 2))),  # they stand
-                distances=self._field.seen_from(state) if s.weights.way else None,
+                distances=self._field.seen_from(state) if s.weights.way or s.weights.along else None,
             )
         )
 

@@ -47,7 +47,7 @@ class TotalCost(SlopedCost):
             yield ground_cost(trajectory, asked.ground, w)
         if asked.goal is not None and (w.goal > 0.0 or w.facing > 0.0 or w.waypoint > 0.0):
             yield goal_cost(trajectory, asked.goal, w)
-        if asked.distances is not None and w.way > 0.0:
+        if asked.distances is not None and (w.way > 0.0 or w.along > 0.0):
             yield way_cost(trajectory, asked.distances, w)
         if asked.path is not None and w.path > 0.0:
             yield path_cost(trajectory, asked.path, w)

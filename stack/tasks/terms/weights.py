@@ -25,6 +25,7 @@ class Weights:
     waypoint: Annotated[float, Setting("squared distance from the goal", "1/m^2", least=0)] = 0.0
     path: Annotated[float, Setting("squared distance from the place on the path", "1/m^2", least=0)] = 10.0
     way: Annotated[float, Setting("distance from the goal by a free way", "1/m", least=0)] = 0.0
+    along: Annotated[float, Setting("1 - cos(heading, free way), less within 0.1 m of the goal", least=0)] = 0.0
     repulsion: Annotated[float, Setting("exp(-sharpness distance), for each obstacle", least=0)] = 0.1
     sharpness: Annotated[float, Setting("how steeply repulsion falls", "1/m", above=0)] = 15.0
     avoidance: Annotated[float, Setting("softplus(1 - distance / margin), for each obstacle", least=0)] = 0.0

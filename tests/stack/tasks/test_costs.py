@@ -99,6 +99,23 @@ def test_the_way_to_the_goal_is_measured_past_what_stands_between() -> None:
         assert cost(-3.0, 0.0) > cost(-2.0, 0.0) > cost(-1.0, 0.0)  # beyond the map
 
 
+def test_the_way_past_what_stands_between_is_faced() -> None:
+    wall = np.array([[0.5, y, 0.08] for y in np.arange(-0.6, 0.31, 0.1)])
+    field, here = PotentialField(np.array([1.0, 0.0]), wall, np.zeros(2), FieldSettings()), state(yaw=0.0)
+    seen, weights = field.seen_from(here), Weights(along=1.0)
+    yaws = np.arange(-3.0, 3.1, 0.25)
+
+    def best(x: float, y: float) -> float:
+        costs = [value(way_cost(moves(np.array([[x, y]]), yaw=yaw), seen, weights)) for yaw in yaws]
+        return float(yaws[int(np.argmin(costs))])
+
+    assert 0.3 < best(-0.2, 0.2) < 1.6  # the wall's end lies to the left
+    assert abs(best(0.5, 0.75)) < 0.6  # past it
+    assert -1.6 < best(0.9, 0.5) < -0.5  # behind it, the goal to the right
+    reversed_ = value(way_cost(moves(np.array([[-0.2, 0.2]]), yaw=best(-0.2, 0.2) + np.pi), seen, weights))
+    assert reversed_ == pytest.approx(2.0, abs=0.1)
+
+
 def test_goal_cost_wants_to_be_near_and_to_face_the_goal() -> None:
     goal, weights = np.array([1.0, 0.0]), Weights(goal=2.0, facing=3.0)
     assert value(goal_cost(moves(np.zeros((3, 2))), goal, weights)) == pytest.approx(2.0, rel=1e-5)
@@ -298,6 +315,7 @@ EVERYTHING = Instruction(
         {"speed": 1.0, "steering": 0.5, "heading": 0.3},
         {"goal": 1.0, "facing": 0.6, "waypoint": 0.4},
         {"way": 1.0},
+        {"along": 1.0},
         {"path": 3.0},
         {"repulsion": 1.0, "sharpness": 6.0},
         {"repulsion": 1.0, "sharpness": 6.0, "avoidance": 0.5, "width": 0.17, "depth": 0.06},
@@ -324,8 +342,9 @@ def test_a_slope_is_how_the_cost_changes_with_each_number_of_the_trajectory(weig
     cost = TotalCost(replace(NOTHING, **weights), BUILD)
     before, slope = cost.slope(walk, EVERYTHING)
     assert (before > 1e-3).all()
-    lean = {"gravity"} if "reach" in weights else set()  # nobody shall lean over to reach
-    for name in set(Trajectory.FIELDS) - lean:
+    # Nobody shall lean over to reach, nor be somewhere else to face the way from there.
+    spared = {"gravity"} if "reach" in weights else {"displacement"} if "along" in weights else set()
+    for name in set(Trajectory.FIELDS) - spared:
         values = getattr(walk, name)
         for index in rng.integers(0, values.shape, (25, values.ndim)):
             nudged = values.copy()
