@@ -34,21 +34,10 @@ class TargetSteering(LearnedTask):
         return Instruction(told.velocity)
 
     def reward(self, asked: Array, state: TaskState) -> Array:
-        return 0.7 * self._moves(asked, state) + 0.3 * np.maximum(self._faced(asked, state), 0.0)
-
-    def guided(self, asked: Array, state: TaskState) -> Array:
-        """More for facing, and the more the less it is off: the reward says nothing to who faces away."""
-        return 0.5 * self._moves(asked, state) + 0.5 * (0.5 + 0.5 * self._faced(asked, state))
-
-    def _moves(self, asked: Array, state: TaskState) -> Array:
-        """Whether it moves as is asked `(n,)`, 0 to 1."""
         error = np.sum((state.velocity - asked[:, :2]) ** 2, -1) / self.robot.walking.forward**2
         forward = np.sum(state.velocity * asked[:, :2], -1) > 0.0
-        return np.exp(-_SHARPNESS * error) * forward
-
-    def _faced(self, asked: Array, state: TaskState) -> Array:
-        """Cosine of how far off it faces `(n,)`."""
-        return np.cos(state.yaw) * asked[:, 2] + np.sin(state.yaw) * asked[:, 3]
+        faced = np.cos(state.yaw) * asked[:, 2] + np.sin(state.yaw) * asked[:, 3]
+        return 0.7 * np.exp(-_SHARPNESS * error) * forward + 0.3 * np.maximum(faced, 0.0)
 
     def steady(self, speed: float) -> Array:
         return np.array([speed, 0.0, 1.0, 0.0])

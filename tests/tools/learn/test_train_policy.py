@@ -164,10 +164,6 @@ def test_rewards_are_highest_for_what_is_asked() -> None:
     assert steering.reward(sideways, state((0, 0), 0.0, (0.0, 0.1)))[0] == pytest.approx(1.0)
     assert steering.reward(sideways, state((0, 0), np.pi / 2, (0.0, 0.1)))[0] == pytest.approx(0.7)
     assert steering.reward(sideways, state((0, 0), 0.0, (0.0, -0.01)))[0] == pytest.approx(0.3)
-    away, aside = (state((0, 0), yaw, (0.0, 0.1)) for yaw in (np.pi, 2.0))
-    assert steering.reward(sideways, aside)[0] == pytest.approx(steering.reward(sideways, away)[0])
-    assert steering.guided(sideways, aside)[0] > steering.guided(sideways, away)[0] + 0.1  # training says where to turn
-    assert steering.guided(sideways, state((0, 0), 0.0, (0.0, 0.1)))[0] == pytest.approx(1.0)
     ball = LEARNED_TASKS["dodgeball"](ROBOT)
     thrown = ball.draw(np.random.default_rng(0), np.array([1.0, -1.0]))[None]
     hit = [bool(ball.ended(ball.advance(thrown, t), state((1, -1), 0.0, (0.0, 0.0)))[0]) for t in np.arange(0, 6, 0.1)]
