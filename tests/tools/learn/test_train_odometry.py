@@ -85,6 +85,16 @@ def test_fitting_takes_a_systematic_slip_out(slipping: dict[str, np.ndarray], tm
     }
 
 
+def test_what_to_do_next_is_no_copy_onto_itself(slipping: dict[str, np.ndarray], tmp_path: Path) -> None:
+    """A robot's own odometry, written where the robot finds it, was to be copied there again."""
+    made = trainer(slipping, tmp_path / "mine.safetensors")
+    assert f"cp {tmp_path}/mine.safetensors" in made.following
+    made.robot = replace(ROBOT, name="mine", folder=str(tmp_path / "mine"))
+    made.best_path = tmp_path / "mine" / "odometry.safetensors"
+    (tmp_path / "mine.yaml").touch()
+    assert made.following == f"servoid rollout walk --policy gait --robot {tmp_path}/mine.yaml --episodes 10"
+
+
 @pytest.mark.slow
 def test_a_fit_that_was_interrupted_ends_as_one_that_was_not(slipping: dict[str, np.ndarray], tmp_path: Path) -> None:
     whole, parted = tmp_path / "whole", tmp_path / "parted"

@@ -25,7 +25,14 @@ from servoid.policy.features import token_layout
 from servoid.policy.text.encoder import load_encoder
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.settings import DiffusionTraining
-from servoid.tools.learn.trainers.trainer import Judge, Trainer, add_run_arguments, require_same, source_of
+from servoid.tools.learn.trainers.trainer import (
+    Judge,
+    Trainer,
+    add_run_arguments,
+    option_of,
+    require_same,
+    source_of,
+)
 
 if TYPE_CHECKING:
     import torch
@@ -219,7 +226,7 @@ class DiffusionTrainer(Trainer):
 
     @property
     def following(self) -> str:
-        return f"servoid rollout walk --policy {self.best_path} --episodes 50"
+        return f"servoid rollout walk --policy {self.best_path}{option_of(self.robot)} --episodes 50"
 
     def learn(self) -> dict[str, float]:
         import torch

@@ -22,7 +22,7 @@ from servoid.policy import checkpoint
 from servoid.policy.mlp import Mlp
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.settings import OdometryTraining
-from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments
+from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments, option_of
 from servoid.tools.learn.walks import drift, maker, mixed, record
 
 if TYPE_CHECKING:
@@ -156,6 +156,8 @@ class OdometryTrainer(Trainer):
     @property
     def following(self) -> str:
         own = Path(self.robot.folder)
+        if self.best_path.resolve() == (own / "odometry.safetensors").resolve():
+            return f"servoid rollout walk --policy gait{option_of(self.robot)} --episodes 10"
         return f"mkdir -p {own} && cp {self.best_path} {own / 'odometry.safetensors'}  # {self.robot.name} goes by it"
 
     def prepare(self) -> None:

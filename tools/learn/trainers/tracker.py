@@ -23,7 +23,7 @@ from servoid.tools.learn.envs.tracking import Tracking
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.settings import TrackerTraining
 from servoid.tools.learn.trainers.ppo import PpoTrainer
-from servoid.tools.learn.trainers.trainer import add_run_arguments
+from servoid.tools.learn.trainers.trainer import add_run_arguments, option_of
 
 _FIRST = 0.05  # of what the last layer would begin with
 _CRITIC_ALONE = 0.1  # of a short training, at most, in which an adopted actor stays as it is
@@ -120,11 +120,7 @@ class TrackerTrainer(PpoTrainer):
 
     @property
     def following(self) -> str:
-        file = Path(self.env.robot.folder).with_suffix(
-            ".yaml"
-        )  # of a robot other than what the command takes by itself
-        own = f" --robot {file}" if self.env.robot.name != "op3" and file.is_file() else ""
-        return f"servoid rollout walk --policy {self.best_path}{own} --episodes 50"
+        return f"servoid rollout walk --policy {self.best_path}{option_of(self.env.robot)} --episodes 50"
 
     def resume(self) -> bool:
         if (old := self.out / "state.pt").exists() and not (self.out / "resume.pt").exists():

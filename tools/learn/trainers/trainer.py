@@ -23,6 +23,7 @@ from servoid.tools.learn.progress import ProgressLine
 from servoid.tools.learn.settings import TrainingRun
 
 if TYPE_CHECKING:
+    from servoid.hw.robot.description import Robot
     from servoid.policy.recording import Recording
     from servoid.tools.learn.trainers.logger import Logger
 
@@ -302,3 +303,9 @@ def require_same(path: Path, otherwise: str, ours: Mapping[str, Any], theirs: Ma
     if changed:
         what = "; ".join(changed)
         raise ConfigError(f"{path}: {otherwise} ({what}); use its options, --no-resume or another --out")
+
+
+def option_of(robot: Robot) -> str:
+    """` --robot FILE` for a robot other than the one that commands take by themselves."""
+    file = Path(robot.folder).with_suffix(".yaml")
+    return f" --robot {file}" if robot.name != "op3" and file.is_file() else ""
