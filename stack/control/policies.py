@@ -119,6 +119,7 @@ POLICIES: dict[str, Maker] = {
     "fast": _expert,
     "gait": _gait,
     "location": _task_policy,
+    "looking-around": _task_policy,
     "speed": _task_policy,
     "steering": _task_policy,
     "zombie": _task_policy,
