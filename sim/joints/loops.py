@@ -40,7 +40,17 @@ class Loops:
                 gap = data.efc_pos[rows]
                 if not len(gap) or np.abs(gap).max() < _CLOSED:
                     break
-                jacobian = data.efc_J.reshape(-1, model.nv)[rows][:, self._dofs]
+                jacobian = _jacobian(model, data)[rows][:, self._dofs]
                 step = np.linalg.lstsq(jacobian, -gap, rcond=1e-6)[0]
                 data.qpos[self._qpos] += np.clip(step, -_LONGEST, _LONGEST)
         qpos[self._qpos] = data.qpos[self._qpos]
+
+
+def _jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """Of the constraints `(nefc, nv)`, which MuJoCo keeps sparse where a model asks for that or is large."""
+    if not mujoco.mj_isSparse(model):
+        dense: Array = data.efc_J.reshape(-1, model.nv)
+        return dense
+    full = np.zeros((data.nefc, model.nv))
+    mujoco.mju_sparse2dense(full, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
+    return full
