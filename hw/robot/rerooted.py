@@ -27,8 +27,10 @@ def rerooted(spec: mujoco.MjSpec, base: str, path: Path) -> mujoco.MjSpec:
     six digits that MuJoCo writes. Raises ValueError where it cannot compile the model."""
     import mujoco
 
-    body = spec.body(base)
-    if body is None or body.parent.name == "world":
+    top = spec.body(base)
+    while top is not None and top.parent.name != "world":
+        top = top.parent
+    if top is None or top.name == base or all(joint.type != mujoco.mjtJoint.mjJNT_FREE for joint in top.joints):
         return spec
     before = spec.compile()
     root = ElementTree.fromstring(spec.to_xml())
@@ -38,8 +40,6 @@ def rerooted(spec: mujoco.MjSpec, base: str, path: Path) -> mujoco.MjSpec:
             compiler.set(folder, str((path.parent / compiler.get(folder, "")).resolve()))
     chain = _chain(root, base)
     free = [part for part in chain[0] if part.tag == "freejoint" or part.get("type") == "free"]
-    if not free:
-        return spec
     _inherit(chain)
     for part in free:
         chain[0].remove(part)

@@ -60,7 +60,7 @@ def test_help_of_every_verb_fits_80_columns(
         (["tasks", "gaol"], "servoid: unknown task 'gaol': did you mean 'goal'?"),
         (["--jason"], "servoid: unknown option '--jason'"),
         (["rollout", "walk", "--robot=--"], "servoid rollout: argument --robot: '--' is no value"),
-        (["bench"], "servoid bench: command missing; known: text-to-motion, sim, policy, guidance, loop"),
+        (["bench"], "servoid bench: command missing; known: text-to-motion, sim, policy, guidance, ideal, loop"),
         ([], "servoid: command missing; known: tasks"),
     ],
 )
