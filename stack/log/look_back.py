@@ -18,7 +18,7 @@ from servoid.stack.log.flightlog import BROKEN, as_now, check_header, open_log, 
 from servoid.stack.log.format import SCHEMAS, read_intent, unpack
 from servoid.stack.log.tick import Proposal, TickRecord, Timing
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 
 Raw = dict[str, list[bytes]]  # channel -> its messages of one tick
 

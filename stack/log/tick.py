@@ -10,7 +10,7 @@ from servoid.hw.contracts.control import Adopted, Instruction, State
 from servoid.hw.contracts.operator import Intent
 from servoid.hw.contracts.world import Percept
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,8 @@ from servoid.stack.runtime.loop import ControlledRobot, Loop
 from servoid.stack.runtime.phases import Phases
 from servoid.stack.runtime.settings import RunSettings, Script
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import ENDED, Guard, Phase
+from servoid.stack.safety.guard import Guard
+from servoid.stack.safety.phase import ENDED, Phase
 
 _ENDING = {Phase.STOPPING, Phase.LOWERING, *ENDED}
 _QUIET = {"phase", "task", "first"}  # kinds of events of others that the first robot's log does without

@@ -18,7 +18,7 @@ from servoid.stack.estimation.sample_hold import missing
 from servoid.stack.log.tick import Proposal
 from servoid.stack.log.trace_buffer import TraceBuffer
 from servoid.stack.runtime.loop import ControlledRobot
-from servoid.stack.safety.guard import DOWN, Phase
+from servoid.stack.safety.phase import DOWN, Phase
 
 SITS = 0.88  # of the standing height: lower than that, a robot that may sit does
 WAIT_SECONDS = 1.0  # for a first sample from every sensor

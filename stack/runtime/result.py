@@ -14,7 +14,8 @@ from servoid.stack.log.format import event_message, plain
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.phases import Phases
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import Guard, Phase
+from servoid.stack.safety.guard import Guard
+from servoid.stack.safety.phase import Phase
 
 _SUMMARY = (
     "outcome", "success", "seconds", "ticks", "missed", "late_p50_ms", "late_p99_ms", "metrics", "task_began",

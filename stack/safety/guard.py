@@ -1,7 +1,7 @@
 """The guard: the only holder of the motors.
 
 Everything else proposes targets; what reaches a servo is decided here. Its invariants, each of which has its tests in
-tests/stack/test_safety*.py:
+tests/stack/safety:
 
 1. A position that is sent ACTIVE is finite and inside the joint's range less the margin, or on its way there from a
    measured pose that was outside.
@@ -34,7 +34,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from enum import StrEnum
 
 import numpy as np
 
@@ -48,6 +47,7 @@ from servoid.stack.safety.health import BLOCKED, WALKING, Health, tilt_of
 from servoid.stack.safety.limits import limit
 from servoid.stack.safety.lowering import lowered_pose
 from servoid.stack.safety.min_jerk import MIN_JERK_PEAK, MinJerk
+from servoid.stack.safety.phase import DOWN, ENDED, FOLLOWING, POWERED, Phase
 from servoid.stack.safety.recovery import LOAD, TRIES, Recovery
 from servoid.stack.safety.upright import Upright
 
@@ -63,27 +63,6 @@ DAMP_SECONDS = 0.4
 HOME_TOLERANCE = 0.35  # rad that a joint may be from home after homing: above any sag under the robot's own weight
 
 
-class Phase(StrEnum):
-    """What the guard lets happen."""
-
-    LIMP = "limp"  # nothing is sent
-    HOMING = "homing"  # going to the home pose
-    READY = "ready"  # holding it, upright
-    RUNNING = "running"  # following targets
-    FALLEN = "fallen"  # falling, or lying: braked, until it is still
-    RECOVERING = "recovering"  # following targets to get up
-    STOPPING = "stopping"  # as running, of a policy that is asked to stand
-    LOWERING = "lowering"  # going to a crouch, to end
-    DAMPED = "damped"  # braking, then torque off
-    FAULT = "fault"  # the same, for a reason that a person must look at
-
-
-DOWN = {Phase.FALLEN, Phase.RECOVERING}
-POWERED = {Phase.HOMING, Phase.READY, Phase.RUNNING, *DOWN, Phase.STOPPING, Phase.LOWERING}
-FOLLOWING = {Phase.RUNNING, Phase.STOPPING}
-ENDED = {Phase.DAMPED, Phase.FAULT}
-
-
 class Guard:
     """Decides and sends every command. `gain` scales the servos' position gain, 1 being as configured; `recover`: a
     fall while running does not end the run."""
@@ -97,7 +76,8 @@ class Guard:
         self.recovery = Recovery(robot) if recover else None
         self.down = False  # it fell while it ran, and has not got up
         self.sits = False  # on a seat, as its task has it; whoever runs that says so
-        self.lowest, self._upright = lowered_pose(robot), Upright(robot)
+        self.lowest = lowered_pose(robot)
+        self._upright = Upright(robot)
         self._motors = motors
         self._gain = np.full(len(robot.names), gain)
         self._health = Health(robot, self._gain)
@@ -108,7 +88,8 @@ class Guard:
         self._stopping = 0  # tick at which that began
         self._again: set[str] = set()  # kinds of the wishes to stop that came while stopping
         self._stands = True  # once it is home: so it is upright, and can be lowered
-        self._rejected = self._damped_ticks = 0
+        self._rejected = 0
+        self._damped_ticks = 0
         self._tick = 0  # of the newest decision
         self._accepted = 0  # tick of the last accepted goal
         self._began: int | None = None
@@ -162,8 +143,9 @@ class Guard:
             return
         if self.phase in {Phase.LOWERING, *ENDED}:
             return
-        self.cause, stands = self.cause or kind, self._stands and not self.sits
+        self.cause = self.cause or kind
         self.note(kind, text, joint)
+        stands = self._stands and not self.sits
         if self.phase is Phase.RUNNING and stands and kind != BLOCKED:
             self._stopping = self._tick
             self._again.add(kind)

@@ -20,7 +20,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, run
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 from servoid.tools.common import exit_codes
 from servoid.tools.common.output import add_json_argument, reporting
 from servoid.tools.common.parser import counted, positive

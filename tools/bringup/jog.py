@@ -184,7 +184,7 @@ class _Shown:
     def __call__(self, record: TickRecord) -> None:
         import numpy as np
 
-        from servoid.stack.safety.guard import ENDED
+        from servoid.stack.safety.phase import ENDED
 
         self.events += record.events
         if record.phase in ENDED:

@@ -15,7 +15,7 @@ from servoid.hw.contracts.task import Trace
 from servoid.hw.geometry import headed, turned
 from servoid.sim.truth import FALL_TILT
 from servoid.stack.log.tick import TickRecord
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 from servoid.tools.common.motion_quality import Poses
 
 

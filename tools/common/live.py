@@ -11,7 +11,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.stack.log.tick import TickRecord
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 from servoid.tools.common.output import Screen
 
 WINDOW = 250  # ticks that the timing is taken over

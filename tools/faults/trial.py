@@ -21,7 +21,8 @@ from servoid.sim.rig.wire.faults import EXPECTED, KINDS, NEEDS_SERVO, STATUS_KIN
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import LOWER_SECONDS, REST_SECONDS, Phase
+from servoid.stack.safety.guard import LOWER_SECONDS, REST_SECONDS
+from servoid.stack.safety.phase import Phase
 
 DETECTION_TICKS = 10  # within which a fault that is not absorbed must be named
 OFF_SECONDS = 0.5  # within which torque must be off then, where the bus reaches a servo

@@ -24,9 +24,10 @@ from servoid.stack.log.tick import Proposal
 from servoid.stack.runtime.clock import Schedule
 from servoid.stack.runtime.interrupt import Interrupt, Stops
 from servoid.stack.runtime.loop import ControlledRobot, Loop
-from servoid.stack.safety.guard import Guard, Phase
+from servoid.stack.safety.guard import Guard
 from servoid.stack.safety.health import BLOCKED
 from servoid.stack.safety.min_jerk import MIN_JERK_PEAK, MinJerk
+from servoid.stack.safety.phase import Phase
 from servoid.tools.identify.excitation import Exercise, middle_pose
 from servoid.tools.identify.recording import END, PIECE
 

@@ -26,7 +26,7 @@ from servoid.stack.log.format import FORMAT
 from servoid.stack.log.recorder import Recorder
 from servoid.stack.log.tick import Proposal, TickRecord, Timing
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 
 ROBOT = load_robot("op3")
 N = len(ROBOT.names)

@@ -15,7 +15,7 @@ from servoid.stack.log.flightlog import read_log
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, Script, prepare, run
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 from servoid.tools.cli import main
 from servoid.tools.commands import replay
 from servoid.tools.common.pictures import flightpath

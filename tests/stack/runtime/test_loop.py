@@ -15,7 +15,8 @@ from servoid.stack.runtime.clock import Schedule
 from servoid.stack.runtime.interrupt import TWICE, Interrupt, Stops
 from servoid.stack.runtime.loop import ControlledRobot, Loop
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import Guard, Phase
+from servoid.stack.safety.guard import Guard
+from servoid.stack.safety.phase import Phase
 
 ROBOT = load_robot("op3")
 

@@ -14,7 +14,7 @@ from servoid.stack.log.flightlog import read_log
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.operator import HEARD, LOST, LOST_SECONDS, REST_SECONDS, SILENT, STOP, Operator
 from servoid.stack.runtime.run import RunSettings, run
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 from servoid.tools.commands import replay
 
 FORWARD = np.array([1.0, 0.0, 0.0])

@@ -19,7 +19,7 @@ from servoid.stack.log.flightlog import FlightLog, read_log
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import Result, RunSettings, Script, prepare, run
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import DOWN, Phase
+from servoid.stack.safety.phase import DOWN, Phase
 from servoid.tools.commands.replay import changes, replay
 from servoid.tools.common.ground_truth import GroundTruth
 from servoid.tools.common.pictures.flightpath import plans

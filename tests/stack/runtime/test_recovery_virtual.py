@@ -12,7 +12,7 @@ from servoid.hw.robot.description import load_robot
 from servoid.sim.rig.process.backend import VirtualBackend
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import Result, RunSettings, run
-from servoid.stack.safety.guard import DOWN, Phase
+from servoid.stack.safety.phase import DOWN, Phase
 from servoid.tools.faults.trial import unsafe_goals
 
 ROBOT = load_robot()

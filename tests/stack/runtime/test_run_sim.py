@@ -14,7 +14,7 @@ from servoid.stack.log.flightlog import read_log
 from servoid.stack.log.format import MACHINE_DEPENDENT
 from servoid.stack.runtime.run import RunSettings, Script, run
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 
 ROBOT = load_robot("op3")
 

@@ -16,7 +16,7 @@ from servoid.sim.rig.process.backend import VirtualBackend
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, run
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 
 ROBOT = load_robot()
 STRAIGHT = {"vx": "0.1", "vy": "0", "yaw_rate": "0"}

@@ -13,8 +13,8 @@ from servoid.hw.robot.description import load_robot
 from servoid.sim.rig.process.backend import VirtualBackend
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import Result, RunSettings, run
-from servoid.stack.safety.guard import Phase
 from servoid.stack.safety.health import DERATED
+from servoid.stack.safety.phase import Phase
 
 ROBOT = load_robot()
 AT = 90  # the tick that it happens at: while walking

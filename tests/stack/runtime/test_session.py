@@ -19,7 +19,7 @@ from servoid.policy.checkpoint import CheckpointError
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.log.flightlog import read_log
 from servoid.stack.runtime.run import RunSettings, Script, run
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 
 ROBOT = load_robot("op3")
 

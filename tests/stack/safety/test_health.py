@@ -12,8 +12,9 @@ from servoid.hw.contracts.body import Mode, Observation
 from servoid.hw.faults import IMU_FROZEN, INPUT_VOLTAGE, STOP_BUTTON, STOP_BUTTON_AGAIN, TORQUE_LOST
 from servoid.hw.robot.description import load_robot
 from servoid.stack.estimation.sample_hold import SampleHold
-from servoid.stack.safety.guard import Guard, Phase
+from servoid.stack.safety.guard import Guard
 from servoid.stack.safety.health import DERATED, LOW_TICKS
+from servoid.stack.safety.phase import Phase
 
 ROBOT = load_robot("op3")
 N = len(ROBOT.names)

@@ -14,8 +14,9 @@ from servoid.hw.contracts.body import BackendError, Mode
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.legs import Legs
 from servoid.stack.estimation.sample_hold import SampleHold
-from servoid.stack.safety.guard import DAMP_SECONDS, PATIENCE, Guard, Phase
+from servoid.stack.safety.guard import DAMP_SECONDS, PATIENCE, Guard
 from servoid.stack.safety.lowering import lowered_pose
+from servoid.stack.safety.phase import Phase
 
 ROBOT = load_robot("op3")
 N = len(ROBOT.names)

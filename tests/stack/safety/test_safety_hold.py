@@ -8,7 +8,8 @@ from fake_body import FakeBody, StillEstimator, observation, spoiled, tilted
 
 from servoid.hw.contracts.body import Mode
 from servoid.hw.robot.description import load_robot
-from servoid.stack.safety.guard import Guard, Phase
+from servoid.stack.safety.guard import Guard
+from servoid.stack.safety.phase import Phase
 
 ROBOT = load_robot("op3")
 N = len(ROBOT.names)

@@ -13,8 +13,9 @@ from test_safety import HIGH, LOW, ROBOT, STEP, N, Rig, proposals
 
 from servoid.hw.contracts.body import Mode
 from servoid.hw.faults import OVERLOAD, STOP_BUTTON, STOP_BUTTON_AGAIN
-from servoid.stack.safety.guard import DAMP_SECONDS, DOWN, Guard, Phase
+from servoid.stack.safety.guard import DAMP_SECONDS, Guard
 from servoid.stack.safety.health import BLOCKED_SECONDS, DERATED
+from servoid.stack.safety.phase import DOWN, Phase
 from servoid.stack.safety.recovery import (
     BRACE_GAIN,
     BRACE_SECONDS,

@@ -10,8 +10,9 @@ from fake_body import tilted
 from test_safety import ROBOT, N, Rig
 
 from servoid.hw.contracts.body import Mode
-from servoid.stack.safety.guard import PATIENCE, REST_SECONDS, REST_WINDOW, Phase
+from servoid.stack.safety.guard import PATIENCE, REST_SECONDS, REST_WINDOW
 from servoid.stack.safety.health import BLOCKED
+from servoid.stack.safety.phase import Phase
 
 
 def test_heat_lowers_before_it_damps():

@@ -13,7 +13,7 @@ from servoid.hw.geometry import up_vector
 from servoid.hw.robot.description import load_robot
 from servoid.hw.robot.legs import Legs
 from servoid.stack.runtime.run import RunSettings, run
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 from servoid.stack.safety.upright import MOST, Upright
 
 ROBOT = load_robot()

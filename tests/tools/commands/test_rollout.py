@@ -22,7 +22,7 @@ from servoid.hw.seeds import episode_seed
 from servoid.sim.backend import SimBackend
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, run
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 from servoid.tools.commands import rollout
 from servoid.tools.common.compare import summarise
 from servoid.tools.common.ground_truth import GroundTruth

@@ -21,7 +21,8 @@ from servoid.hw.contracts.control import State
 from servoid.hw.robot.description import Robot
 from servoid.stack.estimation.sample_hold import missing
 from servoid.stack.log.tick import Proposal
-from servoid.stack.safety.guard import Guard, Phase
+from servoid.stack.safety.guard import Guard
+from servoid.stack.safety.phase import Phase
 
 SPEED = 0.25  # rad/s
 SPAN = 0.35  # rad that the joint may go from where it was found, either way

@@ -16,7 +16,7 @@ from servoid.hw.geometry import headed, joined, turned, yaw_of
 from servoid.policy.features import raw_layout
 from servoid.stack.log.flightlog import FlightLog
 from servoid.stack.log.format import unpack
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 
 
 @dataclass(frozen=True)

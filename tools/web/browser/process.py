@@ -23,7 +23,7 @@ from typing import Any
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
-from servoid.stack.safety.guard import Phase
+from servoid.stack.safety.phase import Phase
 from servoid.tools.web.browser.access import Access
 from servoid.tools.web.browser.gate import Gate
 from servoid.tools.web.browser.live_foxglove import LiveFoxglove

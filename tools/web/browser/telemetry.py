@@ -14,8 +14,8 @@ from servoid.hw.faults import ROBOT, describe
 from servoid.hw.geometry import yaw_of
 from servoid.hw.robot.description import Robot
 from servoid.stack.safety.event import Event
-from servoid.stack.safety.guard import ENDED, Phase
 from servoid.stack.safety.health import FULL
+from servoid.stack.safety.phase import ENDED, Phase
 from servoid.tools.web.line.snapshot import RunInfo, Snapshot
 
 FINE, NEAR, OVER = 0, 1, 2  # nothing, yellow, red
