@@ -295,6 +295,7 @@ class Runtime:
             even=chosen.even,
             limited=chosen.limited,
             repeats=chosen.repeats,
+            actions=chosen.actions,
         )
 
 

@@ -44,6 +44,7 @@ class GuidanceSettings:
     even: bool = False  # each token's gradient has the same norm
     limited: bool = False  # no step is longer than to where the cost would be zero
     repeats: int = 1  # gradient steps a network call, which share weight and clip
+    actions: bool = False  # actions move too, by the network's own Jacobian, for a network call more
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.weight) and self.weight >= 0 and self.clip > 0):
