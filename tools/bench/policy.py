@@ -250,6 +250,7 @@ def _made_up(config: Any, states: Any, actions: Any) -> Model:
     import torch
 
     from servoid.policy.diffusion.model.checkpoint import Model
+    from servoid.policy.diffusion.model.denoiser import Denoiser
 
     torch.manual_seed(0)
     return Model(Denoiser(config).eval().requires_grad_(False), states, actions, {})

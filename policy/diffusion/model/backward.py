@@ -66,7 +66,7 @@ class Forward(nn.Module):
 
 
 def _attention(block: Block, x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Queries, keys and values `(batch, tokens, 3, heads, head width)`, how much each sees of each, and what is added."""
+    """Queries, keys and values `(batch, tokens, 3, heads, head width)`, what each sees of each, and what is added."""
     batch, tokens, width = x.shape
     qkv = block.qkv(block.norm_attention(x)).view(batch, tokens, 3, block.heads, width // block.heads)
     q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)

@@ -222,7 +222,7 @@ def test_scaled_guidance_moves_the_mean_of_a_normal_distribution_to_where_theory
 
 
 def test_actions_guided_by_the_networks_jacobian_go_where_theory_puts_them() -> None:
-    """Of a state and an action that vary together, exp(-c state) moves the action's mean by c times their covariance."""
+    """Of a state and an action that vary together, exp(-c state) moves the action's mean by c times the covariance."""
     both = torch.tensor([[1.0, 0.6], [0.6, 0.8]])
 
     def predict(s: Tensor, a: Tensor, ks: Tensor, ka: Tensor) -> tuple[Tensor, Tensor]:

@@ -24,7 +24,7 @@ class Counted:
 
 
 class CountedEngine:
-    """An engine whose calls are counted, and apart from them those back through the network, where it has a gradient."""
+    """An engine whose calls are counted and, apart from them, the ways back of one that has a gradient."""
 
     def __init__(self, engine: Engine) -> None:
         if isinstance(engine, Differentiable):
