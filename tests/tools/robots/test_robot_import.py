@@ -123,6 +123,32 @@ def test_a_joint_whose_image_belongs_to_another_is_its_own_mirror(
     assert (joints["nod"], joints["rod"]) == ("nod", "rod")
 
 
+def test_a_model_in_place_of_a_robots_file_is_named_as_one(capsys: pytest.CaptureFixture[str]) -> None:
+    """All of it was printed, as one line of YAML."""
+    assert main(["robot", "check", str(ROBOTS / "wren.xml")]) == 2
+    said = capsys.readouterr().err
+    assert "wren.xml: is a model; a robot's file is YAML, and servoid robot import" in said
+    assert len(said) < 500
+
+
+def test_a_mesh_that_collides_and_is_missing_is_named_with_where_it_is_looked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shape = '<collision><geometry><mesh filename="package://own/foot.stl"/></geometry></collision>'
+    (tmp_path / "own.urdf").write_text(f'<robot name="own"><link name="foot">{shape}</link></robot>')
+    assert main(["robot", "import", str(tmp_path / "own.urdf"), "--no-picture"]) == 2
+    assert "'foot': collision mesh package://own/foot.stl: no such file beside the URDF" in capsys.readouterr().err
+
+
+def test_servos_that_no_one_supply_feeds_are_shown() -> None:
+    wren = load_robot("wren")
+    joints = [replace(joint, servo="mx-28") if "ank" in joint.name else joint for joint in wren.joints]
+    supply = next(one for one in findings(replace(wren, joints=tuple(joints))) if one.what == "supply")
+    assert (supply.good, supply.found) == (False, "a mx-28 needs 9.5 V, and a xl330-m288 bears 6.5 V at most")
+    assert "l_knee" in supply.joints
+    assert "l_ank_roll" not in supply.joints
+
+
 def test_what_does_not_fit_its_model_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy(ROBOTS / "wren.xml", tmp_path)
     text = (ROBOTS / "wren.yaml").read_text()
