@@ -46,7 +46,7 @@ class KeyPoints:
     """Names and places of key points `(..., points, 3)`; `ends` of the names are those of limbs."""
 
     def __init__(self, robot: Robot, *, whole: bool = False) -> None:
-        """`whole` adds what says how trunk and feet are turned. Raises ConfigError where the robot's MJCF cannot be read."""
+        """`whole` adds what says how trunk and feet are turned. Raises ConfigError for an MJCF that cannot be read."""
         model = compiled(read_body(robot), robot.mjcf)
         self._base = int(model.body(robot.base).id)
         self._links: list[_Link] = []
