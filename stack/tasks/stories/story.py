@@ -66,11 +66,13 @@ class Story(BaseTask):
     def scenario(self, rng: np.random.Generator) -> StoryEpisode:
         acts = self._drawn(rng)
         layout = laid_out(acts, self.settings.things, rng)
-        scene = Scene(np.zeros((0, 3)), np.zeros((0, 4)), objects=layout.objects)
+        point = next((layout.points[n, :2] for n, index in enumerate(layout.things) if index < 0), None)
+        mark = point.copy() if self.settings.seen and point is not None else None
+        scene = Scene(np.zeros((0, 3)), np.zeros((0, 4)), mark, objects=layout.objects)
         sits = any(act.done.seated for act in acts)
         s = self.settings
         return StoryEpisode(
-            scene if layout.objects else None, acts=acts, things=layout.things, points=layout.points,
+            scene if layout.objects or mark is not None else None, acts=acts, things=layout.things, points=layout.points,
             headings=layout.headings, seated=sits,
             pushes=drawn_pushes(rng, self.seconds, s.push, s.push_every, self.ticks(s.push_every)),
         )  # fmt: skip
@@ -118,7 +120,7 @@ class Story(BaseTask):
         if index >= 0:
             lost = np.full((len(trace.yaw), 7), np.nan)
             return lost if trace.objects is None else trace.objects[:, index]
-        return np.broadcast_to(episode.point(number, trace.objects), (len(trace.yaw), 7))
+        return np.broadcast_to(episode.point(number, trace.objects, trace.goal), (len(trace.yaw), 7))
 
 
 def _count(done: Sequence[int | None]) -> int:

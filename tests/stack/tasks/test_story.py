@@ -299,3 +299,21 @@ def test_a_point_is_where_the_seat_puts_it() -> None:
         episode.point(2, np.stack([seen, drifted]))[:, 0] - episode.points[2, 0], [0, 0.3], atol=1e-9
     )
     np.testing.assert_allclose(episode.point(2, None)[:2], episode.points[2, :2])
+
+
+def test_a_point_that_is_seen_is_where_its_mark_is() -> None:
+    """By odometry alone, robots that slip come to a stand beside it, and believe to be there."""
+    _, episode, machine = _story(plan="sit,rise,reach", seen="yes")
+    assert episode.scene is not None
+    assert episode.scene.goal is not None
+    np.testing.assert_array_equal(episode.scene.goal, episode.points[2, :2])
+    seen = np.array([[1.0, 2.0], [np.nan, np.nan]])
+    found = episode.point(2, None, seen)
+    np.testing.assert_allclose(found[0, :2], seen[0])
+    np.testing.assert_allclose(found[1, :2], episode.points[2, :2], err_msg="out of sight it is where it was drawn")
+    _, episode, machine = _story(plan="reach", seen="yes")
+    for age, led in ((0.0, True), (3.0, False)):
+        asked = machine.instruct(0, _at(np.zeros(2), 0.0), Percept("scene", age, goal=np.array([0.5, -0.1])))
+        assert asked.goal is not None
+        assert np.allclose(asked.goal, [0.5, -0.1]) == led, "what was seen long ago is not gone by"
+    assert _story(plan="reach")[1].scene is None
