@@ -303,7 +303,7 @@ def test_a_point_is_where_the_seat_puts_it() -> None:
 
 def test_a_point_that_is_seen_is_where_its_mark_is() -> None:
     """By odometry alone, robots that slip come to a stand beside it, and believe to be there."""
-    _, episode, machine = _story(plan="sit,rise,reach", seen="yes")
+    _, episode, machine = _story(plan="sit,rise,reach", seen="true")
     assert episode.scene is not None
     assert episode.scene.goal is not None
     np.testing.assert_array_equal(episode.scene.goal, episode.points[2, :2])
@@ -311,7 +311,7 @@ def test_a_point_that_is_seen_is_where_its_mark_is() -> None:
     found = episode.point(2, None, seen)
     np.testing.assert_allclose(found[0, :2], seen[0])
     np.testing.assert_allclose(found[1, :2], episode.points[2, :2], err_msg="out of sight it is where it was drawn")
-    _, episode, machine = _story(plan="reach", seen="yes")
+    _, episode, machine = _story(plan="reach", seen="true")
     for age, led in ((0.0, True), (3.0, False)):
         asked = machine.instruct(0, _at(np.zeros(2), 0.0), Percept("scene", age, goal=np.array([0.5, -0.1])))
         assert asked.goal is not None
