@@ -18,6 +18,7 @@ from servoid.stack.tasks.stories.act import Act, drawn, load_acts
 from servoid.stack.tasks.stories.condition import Conditions, first, held_ticks, moments
 from servoid.stack.tasks.stories.layout import laid_out
 from servoid.stack.tasks.stories.machine import Machine
+from servoid.stack.tasks.stories.strike import struck_by
 from servoid.stack.tasks.stories.told import StoryEpisode, StorySettings
 
 ARM = 1.25  # of the base's height at home: a hand reaches no higher by its skill
@@ -94,6 +95,8 @@ class Story(BaseTask):
         found = {"acts_done": float(_count(done)), "acts_share": _count(done) / len(episode.acts)}
         if episode.acts[-1].sits and _count(done) >= len(done) - 1:
             found["rose_share"] = float(done[-1] is not None and not trace.fallen)
+        if (told := self._struck_as_told(trace, episode, done)) is not None:
+            found["struck_as_told"] = told
         if done[-1] is not None:
             found["seconds_to_done"] = (done[-1] + 1) * trace.dt
         return found
@@ -114,6 +117,20 @@ class Story(BaseTask):
             found.append(at)
             begin = len(trace.yaw) if at is None else at + 1
         return found
+
+    def _struck_as_told(self, trace: Trace, episode: StoryEpisode, done: Sequence[int | None]) -> float | None:
+        """Share of bags that fell by the limb that was to strike them; None where there is none to strike."""
+        strikes = [number for number, act in enumerate(episode.acts) if act.limb is not None]
+        if not strikes or trace.objects is None or not len(trace.yaw):
+            return None
+        now, struck = moments(trace, self.conditions.legs), 0
+        for number in strikes:
+            index = episode.things[number]
+            limb = struck_by(
+                self.conditions.points, now, trace.objects[:, index], np.array(episode.objects[index].size)
+            )
+            struck += done[number] is not None and limb == episode.acts[number].limb
+        return struck / len(strikes)
 
     def _thing(self, trace: Trace, episode: StoryEpisode, number: int) -> Array:
         index = episode.things[number]

@@ -317,3 +317,26 @@ def test_a_point_that_is_seen_is_where_its_mark_is() -> None:
         assert asked.goal is not None
         assert np.allclose(asked.goal, [0.5, -0.1]) == led, "what was seen long ago is not gone by"
     assert _story(plan="reach")[1].scene is None
+
+
+def test_a_bag_is_struck_by_what_is_nearest_as_it_leans() -> None:
+    """A bag that the robot walks over falls, too, and was not struck by the hand that was told."""
+    task, episode, _ = _story(plan="punch-left")
+    height, names = episode.objects[0].size[2], task.conditions.points.names
+    body = task.conditions.points(ROBOT.home)
+    base = np.array([0.0, 0.0, ROBOT.standing_height])
+    for part in ("left hand", "right hand", "right foot"):
+        place = base + body[names.index(part)]
+        bag = np.tile([*place[:2], height / 2, 1.0, 0.0, 0.0, 0.0], (6, 1))
+        bag[:, 1] += np.sign(place[1]) * 0.04 if "hand" in part else 0.0
+        bag[:, 0] += 0.0 if "hand" in part else 0.12
+        bag[3:, 3:] = [np.cos(0.8), 0.0, np.sin(0.8), 0.0]  # it falls
+        trace = Trace(
+            dt=ROBOT.dt, displacement=np.tile(base, (6, 1)), yaw=np.zeros(6), velocity=np.zeros((6, 3)),
+            yaw_rate=np.zeros(6), command=np.zeros((6, 3)), fallen=False,
+            orientation=np.tile([1.0, 0, 0, 0], (6, 1)),
+            joints=np.tile(ROBOT.home, (6, 1)), objects=bag[:, None],
+        )  # fmt: skip
+        assert task.metrics(trace, episode)["struck_as_told"] == float(part == "left hand"), part
+    still = replace(trace, objects=np.repeat(trace.objects[:1], 6, 0))  # type: ignore[index]
+    assert task.metrics(still, episode)["struck_as_told"] == 0.0
