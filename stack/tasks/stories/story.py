@@ -73,8 +73,8 @@ class Story(BaseTask):
         sits = any(act.done.seated for act in acts)
         s = self.settings
         return StoryEpisode(
-            scene if layout.objects or mark is not None else None, acts=acts, things=layout.things, points=layout.points,
-            headings=layout.headings, seated=sits,
+            scene if layout.objects or mark is not None else None, acts=acts, things=layout.things,
+            points=layout.points, headings=layout.headings, seated=sits,
             pushes=drawn_pushes(rng, self.seconds, s.push, s.push_every, self.ticks(s.push_every)),
         )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""What struck a bag, of a whole trace: a pure function. A robot that walks a bag over has not struck it as it was told."""
+"""What struck a bag, of a whole trace: a pure function. A robot that walks a bag over has not struck it as told."""
 
 from __future__ import annotations
 
