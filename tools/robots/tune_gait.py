@@ -1,8 +1,8 @@
 """Search for the steps that a robot walks best by, in simulation, and write them to the robot's own folder.
 
 The search is CMA-ES over the lengths and times of the gait, each candidate walking in all directions on nominal and
-randomised robots. The best so far is written whenever there is a better one, so that Ctrl-C may end the search; not where every
-walk fell.
+randomised robots. The best so far is written whenever there is a better one, so that Ctrl-C may end the search. Where
+every walk fell, nothing is written.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def main(args: argparse.Namespace) -> int:
         report.line(
             f"{robot.name}: {_words(best)}; written to {out}"
             if written
-            else f"{robot.name}: every walk fell; nothing is written. Does run stand stand? See servoid robot check, and "
+            else f"{robot.name}: every walk fell; nothing is written. See servoid robot check, and "
             f"give lower speeds than {robot.walking.forward:.2f} m/s ahead as `walking` in the robot's file"
         )
         report.result(
