@@ -14,6 +14,7 @@ import pytest
 from servoid.hw.config import CONFIGS, available
 from servoid.hw.robot.description import load_robot, load_servo, save_servo
 from servoid.hw.robot.legs import Legs
+from servoid.stack.control.fleet import Fleet
 from servoid.stack.estimation.odometry import odometry_of
 from servoid.tools.cli import main
 from servoid.tools.robots.compare import findings
@@ -48,6 +49,46 @@ def test_what_geometry_says_is_drafted_as_it_is_written_by_hand(
     assert {side: foot.geoms for side, foot in drafted.feet.items()} == {s: f.geoms for s, f in ours.feet.items()}
 
 
+def test_feet_that_are_turned_at_zero_are_found_whole_and_put_level(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At a stranger's zero angles knees are bent backwards and toes are up: of each foot's four studs the two at the
+    heel were taken, no pose with bent knees was found, and it stood leaning ahead while everything had fitted."""
+    text = (ROBOTS / "wren.xml").read_text()
+    sole = 'class="{}_leg" type="box" size="0.038 0.022 0.003" pos="0.006 0.003 -0.012" mass="0.014" material="sole"/>'
+    for side, name, y in (("l", "left", 0.003), ("r", "right", -0.003)):
+        old = f'<geom name="{side}_sole" {sole.format(name)}'.replace("0.003 -0.012", f"{y} -0.012")
+        assert text.count(old) == 1
+        studs = (
+            f'<geom name="{side}{i}" class="{name}_leg" size="0.004" pos="{x} {y + z} -0.011" mass="0.0035"/>'
+            for i, (x, z) in enumerate((x, z) for x in (-0.028, 0.04) for z in (-0.018, 0.018))
+        )
+        text = text.replace(old, "".join(studs))
+        for link, place, turn in (("knee", "0 0 -0.056", -0.3), ("ank_roll", "0 0 -0.014", -0.15)):
+            place = f'"{side}_{link}_link" pos="{place}"'
+            assert text.count(place) == 1
+            text = text.replace(place, f'{place} euler="0 {turn} 0"')
+        text = text.replace(
+            f'<joint name="{side}_knee" axis="0 1 0"/>', f'<joint name="{side}_knee" axis="0 1 0" range="0 2.2"/>'
+        )
+    (tmp_path / "tilted.xml").write_text(text)
+    code, said = imported(capsys, str(tmp_path / "tilted.xml"), "--out", str(tmp_path / "tilted.yaml"))
+    assert code == 0
+    assert "home of every joint: the model has no keyframe; its knees were bent by geometry" in said["todo"]
+    robot = load_robot(tmp_path / "tilted.yaml")
+    assert [foot.geoms for foot in robot.feet.values()] == [tuple(f"{side}{i}" for i in range(4)) for side in "lr"]
+    assert {one.what for one in findings(robot) if not one.good} <= {"steps of the gait"}
+    straight = replace(robot, joints=tuple(replace(joint, home=max(0.0, joint.range[0])) for joint in robot.joints))
+    look = {one.what: one.found for one in findings(straight) if not one.good}
+    assert "leans ahead by 0.4" in look["trunk at home"]
+    fleet = Fleet(robot, 1, None)
+    fleet.reset(np.ones(1, bool))
+    for _ in range(10):
+        fleet.step(robot.home[None])
+    assert fleet.truth.foot_force.sum() == pytest.approx(9.81 * 0.62, rel=0.3)
+    assert not fleet.truth.fallen.any()  # a stud is a body of its own, and part of the foot
+
+
 def test_an_origin_on_the_ground_is_moved_into_the_trunk(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Models out of drawing programs have it there, and how high such a base is says nothing of a fall."""
     text = (ROBOTS / "wren.xml").read_text().replace('<freejoint name="root"/>', '<freejoint/><frame pos="0 0 0.19">')
@@ -80,6 +121,32 @@ def test_a_joint_whose_image_belongs_to_another_is_its_own_mirror(
     assert "mirror of rod: nod, at its image, is that of another" in said["todo"]
     joints = {joint.name: joint.mirror for joint in load_robot(tmp_path / "neck.yaml").joints}
     assert (joints["nod"], joints["rod"]) == ("nod", "rod")
+
+
+def test_a_model_in_place_of_a_robots_file_is_named_as_one(capsys: pytest.CaptureFixture[str]) -> None:
+    """All of it was printed, as one line of YAML."""
+    assert main(["robot", "check", str(ROBOTS / "wren.xml")]) == 2
+    said = capsys.readouterr().err
+    assert "wren.xml: is a model; a robot's file is YAML, and servoid robot import" in said
+    assert len(said) < 500
+
+
+def test_a_mesh_that_collides_and_is_missing_is_named_with_where_it_is_looked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shape = '<collision><geometry><mesh filename="package://own/foot.stl"/></geometry></collision>'
+    (tmp_path / "own.urdf").write_text(f'<robot name="own"><link name="foot">{shape}</link></robot>')
+    assert main(["robot", "import", str(tmp_path / "own.urdf"), "--no-picture"]) == 2
+    assert "'foot': collision mesh package://own/foot.stl: no such file beside the URDF" in capsys.readouterr().err
+
+
+def test_servos_that_no_one_supply_feeds_are_shown() -> None:
+    wren = load_robot("wren")
+    joints = [replace(joint, servo="mx-28") if "ank" in joint.name else joint for joint in wren.joints]
+    supply = next(one for one in findings(replace(wren, joints=tuple(joints))) if one.what == "supply")
+    assert (supply.good, supply.found) == (False, "a mx-28 needs 9.5 V, and a xl330-m288 bears 6.5 V at most")
+    assert "l_knee" in supply.joints
+    assert "l_ank_roll" not in supply.joints
 
 
 def test_what_does_not_fit_its_model_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
