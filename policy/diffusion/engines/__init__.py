@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -84,10 +84,11 @@ def load_engine(name: str, denoiser: Denoiser, gradient: bool = False) -> Engine
     if name == "onnx-int8":
         graph = export.quantised(graph)
     load = _onnx_runtime if name.startswith("onnx") else partial(_openvino, "bf16" if "bf16" in name else "f32")
-    engine: Engine = Exported(load(graph), denoiser.config.text_size)
+    whole = Exported(load(graph), denoiser.config.text_size)
+    engine: Engine = whole
     if gradient:
         passes = [load(export.exported(denoiser, part)) for part in (export.FORWARD, export.BACKWARD)]
-        engine = _with_gradient(engine, denoiser, *passes)
+        engine = _with_gradient(whole, denoiser, *passes)
     error = deviation(engine, denoiser, gradient)
     if not error <= ENGINES[name].tolerance:
         raise ConfigError(
@@ -139,7 +140,7 @@ class Exported:
         self._text_size = text_size
         self._told: dict[int, tuple[Array, Array]] = {}  # by batch: all are told, and an instruction for those without
 
-    def __call__(self, *inputs: Tensor, **text: Tensor | None) -> tuple[Tensor, Tensor]:
+    def __call__(self, *inputs: Tensor, **text: Any) -> tuple[Tensor, Tensor]:
         """See `Denoiser.forward`. Raises RuntimeError when a gradient is wanted, which a graph has not."""
         import torch
 

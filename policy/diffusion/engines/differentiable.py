@@ -29,7 +29,7 @@ class Differentiable:
         """See `Denoiser.forward`. The gradient is on noisy states, by clean ones: actions have none."""
         if not (states.requires_grad and torch.is_grad_enabled()):
             return self.engine(states, *others, **text)
-        clean: tuple[Tensor, Tensor] = _Passes.apply(states, self, others, text)
+        clean: tuple[Tensor, Tensor] = _Passes.apply(states, self, others, text)  # type: ignore[no-untyped-call]
         return clean
 
 

@@ -95,12 +95,19 @@ class Backward(nn.Module):
             block = net.blocks[i]
             assert isinstance(block, Block)
             entered, qkv, seen, fed, feed = parts[_PER_BLOCK * i : _PER_BLOCK * (i + 1)]
-            widened = (slope @ block.feed[2].weight) * _gelu_slope(feed)
-            slope = slope + _norm_back(block.norm_feed, widened @ block.feed[0].weight, fed)
+            widen, narrow = _weights(block.feed)
+            slope = slope + _norm_back(block.norm_feed, ((slope @ narrow) * _gelu_slope(feed)) @ widen, fed)
             back = _attention_back(block, slope, qkv, seen)
             slope = slope + _norm_back(block.norm_attention, back @ block.qkv.weight, entered)
-        first, _, second = net.embed_state
-        return ((slope[:, :n] @ second.weight) * _gelu_slope(embedded)) @ first.weight
+        first, second = _weights(net.embed_state)
+        return ((slope[:, :n] @ second) * _gelu_slope(embedded)) @ first
+
+
+def _weights(layers: nn.Sequential) -> tuple[Tensor, Tensor]:
+    """Of two linear layers with a GELU between them."""
+    first, _, second = layers
+    assert isinstance(first, nn.Linear) and isinstance(second, nn.Linear)
+    return first.weight, second.weight
 
 
 def _attention_back(block: Block, slope: Tensor, qkv: Tensor, seen: Tensor) -> Tensor:

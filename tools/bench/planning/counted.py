@@ -27,14 +27,15 @@ class CountedEngine:
     """An engine whose calls are counted and, apart from them, the ways back of one that has a gradient."""
 
     def __init__(self, engine: Engine) -> None:
+        self._back: list[Counted] = []
         if isinstance(engine, Differentiable):
             forward, backward = (Counted(each) for each in engine.passes)
             plain = Counted(engine.engine)
-            self._calls, self._back = (plain, forward), (backward,)
+            self._calls, self._back = [plain, forward], [backward]
             self.engine: Engine = Differentiable(plain, forward, backward)
         else:
-            self.engine = Counted(engine)
-            self._calls, self._back = (self.engine,), ()
+            plain = Counted(engine)
+            self._calls, self.engine = [plain], plain
 
     def clear(self) -> None:
         """Count from here."""
