@@ -106,7 +106,8 @@ class Backward(nn.Module):
 def _weights(layers: nn.Sequential) -> tuple[Tensor, Tensor]:
     """Of two linear layers with a GELU between them."""
     first, _, second = layers
-    assert isinstance(first, nn.Linear) and isinstance(second, nn.Linear)
+    assert isinstance(first, nn.Linear)
+    assert isinstance(second, nn.Linear)
     return first.weight, second.weight
 
 
