@@ -124,7 +124,7 @@ class Guidance:
 
     def _along(self, slope: Array, step: DenoisingStep) -> Array:
         """A gradient on clean states as a direction of noisy ones, with its share of the weight."""
-        along: Array = slope * (step.moving[:, None] * np.float32(min(self.weight / self.repeats, _LARGEST)))
+        along: Array = self._shared(slope) * (step.moving[:, None] * np.float32(min(self.weight / self.repeats, _LARGEST)))
         return along * (step.noise**2 / step.signal) if self.scaled else along
 
     @staticmethod
@@ -138,6 +138,12 @@ class Guidance:
             there = network(states + torch.from_numpy(along * reach), actions, *levels)[1].numpy()
         change: Array = (there - acted) / reach
         return change
+
+    def _shared(self, gradient: Array) -> Array:
+        """Of neighbours that are samples of one window, the mean for each."""
+        if self.samples == 1:
+            return gradient
+        return np.repeat(gradient.reshape(-1, self.samples, *gradient.shape[1:]).mean(1), self.samples, 0)
 
     def _limited(self, step: Array, slope: Array, cost: Array) -> Array | float:
         """How much of a step, `(batch, 1, 1)`, leads to where a `cost` `(batch,)` with this `slope` would be zero."""
@@ -153,9 +159,7 @@ class Guidance:
         if self.even:
             size = np.linalg.norm(gradient, axis=2, keepdims=True)
             gradient = gradient * (size[:, moving].mean(1, keepdims=True) / np.maximum(size, 1e-12))
-        if self.samples > 1:
-            mean = gradient.reshape(-1, self.samples, *gradient.shape[1:]).mean(1)
-            gradient = np.repeat(mean, self.samples, 0)
+        gradient = self._shared(gradient)
         # What does not move uses nothing of the step up; weights are beyond all bounds before float32 is.
         step = gradient * (moving[:, None] * np.float32(min(self.weight / self.repeats, _LARGEST)))
         flat = step.reshape(len(step), -1)
