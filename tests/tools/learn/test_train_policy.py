@@ -28,6 +28,8 @@ from servoid.policy.priors.adversarial.discriminator import (
 from servoid.policy.priors.goals import GOALS
 from servoid.policy.priors.observation import TaskObservation
 from servoid.policy.priors.score_matching.model import Style, load_prior
+from servoid.policy.priors.score_matching.score import Score
+from servoid.policy.priors.score_matching.smiling import OwnScore
 from servoid.policy.priors.score_matching.windows import PriorWindows
 from servoid.policy.priors.task_policy import TaskPolicy
 from servoid.policy.recording import DatasetError, read_recording
@@ -340,6 +342,30 @@ def test_what_a_policy_imitates_is_kept_and_others_can_begin_with_it(
     assert np.allclose(first.actor()(seen), second.actor()(seen), atol=1e-6)
 
 
+def test_smiling_pays_nothing_for_what_the_prior_knows_as_well_and_charges_for_the_rest(prior: Path) -> None:
+    """Both denoisers see the same noise: as long as they are one, the reward is exactly nought; once the second has
+    learned motion that the prior does not know, that costs."""
+    known = load_prior(prior, ROBOT, limbs_of(ROBOT))
+    own, judge, scale = OwnScore(known, 0), Score(known, Style(), 0), np.ones(3)
+    own.network.load_state_dict(known.network.state_dict())
+    elsewhere = known.decode(torch.full((64, known.config.frames, known.config.size), 3.0))
+    assert own.reward(elsewhere, judge(elsewhere), scale) == pytest.approx(np.zeros(64))
+    losses = [own.learn()["own_loss"] for _ in range(20)]
+    assert losses[-1] < 0.7 * losses[0]
+    assert own.reward(elsewhere, judge(elsewhere), scale).mean() < -0.3
+
+
+def test_smiling_rewards_in_the_place_of_the_prior(prior: Path) -> None:
+    known = load_prior(prior, ROBOT, limbs_of(ROBOT))
+    settings = replace(SETTINGS, rewards={"manner": 1.0}, generated=0.0)
+    env = environment(load_learned_task("speed", ROBOT), known, Style(), settings, 6, 0, "smiling")
+    env.reset()
+    rewards = [env.step(np.zeros((env.n, env.action_size)))[0] for _ in range(3)]
+    assert np.isfinite(rewards).all()
+    assert (env.score.ratio > 0).all()  # the prior goes on measuring
+    assert env.score.learn()["own_loss"] > 0.0
+
+
 @pytest.mark.slow
 def test_a_discriminator_learns_along_and_rewards_frozen(prior: Path, synthetic_dataset: Path, tmp_path: Path) -> None:
     """AMP in the same environment: it comes to tell the policy's windows, and its file rewards another training."""
@@ -360,7 +386,7 @@ def test_a_discriminator_learns_along_and_rewards_frozen(prior: Path, synthetic_
     frozen = load_discriminator(file, known)
     real = adversary._data.held_out(20)[0] * known.std + known.mean
     assert np.array_equal(frozen.reward(real), discriminator.reward(real))
-    assert frozen.reward(real).mean() > frozen.reward(torch.cat(adversary._memory)).mean()
+    assert frozen.reward(real).mean() > frozen.reward(adversary.memory.windows).mean()
     again = environment(load_learned_task("speed", ROBOT), known, Style(), SETTINGS, 6, 0, Rival(frozen, None))
     again.reset()
     again.step(np.zeros((6, again.action_size)))

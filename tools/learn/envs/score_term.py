@@ -175,11 +175,27 @@ class AdversarialTerm(ScoreTerm):
 
     def _reward(self, windows: Tensor, errors: Array) -> Array:
         if self._adversary is not None:
-            self._adversary.see(windows)
+            self._adversary.memory.see(windows)
         return self.discriminator.reward(windows)
 
     def learn(self) -> dict[str, float]:
         return {} if self._adversary is None else self._adversary.learn()
+
+
+class SmilingTerm(ScoreTerm):
+    """SMILING's reward instead, which has no bound: see `OwnScore`; the prior measures the manner all the same."""
+
+    def __init__(self, prior: Prior, style: Style, n: int, settings: ScoreSettings, seed: int) -> None:
+        from servoid.policy.priors.score_matching.smiling import OwnScore
+
+        super().__init__(prior, style, n, settings, seed)
+        self.own = OwnScore(prior, seed, settings.random_level)
+
+    def _reward(self, windows: Tensor, errors: Array) -> Array:
+        return self.own.reward(windows, errors, self.data_error)
+
+    def learn(self) -> Mapping[str, float]:
+        return self.own.learn()
 
 
 class GeneratedStarts:
