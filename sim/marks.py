@@ -11,6 +11,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.world import SceneObject
+from servoid.hw.geometry import rotation_matrix
 from servoid.sim.objects import COLOURS, shapes
 from servoid.sim.scene import PILLAR_COLOUR, PILLAR_HEIGHT, SPHERE_COLOUR
 
@@ -21,7 +22,9 @@ PATH_COLOUR = (0.15, 0.50, 0.30, 0.7)
 TRAIL_COLOUR = (0.20, 0.35, 0.75, 0.9)
 PLAN_COLOUR = (0.95, 0.55, 0.10, 0.9)
 PUSH_COLOUR = (0.85, 0.10, 0.15, 1.0)
+WRONG_COLOUR = (0.90, 0.10, 0.10, 0.65)
 PUSH_LENGTH = 0.5  # m of the arrow for each m/s
+WRONG_SIZE = 0.09  # of the base's height: larger than a servo, so that what is inside of a limb is seen
 _GEOM = mujoco.mjtGeom
 
 
@@ -41,6 +44,7 @@ class Frame:
     reach: float | None = None  # m around the goal that count as there
     path: Array | None = None  # (n, 2) m: the way that was asked for
     push: Array | None = None  # (2,) m/s: the velocity that the base is changed by now
+    wrong: tuple[tuple[float, float, float], ...] = ()  # m, from the base along its axes: places to look at
     ghosts: tuple[Frame, ...] = field(default=())  # poses to be in later
 
 
@@ -51,6 +55,9 @@ def draw(scene: mujoco.MjvScene, frame: Frame, trail: list[Array]) -> None:
             _add(scene, _GEOM.mjGEOM_CYLINDER, (frame.reach, 0.001, 0), frame.goal, 0.002, REACH_COLOUR)
         _add(scene, _GEOM.mjGEOM_CYLINDER, (0.015, 0.002, 0), frame.goal, 0.004, GOAL_COLOUR)
         _add(scene, _GEOM.mjGEOM_CYLINDER, (0.004, 0.12, 0), frame.goal, 0.12, GOAL_COLOUR)
+    for place in frame.wrong:
+        x, y, z = frame.place + rotation_matrix(frame.orientation) @ np.array(place)
+        _add(scene, _GEOM.mjGEOM_SPHERE, (WRONG_SIZE * frame.place[2], 0, 0), np.array([x, y]), z, WRONG_COLOUR)
     for x, y, radius in frame.pillars if frame.pillars is not None else ():
         size, half = (radius, PILLAR_HEIGHT / 2, 0.0), PILLAR_HEIGHT / 2
         _add(scene, _GEOM.mjGEOM_CYLINDER, size, np.array([x, y]), half, PILLAR_COLOUR)

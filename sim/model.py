@@ -191,7 +191,7 @@ def _add_sensors(model: mujoco.MjSpec, robot: Robot, number: int, robots: int) -
         body = model.geom(own + foot.geoms[0]).parent
         site = f"{own}{ADDED}{name}_foot"
         body.add_site(name=site, pos=foot.sole, quat=_quaternion(foot.axes), group=4)
-        sole = {"reftype": obj.mjOBJ_BODY, "refname": body.name}
+        sole = {"reftype": obj.mjOBJ_XBODY, "refname": _moving(body).name}  # studs may be bodies of their own
         add(
             f"{ADDED}{name}_contact",
             kind.mjSENS_CONTACT,
@@ -206,6 +206,13 @@ def _add_sensors(model: mujoco.MjSpec, robot: Robot, number: int, robots: int) -
     for other in (i for i in range(robots) if i != number):  # of the scene's sensors: what it touches beside the floor
         base = prefix(other) + robot.base
         add(f"{SCENE}robot{other}", kind.mjSENS_CONTACT, obj.mjOBJ_XBODY, base, intprm=[FOUND, 0, 1], **whole)
+
+
+def _moving(body: mujoco.MjsBody) -> mujoco.MjsBody:
+    """The body that carries this one, maybe over others, and moves by a joint."""
+    while not body.joints:
+        body = body.parent
+    return body
 
 
 def _quaternion(axes: Axes) -> Array:

@@ -37,6 +37,7 @@ HEAVY = {
         "tools/robots/compare.py",
         "tools/robots/home.py",
         "tools/robots/draft.py",
+        "tools/robots/feet.py",
         "tools/robots/couplings.py",
     ),  # hw/robot/ reads the robot's body by it, when a robot is loaded
 }

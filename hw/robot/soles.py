@@ -14,9 +14,10 @@ from servoid.hw.geometry import rotation_matrix
 if TYPE_CHECKING:
     import mujoco
 
-_UPRIGHT = np.cos(np.deg2rad(20.0))  # of a face that may be a sole, at the home pose
+_UPRIGHT = np.cos(np.deg2rad(35.0))  # of a face that may be a sole, at the home pose: not every robot stands level
 _FORWARD = np.cos(np.deg2rad(45.0))
 _FLAT = 0.004  # m above the lowest point that still counts as sole: rounded edges, and soles of several parts
+_LARGER = 1.5  # times the area by which a sole must be larger to be taken instead
 _LEAST = 0.004  # m, half size of a sole that touches in a point or a line
 
 
@@ -34,7 +35,8 @@ def find_sole(model: mujoco.MjModel, geoms: tuple[str, ...], home: Array) -> Sol
     """The sole of `geoms`, all fixed to the body of the first; `home` `(3, 3)` turns that body into the base at the
     home pose, where soles lie about level.
 
-    Its axes are the body's, or those of one of its boxes, if such are about level at home; else the base's at home.
+    Its axes are the body's, those of one of its boxes, or the base's at home: of those that are about level at home the
+    first, unless along others a clearly larger sole touches the ground at once.
     """
     ids = [model.geom(name).id for name in geoms]
     first = int(model.geom_bodyid[ids[0]])
@@ -44,8 +46,17 @@ def find_sole(model: mujoco.MjModel, geoms: tuple[str, ...], home: Array) -> Sol
         if int(model.geom_type[geom]) == _box():
             frames.append(turn)
         points.append(place + _points(model, geom, turn.T @ -home[2]) @ turn.T)
-    level = next((axes for axes in (_axes(frame, home) for frame in frames) if axes is not None), home.T)
-    cloud = np.concatenate(points) @ level
+    levels = [axes for axes in (_axes(frame, home) for frame in frames) if axes is not None]
+    soles = [_touching(np.concatenate(points), level) for level in [*levels, home.T]]
+    best = soles[0]
+    for sole in soles[1:]:
+        best = sole if np.prod(sole.half_size) > _LARGER * np.prod(best.half_size) else best
+    return best
+
+
+def _touching(points: Array, level: Array) -> Sole:
+    """The sole that the lowest of points `(n, 3)` m are along the axes that are the columns of `level`."""
+    cloud = points @ level
     under = cloud[cloud[:, 2] < cloud[:, 2].min() + _FLAT]
     low, high = under.min(0), under.max(0)
     centre = np.array([*(low[:2] + high[:2]) / 2, low[2]])

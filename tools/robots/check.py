@@ -18,7 +18,9 @@ from servoid.tools.common.pictures.drawing import choose_drawing
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `servoid robot check`."""
     parser.add_argument("robot", nargs="?", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the robot in four poses, as a .png")
+    parser.add_argument(
+        "--picture", type=Path, metavar="FILE", help="draw the robot in four poses, and where to look, as a .png"
+    )
     add_json_argument(parser)
 
 
@@ -39,9 +41,9 @@ def main(args: argparse.Namespace) -> int:
         robot = load_robot(args.robot)
         found = findings(robot)
         report.table(("", "what", "found"), [("ok" if one.good else "look", one.what, one.found) for one in found])
-        if picture is not None:
-            poses(robot, picture, report)
         wrong = [one for one in found if not one.good]
+        if picture is not None:
+            poses(robot, picture, report, tuple(place for one in wrong for place in one.places))
         report.line(f"{robot.name}: {len(wrong)} to look at" if wrong else f"{robot.name}: all fits")
         report.result({"ok": not wrong, "findings": [vars(one) for one in found]})
     return exit_codes.DONE if not wrong else exit_codes.FAILED

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.geometry import rotation_matrix
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
 from servoid.hw.robot.mjcf import compiled, read_spec
@@ -23,18 +24,22 @@ _SAME_GEAR = 1e-3  # of a ratio
 _MIRRORED = 0.005  # m that joints may be beside their mirror images
 _LOPSIDED = 0.015  # m more that a body's centre of mass may be: no robot is quite alike on both sides
 _LOADED = 0.6  # share of its stall torque that a servo may need to hold the robot at home
-_LEVEL = 0.05  # rad that soles may lean at home
+_LEVEL = 0.05  # rad that soles may lean against each other at home
+_UPRIGHT = 0.15  # rad that the base may lean at home
 _STIFF = 1.5  # times the stiffness at which a robot topples at home by its weight alone
 _WHIP = 4.0  # times the speed that a goal may have, that the gait's joints may ask for: servos lag behind
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Something that was compared, and whether it is as it should be."""
+    """Something that was compared, and whether it is as it should be. Where it is not: at these joints, and at these
+    places [m] at home, in the base's frame."""
 
     good: bool
     what: str
     found: str
+    joints: tuple[str, ...] = ()
+    places: tuple[tuple[float, float, float], ...] = ()
 
 
 def findings(robot: Robot) -> list[Comparison]:
@@ -43,7 +48,7 @@ def findings(robot: Robot) -> list[Comparison]:
     data = mujoco.MjData(model)
     joints = np.array([int(model.joint(name).qposadr[0]) for name in robot.names])
     mass = float(model.body_mass[1:].sum())
-    return [
+    found = [
         Comparison(
             True, "weight and height", f"{mass:.2f} kg, base {robot.standing_height:.3f} m above the ground at home"
         ),
@@ -53,11 +58,20 @@ def findings(robot: Robot) -> list[Comparison]:
         _mirrors(robot, model, data, joints),
         _ranges(robot),
         _soles(robot),
+        _upright(robot),
         _balance(robot, model, data, joints),
         _load(robot, model, data, joints),
         _stiffness(robot, model, data, joints),
         _steps(robot),
     ]
+    _put(model, data, joints, robot.home)
+    at = {name: data.xanchor[model.joint(name).id].copy() for name in robot.names}
+    return [replace(one, places=one.places + _places(*(at[name] for name in one.joints))) for one in found]
+
+
+def _places(*points: Array) -> tuple[tuple[float, float, float], ...]:
+    """Points `(3,)` as plain figures, to the millimetre."""
+    return tuple((round(float(x), 3), round(float(y), 3), round(float(z), 3)) for x, y, z in points)
 
 
 def _put(model: mujoco.MjModel, data: mujoco.MjData, joints: Array, pose: Array) -> None:
@@ -75,7 +89,8 @@ def _kinematics(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints
         soles, _ = legs.soles(legs.pick(pose))
         for sole, foot in zip(soles, robot.legs, strict=True):
             worst = max(worst, float(np.abs(data.sensor(f"servoid/{foot}_position").data - sole).max()))
-    return Comparison(worst < _EXACT, "kinematics", f"soles {worst:.1e} m from MuJoCo's at {_POSES} random poses")
+    text, at_home = f"soles {worst:.1e} m from MuJoCo's at {_POSES} random poses", legs.soles(legs.pick(robot.home))[0]
+    return Comparison(worst < _EXACT, "kinematics", text, places=_places(*at_home) if worst >= _EXACT else ())
 
 
 def _gears(robot: Robot) -> list[Comparison]:
@@ -92,24 +107,27 @@ def _gears(robot: Robot) -> list[Comparison]:
     return [Comparison(not wrong, "gears", "; ".join(wrong) or "as the model ties joints to their servos' horns")]
 
 
-def overlaps(robot: Robot, model: mujoco.MjModel) -> dict[tuple[str, str], float]:
-    """Pairs of the robot's bodies whose shapes overlap at home, as they collide, and by how much [m]."""
-    data, found = mujoco.MjData(model), dict[tuple[str, str], float]()
+def overlaps(robot: Robot, model: mujoco.MjModel) -> dict[tuple[str, str], tuple[float, Array]]:
+    """Pairs of the robot's bodies whose shapes overlap at home, as they collide: by how much [m], and where `(3,)` m in
+    the base's frame."""
+    data, found = mujoco.MjData(model), dict[tuple[str, str], tuple[float, Array]]()
     _put(model, data, np.array([int(model.joint(name).qposadr[0]) for name in robot.names]), robot.home)
     for contact in data.contact:
         bodies = (int(model.geom_bodyid[geom]) for geom in contact.geom)
         first, second = sorted(model.body(body).name for body in bodies)
         if "world" not in (first, second) and contact.dist < -_TOUCHING:
-            found[first, second] = max(found.get((first, second), 0.0), -float(contact.dist))
+            before = found.get((first, second), (0.0, contact.pos))
+            found[first, second] = max(before, (-float(contact.dist), contact.pos.copy()), key=lambda one: one[0])
     return found
 
 
 def _apart(robot: Robot, model: mujoco.MjModel) -> Comparison:
     """No limbs push each other away at home."""
-    wrong = [f"{one} and {other} by {1000 * by:.0f} mm" for (one, other), by in overlaps(robot, model).items()]
+    found = overlaps(robot, model)
+    wrong = [f"{one} and {other} by {1000 * by:.0f} mm" for (one, other), (by, _) in found.items()]
     hint = ": they push each other away; move them apart in the model, or name them as `overlapping`"
     text = f"overlap: {', '.join(wrong)}{hint}" if wrong else "apart from each other"
-    return Comparison(not wrong, "limbs at home", text)
+    return Comparison(not wrong, "limbs at home", text, places=_places(*(place for _, place in found.values())))
 
 
 def _mirrors(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
@@ -127,7 +145,8 @@ def _mirrors(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: A
     away = np.maximum(away, off)
     worst = int(away.argmax())
     text = f"joints {1000 * away.max():.1f} mm beside their images, most {robot.names[worst]}"
-    return Comparison(bool(away.max() < _MIRRORED), "mirrors", text)
+    wrong = tuple(robot.names[i] for i in np.flatnonzero(away >= _MIRRORED))
+    return Comparison(not wrong, "mirrors", text, wrong)
 
 
 def _ranges(robot: Robot) -> Comparison:
@@ -137,17 +156,29 @@ def _ranges(robot: Robot) -> Comparison:
     off = np.abs(ends - np.stack([robot.lower, robot.upper])).max(0)
     off[index == np.arange(len(index))] = 0.0
     wrong = [robot.names[i] for i in np.flatnonzero(off > 1e-3)]
-    return Comparison(
-        not wrong, "ranges", f"differ from their mirrors': {', '.join(wrong)}" if wrong else "alike on both sides"
-    )
+    text = f"differ from their mirrors': {', '.join(wrong)}" if wrong else "alike on both sides"
+    return Comparison(not wrong, "ranges", text, tuple(wrong))
 
 
 def _soles(robot: Robot) -> Comparison:
     legs = Legs(robot)
     _, rotation, _, _ = legs.forward(legs.pick(robot.home))
     tilt = float(np.arccos(np.clip(rotation[:, :, 2] @ rotation[0, :, 2], -1.0, 1.0)).max())
-    step = float(np.ptp(legs.soles(legs.pick(robot.home))[1] @ rotation[0, :, 2]))
-    return Comparison(tilt < _LEVEL, "soles at home", f"{tilt:.3f} rad and {1000 * step:.0f} mm from one plane")
+    soles, corners = legs.soles(legs.pick(robot.home))
+    step = float(np.ptp(corners @ rotation[0, :, 2]))
+    text = f"{tilt:.3f} rad and {1000 * step:.0f} mm from one plane"
+    return Comparison(tilt < _LEVEL, "soles at home", text, places=_places(*soles) if tilt >= _LEVEL else ())
+
+
+def _upright(robot: Robot) -> Comparison:
+    """With its soles on the ground, the base stands upright at home."""
+    up = rotation_matrix(Legs(robot).stand(robot.home)[1])[2]  # the vertical, in the base's frame
+    lean, ahead = float(np.arccos(np.clip(up[2], -1.0, 1.0))), -up[0]
+    if lean < _UPRIGHT:
+        return Comparison(True, "trunk at home", f"leans {lean:.3f} rad with the soles on the ground")
+    way = "ahead" if ahead > abs(up[1]) else "back" if -ahead > abs(up[1]) else "aside"
+    hint = "the soles are turned that far: turn ankles or hips at home so that they are level under an upright trunk"
+    return Comparison(False, "trunk at home", f"leans {way} by {lean:.3f} rad with the soles on the ground: {hint}")
 
 
 def _balance(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
@@ -159,7 +190,9 @@ def _balance(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: A
     corners = legs.soles(legs.pick(robot.home))[1].reshape(-1, 3) @ rotation[0]
     centre = data.subtree_com[model.body(robot.base).id] @ rotation[0]
     room = float(min(centre[0] - corners[:, 0].min(), corners[:, 0].max() - centre[0]))
-    return Comparison(room > 0, "balance at home", f"the centre of mass is {1000 * room:.0f} mm inside the soles' ends")
+    text = f"the centre of mass is {1000 * room:.0f} mm inside the soles' ends"
+    ground = np.array([*centre[:2], corners[:, 2].min()]) @ rotation[0].T
+    return Comparison(room > 0, "balance at home", text, places=() if room > 0 else _places(ground))
 
 
 def _load(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
@@ -179,7 +212,8 @@ def _load(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Arra
     leg, joint = np.unravel_index(int((torque / stall).argmax()), torque.shape)
     share = float((torque / stall)[leg, joint])
     name = robot.names[legs.index[leg, joint]]
-    return Comparison(share < _LOADED, "servos at home", f"{name} needs most: {100 * share:.0f} % of its stall torque")
+    text, good = f"{name} needs most: {100 * share:.0f} % of its stall torque", share < _LOADED
+    return Comparison(good, "servos at home", text, () if good else (name,))
 
 
 def _stiffness(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Array) -> Comparison:
@@ -230,4 +264,4 @@ def _steps(robot: Robot) -> Comparison:
     hint = (
         ": no servo follows; bend the knees at home, or search for other steps with servoid tune gait" if fast else ""
     )
-    return Comparison(not (wrong or fast), "steps of the gait", text + hint)
+    return Comparison(not (wrong or fast), "steps of the gait", text + hint, tuple(wrong))

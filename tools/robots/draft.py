@@ -14,9 +14,9 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_servo
 from servoid.hw.robot.mjcf import compiled, read_spec
 from servoid.tools.robots.couplings import Couplings, couplings
+from servoid.tools.robots.feet import bottom, find_feet, hip_height
 
 _NEAR = 0.01  # m between a joint and the mirror image of another, and of an axis
-_FLAT = 0.004  # m above a foot's lowest point that still is its sole
 _SPAN = 3.0  # rad to either side where the model says no range
 _BUS_HEAD = """rate: 50                    # TODO: control ticks a second
 bus:
@@ -65,7 +65,6 @@ class DraftedJoint:
 class Draft:
     """What was found. `feet` are geoms by the name of their foot."""
 
-    name: str
     model: Path
     base: str
     imu: str
@@ -103,8 +102,8 @@ class Draft:
         passive += f"overlapping: # bodies that the model draws into each other\n{pairs}" if pairs else ""
         passive += f"held: [{', '.join(self.held)}]\n" if self.held else ""
         return (
-            f"# {self.name}: drafted by `servoid robot import`. TODO marks what its model does not say.\n"
-            f"name: {self.name}\nmjcf: {path}\nbase: {self.base}\n{origin}imu_site: {self.imu}\n"
+            f"# {out.stem}: drafted by `servoid robot import`. TODO marks what its model does not say.\n"
+            f"name: {out.stem.replace(' ', '-')}\nmjcf: {path}\nbase: {self.base}\n{origin}imu_site: {self.imu}\n"
             f"{limits}{passive}feet:\n"
             + "\n".join(feet)
             + "\njoints: # TODO: servo, id, direction and zero of each\n"
@@ -151,7 +150,7 @@ def draft(path: Path, choices: Choices) -> Draft:
     mujoco.mj_kinematics(model, data)
     turn = data.xmat[base].reshape(3, 3)
     places, axes = (data.xanchor - data.xpos[base]) @ turn, data.xaxis @ turn
-    feet = _feet(model, data, base, inside)
+    feet = find_feet(model, data, base, inside)
     if len(feet) != 2:
         raise ConfigError(
             f"{path}: {len(feet)} feet found where two are needed: collision geoms at the ends of limbs, at the lowest "
@@ -161,14 +160,13 @@ def draft(path: Path, choices: Choices) -> Draft:
     drafted = _mutual([_geared(model, _joint(model, j, joints, places, axes, notes), ties) for j in joints], notes)
     if loose := [model.joint(j).name for j in joints if not model.jnt_limited[j]]:
         notes.append(f"range of {', '.join(loose)}: the model has none")
-    name = path.stem.replace(" ", "-")
-    soles = min(_bottom(model, data, model.geom(geom).id, base) for geoms in feet.values() for geom in geoms)
+    up = turn[:, 2]
+    soles = min(bottom(model, data, model.geom(geom).id, base, up) for geoms in feet.values() for geom in geoms)
     bodies = [int(model.geom(geoms[0]).bodyid[0]) for geoms in feet.values()]
-    top = float(np.mean([_hip(model, data, body, base) for body in bodies]))
+    top = float(np.mean([hip_height(model, data, body, base) for body in bodies]))
     # Of an origin that is not well above the soles, a height says little of whether the robot has fallen.
     origin = (0.0, 0.0, round(top, 4)) if -soles < 0.5 * (top - soles) else (0.0, 0.0, 0.0)
     return Draft(
-        name=name,
         model=path,
         base=model.body(base).name,
         imu=imu,
@@ -224,41 +222,6 @@ def _imu(model: mujoco.MjModel, base: int, notes: list[str]) -> str:
     if not named:
         notes.append(f"imu_site: {chosen} is only a guess")
     return chosen
-
-
-def _feet(model: mujoco.MjModel, data: mujoco.MjData, base: int, inside: Sequence[int]) -> dict[str, tuple[str, ...]]:
-    """Colliding geoms of the lowest bodies, left and right, that nothing moves below."""
-    low: dict[int, float] = {}
-    turn = data.xmat[base].reshape(3, 3)
-    bottom = [_bottom(model, data, geom, base) for geom in range(model.ngeom)]
-    solid = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
-    for geom in solid:
-        body = int(model.body_weldid[model.geom_bodyid[geom]])
-        if body in inside and body != base:
-            low[body] = min(low.get(body, np.inf), bottom[geom])
-    feet: dict[str, tuple[str, ...]] = {}
-    for name, side in (("left", 1.0), ("right", -1.0)):
-        beside = {b: z for b, z in low.items() if side * float(((data.xipos[b] - data.xpos[base]) @ turn)[1]) > 1e-3}
-        if beside:
-            foot = min(beside, key=lambda b: beside[b])
-            own = [g for g in solid if model.body_weldid[model.geom_bodyid[g]] == foot]
-            feet[name] = tuple(model.geom(g).name for g in own if bottom[g] < low[foot] + _FLAT)
-    return feet
-
-
-def _hip(model: mujoco.MjModel, data: mujoco.MjData, body: int, base: int) -> float:
-    """Height of the first body of the limb that this one is of, in the base's frame [m]."""
-    while model.body_parentid[body] != base:
-        body = int(model.body_parentid[body])
-    return float((data.xpos[body] - data.xpos[base]) @ data.xmat[base].reshape(3, 3)[:, 2])
-
-
-def _bottom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, base: int) -> float:
-    """The lowest height of a geom's box in the base's frame [m]."""
-    up = data.xmat[base].reshape(3, 3)[:, 2]
-    centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-    along = data.geom_xmat[geom].reshape(3, 3).T @ up
-    return float((data.geom_xpos[geom] - data.xpos[base]) @ up + along @ centre - np.abs(along) @ half)
 
 
 def _joint(

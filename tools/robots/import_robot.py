@@ -69,7 +69,11 @@ def main(args: argparse.Namespace) -> int:
         if not found.posed:
             home = bent_home(robot)
             if home is None:
-                notes.append("home of every joint: the model has no keyframe; on straight knees no robot can walk")
+                notes.append(
+                    "home of every joint: the model has no keyframe, and its zero angles were taken: legs are bent "
+                    "there already, or reach no pose of bent knees whose soles are level and under the centre of mass; "
+                    "on straight knees no robot can walk"
+                )
             else:
                 notes.append("home of every joint: the model has no keyframe; its knees were bent by geometry")
                 found = found.at_home(home)

@@ -13,12 +13,13 @@ from servoid.tools.common.output import Report
 _SIDE = 480  # pixels of each picture
 
 
-def poses(robot: Robot, out: Path, report: Report) -> str | None:
+def poses(robot: Robot, out: Path, report: Report, wrong: tuple[tuple[float, float, float], ...] = ()) -> str | None:
     """Draw the robot at home, lowered, and halfway to both ends of its ranges; returns the file, or None where this
-    machine cannot draw. Call `choose_drawing` before MuJoCo is loaded."""
+    machine cannot draw. At home red balls are put to the places `wrong` [m], in the base's frame. Call `choose_drawing`
+    before MuJoCo is loaded."""
     from servoid.hw.robot.legs import Legs
     from servoid.sim.marks import Frame
-    from servoid.sim.render import RenderError, render
+    from servoid.sim.render import AZIMUTH, RenderError, render
     from servoid.stack.safety.lowering import lowered_pose
 
     legs = Legs(robot)
@@ -28,13 +29,15 @@ def poses(robot: Robot, out: Path, report: Report) -> str | None:
         from PIL import Image
 
         pictures = []
-        for pose in shown:
+        for number, pose in enumerate(shown):
             height, orientation = legs.stand(pose)
-            frame = Frame(np.array([0.0, 0.0, float(height)]), orientation, pose)
-            pictures.append(next(iter(render(robot, [frame], _SIDE, _SIDE))))
+            place = np.array([0.0, 0.0, float(height)])
+            frame = Frame(place, orientation, pose, wrong=wrong if number == 0 else ())
+            pictures.append(next(iter(render(robot, [frame], _SIDE, _SIDE, azimuth=AZIMUTH))))
         Image.fromarray(np.concatenate(pictures, 1)).save(out)
     except (RenderError, ImportError) as error:
         report.line(f"no picture: {error}")
         return None
-    report.line(f"drew {out}: at home, lowered, and halfway to either end of every joint's range")
+    red = ", with red balls where to look" if wrong else ""
+    report.line(f"drew {out}: at home{red}, lowered, and halfway to either end of every joint's range")
     return str(out)

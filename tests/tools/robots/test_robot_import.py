@@ -14,6 +14,7 @@ import pytest
 from servoid.hw.config import CONFIGS, available
 from servoid.hw.robot.description import load_robot, load_servo, save_servo
 from servoid.hw.robot.legs import Legs
+from servoid.stack.control.fleet import Fleet
 from servoid.stack.estimation.odometry import odometry_of
 from servoid.tools.cli import main
 from servoid.tools.robots.compare import findings
@@ -46,6 +47,46 @@ def test_what_geometry_says_is_drafted_as_it_is_written_by_hand(
     assert mirrors[1] == mirrors[0]
     assert (drafted.base, drafted.imu_site) == (ours.base, ours.imu_site)
     assert {side: foot.geoms for side, foot in drafted.feet.items()} == {s: f.geoms for s, f in ours.feet.items()}
+
+
+def test_feet_that_are_turned_at_zero_are_found_whole_and_put_level(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At a stranger's zero angles knees are bent backwards and toes are up: of each foot's four studs the two at the
+    heel were taken, no pose with bent knees was found, and it stood leaning ahead while everything had fitted."""
+    text = (ROBOTS / "wren.xml").read_text()
+    sole = 'class="{}_leg" type="box" size="0.038 0.022 0.003" pos="0.006 0.003 -0.012" mass="0.014" material="sole"/>'
+    for side, name, y in (("l", "left", 0.003), ("r", "right", -0.003)):
+        old = f'<geom name="{side}_sole" {sole.format(name)}'.replace("0.003 -0.012", f"{y} -0.012")
+        assert text.count(old) == 1
+        studs = (
+            f'<geom name="{side}{i}" class="{name}_leg" size="0.004" pos="{x} {y + z} -0.011" mass="0.0035"/>'
+            for i, (x, z) in enumerate((x, z) for x in (-0.028, 0.04) for z in (-0.018, 0.018))
+        )
+        text = text.replace(old, "".join(studs))
+        for link, place, turn in (("knee", "0 0 -0.056", -0.3), ("ank_roll", "0 0 -0.014", -0.15)):
+            place = f'"{side}_{link}_link" pos="{place}"'
+            assert text.count(place) == 1
+            text = text.replace(place, f'{place} euler="0 {turn} 0"')
+        text = text.replace(
+            f'<joint name="{side}_knee" axis="0 1 0"/>', f'<joint name="{side}_knee" axis="0 1 0" range="0 2.2"/>'
+        )
+    (tmp_path / "tilted.xml").write_text(text)
+    code, said = imported(capsys, str(tmp_path / "tilted.xml"), "--out", str(tmp_path / "tilted.yaml"))
+    assert code == 0
+    assert "home of every joint: the model has no keyframe; its knees were bent by geometry" in said["todo"]
+    robot = load_robot(tmp_path / "tilted.yaml")
+    assert [foot.geoms for foot in robot.feet.values()] == [tuple(f"{side}{i}" for i in range(4)) for side in "lr"]
+    assert {one.what for one in findings(robot) if not one.good} <= {"steps of the gait"}
+    straight = replace(robot, joints=tuple(replace(joint, home=max(0.0, joint.range[0])) for joint in robot.joints))
+    look = {one.what: one.found for one in findings(straight) if not one.good}
+    assert "leans ahead by 0.4" in look["trunk at home"]
+    fleet = Fleet(robot, 1, None)
+    fleet.reset(np.ones(1, bool))
+    for _ in range(10):
+        fleet.step(robot.home[None])
+    assert fleet.truth.foot_force.sum() == pytest.approx(9.81 * 0.62, rel=0.3)
+    assert not fleet.truth.fallen.any()  # a stud is a body of its own, and part of the foot
 
 
 def test_an_origin_on_the_ground_is_moved_into_the_trunk(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
