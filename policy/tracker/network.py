@@ -12,14 +12,20 @@ from servoid.policy.checkpoint import CheckpointError, read_header
 from servoid.policy.mlp import Mlp
 from servoid.policy.references.gait import GaitSettings, gait_of
 from servoid.policy.tracker.observation import TrackerObservation
+from servoid.policy.tracker.points import PointObservation
 
 
-def load_tracker(path: Path, robot: Robot) -> tuple[Mlp, bool]:
-    """The network in `path`, and whether it tracks clips too: see `TrackerObservation`. Raises CheckpointError."""
+def load_tracker(path: Path, robot: Robot, shape: tuple[int, ...] = ()) -> tuple[Mlp, TrackerObservation]:
+    """The network in `path`, and what it observes by, of leading dimensions `shape`. Raises CheckpointError."""
     config = read_header(path).get("config")
-    clips = isinstance(config, dict) and "clips" in config
-    network, _ = Mlp.load(path, "tracker", robot, TrackerObservation(robot, clips=clips).size)
-    return network, clips
+    known: Mapping[str, Any] = config if isinstance(config, dict) else {}
+    observation = observation_of(robot, shape, clips="clips" in known, points=bool(known.get("points")))
+    return Mlp.load(path, "tracker", robot, observation.size)[0], observation
+
+
+def observation_of(robot: Robot, shape: tuple[int, ...], *, clips: bool, points: bool) -> TrackerObservation:
+    """Of a tracker of the gait alone, of one of `clips` and any reference, or of one that sees key points alone."""
+    return PointObservation(robot, shape) if points else TrackerObservation(robot, shape, clips=clips)
 
 
 def gait_of_tracker(path: Path, robot: Robot) -> GaitSettings:

@@ -13,7 +13,7 @@ from servoid.policy.checkpoint import CheckpointError, resolve
 from servoid.policy.references.gait import Gait
 from servoid.policy.references.style import WalkingStyle
 from servoid.policy.tracker.network import gait_of_tracker, load_tracker
-from servoid.policy.tracker.observation import RESIDUAL, TrackerObservation
+from servoid.policy.tracker.observation import RESIDUAL
 from servoid.stack.control.base import BasePolicy
 
 LOOK = np.arange(0, 26)  # ticks ahead, a step with each foot, over which a plan is asked whether it walks
@@ -31,10 +31,9 @@ class Tracker:
     ) -> None:
         """Raises CheckpointError where the network does not fit, or `clips` are to be tracked and it knows none."""
         path = resolve(checkpoint, robot)
-        self._network, knows = load_tracker(path, robot)
-        if clips and not knows:
+        self._network, self._observation = load_tracker(path, robot, shape)
+        if clips and not self._observation.clips:
             raise CheckpointError(f"{path}: a tracker of the gait alone, and it is a clip that is to be tracked")
-        self._observation = TrackerObservation(robot, shape, clips=knows)
 
     def reset(self, where: Array | None = None) -> None:
         """Forget, in the worlds `where` `(...,)` bool (default: all)."""
@@ -43,7 +42,8 @@ class Tracker:
     def __call__(self, state: State, applied: Array, reference: Reference) -> Array:
         """Joint targets `(..., n_joints)` rad by which the next frame of `reference` is reached. Once a tick."""
         frames = reference.frames(self._observation.ahead)
-        return frames.position[..., 0, :] + RESIDUAL * self._network(self._observation(state, applied, frames))
+        seen = self._observation(state, applied, frames)
+        return np.asarray(self._observation.base(frames) + RESIDUAL * self._network(seen))
 
 
 class Followers:

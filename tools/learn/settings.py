@@ -274,17 +274,15 @@ class TrackingSettings:
     ] = False
     clips: Annotated[tuple[str, ...], "clips of the library to learn; none: all that are of this robot"] = ()
     clip_share: Annotated[float, "share of episodes that begin with a clip, and of walks that lead to one"] = 1.0
-    rates: Annotated[Range, "how fast clips are played, of their own speed; the fastest grows over the first half"] = (
-        0.9,
-        1.2,
-    )
+    rates: Annotated[Range, "how fast clips are played, of their own speed; the fastest grows over half"] = (0.9, 1.2)
     get_up_rates: Annotated[Range, "the same of clips that begin lying"] = (1.0, 1.6)
     walk_seconds: Annotated[Range, "seconds of walking between two clips"] = (0.6, 2.5)
-    planner: Annotated[
-        str, "settings of a closed loop whose plans are followed instead: a policy's name, or a file"
-    ] = ""
+    planner: Annotated[str, "settings of a closed loop, whose plans are followed: a policy's name, or a file"] = ""
     near: Annotated[float, "with a planner: share of its tasks that begin where there is little left to walk"] = 0.5
     words: Annotated[float, "with a planner: share of episodes that are told sentences of clips, and no place"] = 0.2
+    points: Annotated[bool, "see key points alone of what is followed, and add to the pose of standing"] = False
+    teacher: Annotated[str, "tracker of any reference to imitate, instead of PPO by reward; none: nobody"] = ""
+    walker: Annotated[str, "with a teacher: tracker of the gait to imitate where what is followed walks"] = "expert"
     rewards: Annotated[dict[str, float], "weights of reward terms, per tick (policy/tracker/rewards.py)"] = field(
         default_factory=lambda: {
             "velocity": 3.0,
@@ -329,6 +327,8 @@ class TrackingSettings:
         for name in ("clip_share", "near", "words"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be 0 to 1, not {getattr(self, name):g}")
+        if self.points and not self.clip_share:
+            raise ValueError("points needs a tracker of any reference: clip_share must not be 0")
         if self.planner and not self.clip_share:
             raise ValueError("planner needs a tracker of any reference: clip_share must not be 0")
         for name in ("rates", "get_up_rates", "walk_seconds"):

@@ -1,11 +1,12 @@
 """Places of a robot's key points by forward kinematics from its MJCF, for numpy arrays and, differentiably, torch.
 
 Key points are the ends of the limbs (soles, hands, head) and, of a limb with three joints or more, the joint in its
-middle (knees, elbows).
+middle (knees, elbows); of a whole body also its first joint (hips, shoulders), and the toes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -44,8 +45,8 @@ class _Link:
 class KeyPoints:
     """Names and places of key points `(..., points, 3)`; `ends` of the names are those of limbs."""
 
-    def __init__(self, robot: Robot) -> None:
-        """Raises ConfigError where the robot's MJCF cannot be read."""
+    def __init__(self, robot: Robot, *, whole: bool = False) -> None:
+        """`whole` adds what says how trunk and feet are turned. Raises ConfigError for an MJCF that cannot be read."""
         model = compiled(read_body(robot), robot.mjcf)
         self._base = int(model.body(robot.base).id)
         self._links: list[_Link] = []
@@ -65,7 +66,7 @@ class KeyPoints:
             if middle is not None and limb:
                 middles[f"{limb} {'knee' if part == 'foot' else 'elbow'}"] = (middle, self._links[middle].anchor)
         self.ends = tuple(ends)
-        points = {**ends, **middles}
+        points = {**ends, **middles, **(self._further(robot, ends) if whole else {})}
         self.names = tuple(points)
         self._point_links = [link for link, _ in points.values()]
         self._point_places = np.array([place for _, place in points.values()])
@@ -95,10 +96,7 @@ class KeyPoints:
         point = self.names.index(name)
         link, place = self._point_links[point], self._point_places[point]
         rotations, positions = self._frames(np.zeros(1 + max(each.joint for each in self._links)))
-        tip, chain = positions[link] + rotations[link] @ place, list[int]()
-        while link >= 0:
-            chain.insert(0, link)
-            link = self._links[link].parent
+        tip, chain = positions[link] + rotations[link] @ place, self._chain(link)
         anchors = [positions[k] + rotations[k] @ self._links[k].anchor for k in chain]
         axes = []
         for k in chain:
@@ -145,6 +143,29 @@ class KeyPoints:
             found.append((self._of_body[body], place + turn @ np.array(foot.sole)))
         return found
 
+    def _further(self, robot: Robot, ends: Mapping[str, tuple[int, Array]]) -> dict[str, tuple[int, Array]]:
+        """The first joint of each limb that has a side, and the middle of each sole's front edge."""
+        rotations, positions = self._frames(robot.home)
+        legs = Legs(robot)
+        corners = dict(zip(robot.legs, legs.soles(legs.pick(robot.home))[1], strict=True))
+        found = {}
+        for name, (link, _) in ends.items():
+            side, _, part = name.rpartition(" ")
+            if side:
+                first = self._chain(link)[0]
+                found[f"{side} {'hip' if part == 'foot' else 'shoulder'}"] = first, self._links[first].anchor
+            if part == "foot":
+                front = corners[side][np.argsort(corners[side][:, 0])[-2:]].mean(0)
+                found[f"{side} toe"] = link, rotations[link].T @ (front - positions[link])
+        return found
+
+    def _chain(self, link: int) -> list[int]:
+        """Links from the base to this one."""
+        chain = [link]
+        while self._links[chain[0]].parent >= 0:
+            chain.insert(0, self._links[chain[0]].parent)
+        return chain
+
     def _free_ends(self, model: mujoco.MjModel, robot: Robot) -> dict[str, tuple[int, Array]]:
         """Head and hands: the highest end in the middle, and the furthest one of each side that is no foot."""
         parents = set(model.body_parentid.tolist())
@@ -171,9 +192,7 @@ class KeyPoints:
 
     def _middle(self, link: int, end: Array, home: Array) -> int | None:
         """The joint of a limb that is furthest from its first joint and from its end; None for one of two joints."""
-        chain = [link]
-        while self._links[chain[0]].parent >= 0:
-            chain.insert(0, self._links[chain[0]].parent)
+        chain = self._chain(link)
         if len(chain) < 3:
             return None
         root, tip = self._at(chain[0], self._links[chain[0]].anchor, home), self._at(link, end, home)

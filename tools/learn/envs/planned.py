@@ -139,4 +139,7 @@ class PlannedTracking(Tracking):
 
     def _followed(self, clips: Sequence[Clip], seed: int) -> Plans:
         acts = Acts(self.robot, self.n, self.settings, clips)
-        return Plans(self.fleet, acts, load_settings(self.settings.planner), clips)
+        settings = load_settings(self.settings.planner)
+        if self.settings.teacher:  # whose pupil walks itself
+            settings = replace(settings, walker="")
+        return Plans(self.fleet, acts, settings, clips)

@@ -16,9 +16,11 @@ from servoid.hw.robot.mirror import Mirror
 from servoid.policy.mlp import Mlp
 from servoid.policy.motion.clip import About, Clip
 from servoid.policy.references.gait import Gait
-from servoid.policy.tracker.observation import RESIDUAL, TrackerObservation
+from servoid.policy.tracker.network import observation_of
+from servoid.policy.tracker.observation import RESIDUAL
 from servoid.policy.tracker.rewards import TERMS, Step
 from servoid.stack.control.fleet import Fleet
+from servoid.stack.control.tracker import Followers
 from servoid.tools.learn.envs.curriculum import Curriculum
 from servoid.tools.learn.envs.motions import Motions
 from servoid.tools.learn.settings import TrackingSettings
@@ -45,7 +47,9 @@ class Tracking:
         self.fleet = self._fleet(odometry, seed)
         self.motions = self._followed(clips, seed)
         self.reference = self.motions.reference
-        self.observation = TrackerObservation(robot, (n,), clips=settings.clip_share > 0.0)
+        self.observation = observation_of(robot, (n,), clips=settings.clip_share > 0.0, points=settings.points)
+        self.teacher = Followers(robot, settings.teacher, settings.walker, (n,)) if settings.teacher else None
+        self.taught = np.zeros((n, len(robot.joints)))  # what it would do, as an action
         joints, feet = Mirror.joints(robot), Mirror.feet(robot)
         critic = Mirror.join(
             self.observation.mirror, Mirror.VECTOR, feet, Mirror.vectors(feet),
@@ -54,7 +58,7 @@ class Tracking:
         )  # fmt: skip
         self.mirrors = {"action": joints, "actor": self.observation.mirror, "critic": critic}
         self.action_size = len(robot.joints)
-        self.acting = ~heads(robot)
+        self.acting = ~heads(robot) | settings.points
         self.ticks = np.zeros(n, int)
         self._weight = robot.weight or self.fleet.worlds.weight
         self.limit = round(settings.episode_seconds / robot.dt)
@@ -106,6 +110,8 @@ class Tracking:
         fleet.reset(where, self.motions.begin(where, fleet.rngs))
         self.motions.enter(where, fleet.rngs)
         self.observation.reset(where)
+        if self.teacher is not None:
+            self.teacher.reset(where)
         self.ticks[where] = 0
         self._next_push[where] = 25
         self._twists[:, where], self._twist[where] = 0.0, 0.0
@@ -118,6 +124,9 @@ class Tracking:
         self.frames = frames
         self._upright = -up_vector(frames.root_orientation[:, 0])
         actor = self.observation(state, self.fleet.applied, frames)
+        if self.teacher is not None:
+            target = self.teacher(state, self.fleet.applied, self.reference)
+            self.taught = (target - self.observation.base(frames)) / RESIDUAL
         truth, worlds = self.fleet.truth, self.fleet.worlds
         bodies = worlds.bodies
         privileged = np.concatenate(
@@ -175,9 +184,11 @@ class Tracking:
         self._twists[row, worlds] = now
 
     def step(self, action: Array) -> tuple[Array, Array, Array]:
-        """Act for a tick with residuals `(n, n_joints)`. Returns reward a tick, done and time-out `(n,)`."""
-        frames, residual = self.frames, RESIDUAL * action * self.acting
-        self.fleet.step(self.motions.led(frames.position[:, 0] + residual))
+        """Act for a tick with `(n, n_joints)`. Returns reward a tick, done and time-out `(n,)`."""
+        frames = self.frames
+        target = self.observation.base(frames) + RESIDUAL * action * self.acting
+        residual = target - frames.position[:, 0]
+        self.fleet.step(self.motions.led(target))
         for past, now in ((self._targets, self.fleet.applied), (self._residuals, residual)):
             past[1:] = past[:-1].copy()
             past[0] = now

@@ -61,10 +61,17 @@ def main(args: argparse.Namespace) -> int:
     torch.manual_seed(settings.seed)
     clips = chosen_clips(robot, settings.clips)
     env = environment(robot, odometry, settings, clips, args.adversarial)
-    trainer = TrackerTrainer(env, settings, args.out)
+    trainer = trainer_of(env, settings, args.out)
     trainer.start(args.resume, None if args.init is None else checkpoint.resolve(args.init, robot))
     trainer.run()
     return 0
+
+
+def trainer_of(env: Tracking, settings: TrackerTraining, out: Path) -> TrackerTrainer:
+    """By reward, or by a teacher where the settings name one."""
+    from servoid.tools.learn.trainers.taught import TaughtTrainer
+
+    return (TaughtTrainer if settings.teacher else TrackerTrainer)(env, settings, out)
 
 
 def environment(
@@ -131,13 +138,17 @@ class TrackerTrainer(PpoTrainer):
         return super().resume()
 
     def adopt(self, path: Path) -> None:
-        network, clips = load_tracker(path, self.env.robot)
+        network, observation = load_tracker(path, self.env.robot)
         hidden = list(network.sizes[1:-1])
         if hidden != list(self.settings.hidden):
             raise checkpoint.CheckpointError(
                 f"{path}: its hidden layers are {hidden}; give --hidden {' '.join(map(str, hidden))}"
             )
-        if clips != self._clips:
+        if type(observation) is not type(self.env.observation):
+            raise checkpoint.CheckpointError(
+                f"{path}: only one of them sees key points alone: give --points for both, or none"
+            )
+        if (clips := observation.clips) != self._clips:
             what = "of clips, too, which sees more" if clips else "of the gait alone, which sees less"
             raise checkpoint.CheckpointError(f"{path}: a tracker {what} than this one: choose another --clip-share")
         self.begin_with(network)
@@ -155,6 +166,8 @@ class TrackerTrainer(PpoTrainer):
         config: dict[str, Any] = {"hidden": list(s.hidden), "rewards": s.rewards}
         if self._clips:
             config |= {"clips": [clip.name for clip in self.env.motions.clips], "clip_rewards": s.clip_rewards}
+        if s.points:
+            config["points"] = True
         if s.gait:
             config["gait"] = written(load_gait(s.gait))
         about: dict[str, Any] = {

@@ -16,6 +16,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.geometry import headed, yaw_of
 from servoid.hw.robot.description import load_robot
 from servoid.policy.diffusion.prefix.frames import Anchor, BodyMotion, Frames, wrapped
+from servoid.policy.diffusion.prefix.key_points import KeyPoints
 from servoid.policy.features import raw_layout
 from servoid.policy.motion.library import Library
 from servoid.sim.model import build
@@ -88,6 +89,23 @@ def test_key_points_are_where_mujoco_has_them() -> None:
         np.testing.assert_allclose(motion.points[i, names.index("left knee")], data.joint("l_knee").xanchor, atol=1e-9)
         np.testing.assert_allclose(motion.points[i, names.index("right elbow")], data.joint("r_el").xanchor, atol=1e-9)
         np.testing.assert_allclose(motion.points[i, names.index("left foot")], data.site("l_sole").xpos, atol=1e-3)
+
+
+def test_a_whole_body_has_hips_shoulders_and_toes_too() -> None:
+    whole = KeyPoints(ROBOT, whole=True)
+    assert whole.names[: len(FRAMES.key_points.names)] == FRAMES.key_points.names, "those of frames stay what they are"
+    model = build(ROBOT)
+    data = mujoco.MjData(model)
+    motion = _motion(4, frames=1)
+    data.qpos[:7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    data.qpos[[int(model.jnt_qposadr[model.joint(name).id]) for name in ROBOT.names]] = motion.joints[0]
+    mujoco.mj_kinematics(model, data)
+    at = dict(zip(whole.names, whole(motion.joints[0]), strict=True))
+    np.testing.assert_allclose(at["left hip"], data.joint("l_hip_yaw").xanchor, atol=1e-9)
+    np.testing.assert_allclose(at["right shoulder"], data.joint("r_sho_pitch").xanchor, atol=1e-9)
+    ahead = at["right toe"] - at["right foot"]
+    assert np.linalg.norm(ahead) == pytest.approx(ROBOT.feet["right"].half_size[0], abs=1e-3)
+    np.testing.assert_allclose(ahead / np.linalg.norm(ahead), data.site("r_sole").xmat.reshape(3, 3)[:, 0], atol=0.02)
 
 
 def test_a_mirrored_motion_has_mirrored_frames() -> None:
