@@ -20,7 +20,7 @@ from torch.nn import functional
 from servoid.hw.contracts.body import Array
 from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError
-from servoid.policy.priors.memory import Memory
+from servoid.policy.priors.adversarial.memory import Memory
 from servoid.policy.priors.score_matching.model import Prior
 from servoid.policy.priors.score_matching.windows import PriorWindows
 

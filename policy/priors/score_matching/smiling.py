@@ -14,7 +14,7 @@ import torch
 
 from servoid.hw.contracts.body import Array
 from servoid.policy.diffusion.schedule import cosine_signal
-from servoid.policy.priors.memory import Memory
+from servoid.policy.priors.adversarial.memory import Memory
 from servoid.policy.priors.score_matching.model import Prior, Style
 from servoid.policy.priors.score_matching.network import PriorNetwork
 from servoid.policy.priors.score_matching.score import Score
