@@ -16,6 +16,7 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.priors.goals import GOALS, SeenGoal
 
 if TYPE_CHECKING:
+    from servoid.policy.motion.clip import Clip
     from servoid.policy.rising.lead import Rising
 
 
@@ -50,6 +51,16 @@ class LearnedTask(ABC):
     @property
     def seen(self) -> SeenGoal:
         return GOALS[self.goal]
+
+    @property
+    def motion(self) -> Clip | None:
+        """The clip that it is about, in which episodes begin; None: about none."""
+        return None
+
+    @property
+    def grounded(self) -> bool:
+        """Whether it goes to the ground, so that no fall ends its episodes."""
+        return self.lies
 
     @abstractmethod
     def draw(self, rng: np.random.Generator, position: Array) -> Array:

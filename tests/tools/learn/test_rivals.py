@@ -19,9 +19,9 @@ from servoid.policy.priors.adversarial.discriminator import (
     load_discriminator,
     save_discriminator,
 )
+from servoid.policy.priors.adversarial.smiling import OwnScore
 from servoid.policy.priors.score_matching.model import Style, load_prior
 from servoid.policy.priors.score_matching.score import Score
-from servoid.policy.priors.score_matching.smiling import OwnScore
 from servoid.policy.priors.score_matching.windows import PriorWindows
 from servoid.policy.recording import read_recording
 from servoid.sim.kinematics import limbs_of

@@ -11,8 +11,8 @@ With `--style` they walk in a style of configs/styles, arms spread or crouched, 
 styles (`servoid train prior`), one dataset for each in a folder of its name.
 
 With `--skills` the worlds also perform the skills of configs/skills that take nothing but the ground, each for as many
-ticks, and go from any of them to any other and to walking, some in mid motion. Each tick says what was told, and how
-long a skill has lasted: what a model learns from that follows sentences about skills.
+ticks, and go from any of them to any other and to walking, some in mid motion; with `--only` those that it names. Each
+tick says what was told, and how long a skill has lasted: what a model learns from that follows sentences about skills.
 
 The same options and the same seed make the same files. With --parts the frames come from so many recordings, each with
 a seed of its own and done by itself: on the machines of a Ray cluster with --ray. Those that are done wait beside the
@@ -60,6 +60,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     parser.add_argument("--skills", action="store_true", help="perform skills, too, by their tracker")
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="SKILL", help="with --skills: these, again and again, and no walks"
+    )
     parser.add_argument(
         "--tracker", default="tracker", metavar="NAME|FILE", help="tracker that performs skills (default: tracker)"
     )
@@ -139,6 +142,8 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(f"--noise {args.noise[0]:g} {args.noise[1]:g}: must not be negative, the lower one first")
     if args.style is not None and (args.skills or args.crouched or args.policy == "gait"):
         raise ConfigError("--style is how the expert walks upright: drop --skills, --crouched or --policy gait")
+    if args.only and not args.skills:
+        raise ConfigError("--only names skills to perform: give --skills, too")
     if args.skills and args.policy == "gait":
         raise ConfigError("--skills goes with --policy expert or a tracker: the gait cannot walk on from a skill")
     if args.workers < 0:
@@ -174,6 +179,7 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
         plain_odometry=args.plain_odometry,
         crouched=args.crouched,
         style=args.style,
+        only=tuple(args.only),
         threads=args.threads or (1 if args.workers > 1 or args.ray is not None else 0),
     )
     performances, tally = how.performances(1), RecordingTally()

@@ -41,6 +41,7 @@ class FleetRecipe:
     threads: int
     crouched: float = 0.0
     style: str | None = None
+    only: tuple[str, ...] = ()  # skills that are performed, without walks; none: all, and walks
 
     @property
     def disturbances(self) -> DisturbanceSettings:
@@ -61,13 +62,22 @@ class FleetRecipe:
 
     def performances(self, worlds: int) -> Performances | None:
         """What so many worlds are told, where they perform skills. Raises ConfigError."""
-        from servoid.stack.skills.skill import load_skills
+        from servoid.stack.skills.skill import UPRIGHT, chosen, load_skills, way
 
         if not self.skills:
             return None
         robot = load_robot(self.robot)
-        skills = {name: skill for name, skill in load_skills(robot).items() if skill.alone}
-        return Performances(robot, skills, worlds, expert=self.policy, tracker=self.tracker)
+        known = load_skills(robot)
+        skills = {name: skill for name, skill in known.items() if skill.alone}
+        share = 0.7
+        if self.only:
+            skills, share = {name: chosen(name, skills) for name in self.only}, 1.0
+            if not any(skill.entry == UPRIGHT for skill in skills.values()):
+                raise ConfigError(f"--only {' '.join(self.only)}: none of them begins upright, as episodes do")
+            for skill in skills.values():
+                if skill.end != UPRIGHT:
+                    way(skill.end, UPRIGHT, skills)
+        return Performances(robot, skills, worlds, share, expert=self.policy, tracker=self.tracker)
 
     def cutter(self, seed: int) -> EpisodeCutter:
         """A fleet of that seed, to be recorded. Raises ConfigError."""

@@ -186,7 +186,7 @@ class SmilingTerm(ScoreTerm):
     """SMILING's reward instead, which has no bound: see `OwnScore`; the prior measures the manner all the same."""
 
     def __init__(self, prior: Prior, style: Style, n: int, settings: ScoreSettings, seed: int) -> None:
-        from servoid.policy.priors.score_matching.smiling import OwnScore
+        from servoid.policy.priors.adversarial.smiling import OwnScore
 
         super().__init__(prior, style, n, settings, seed)
         self.own = OwnScore(prior, seed, settings.random_level)

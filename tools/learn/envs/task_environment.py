@@ -18,6 +18,7 @@ from servoid.policy.references.gait import gait_of
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.safety.limits import clamp
 from servoid.stack.tasks.learned import LearnedTask, TaskState
+from servoid.tools.learn.envs.along_clip import AlongClip
 from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.score_term import GeneratedStarts, Manner
 from servoid.tools.learn.prior_settings import EpisodeSettings
@@ -62,7 +63,7 @@ class TaskEnvironment:
     """`n` worlds: see `servoid.tools.learn.trainers.ppo.Environment`. A tick of that is a decision here."""
 
     def __init__(
-        self, task: LearnedTask, score: Manner, starts: GeneratedStarts | Down | None, odometry: Mlp | None,
+        self, task: LearnedTask, score: Manner, starts: GeneratedStarts | Down | AlongClip | None, odometry: Mlp | None,
         s: EpisodeSettings, n: int, seed: int,
     ) -> None:  # fmt: skip
         """Call `reset` first. Episodes begin as `starts` has them, or without them standing."""
@@ -70,6 +71,7 @@ class TaskEnvironment:
         self.task, self.score, self.settings, self.robot, self.n = task, score, s, robot, n
         self.generated = starts if isinstance(starts, GeneratedStarts) else None
         self.down = starts if isinstance(starts, Down) else None
+        self.along = starts if isinstance(starts, AlongClip) else None
         self.fleet = Fleet(robot, n, odometry if task.seen.odometry else None, randomise=s.randomised, seed=seed)
         self.lead = task.lead(n)
         self.observation = TaskObservation(robot, task.seen if self.lead is None else self.lead.goal, (n,))
@@ -132,6 +134,8 @@ class TaskEnvironment:
         fleet, windows = self.fleet, None
         if self.down is not None:
             start = self.down.draw(fleet.rngs, where)
+        elif self.along is not None:
+            start = self.along.draw(fleet.rngs, where)
         elif self.generated is not None:
             windows, start = self.generated.draw(fleet.rngs, where)
         else:
@@ -246,7 +250,7 @@ class TaskEnvironment:
         unlike = (self.score.ratio > self.settings.unlike) if self.settings.unlike else np.zeros(self.n, bool)
         unlike &= self.ticks > self.settings.unlike_after / self.dt
         over = unlike | self.task.ended(self.asked, known)
-        if not self.task.lies:
+        if not self.task.grounded:
             over |= fallen
         self._held = np.where(self.task.achieved(known), self._held + 1, 0)
         self.achieved = self._held * self.dt >= self.task.hold

@@ -1,11 +1,11 @@
 """Train a policy for a task with PPO, under a motion prior that rewards what is like its data (SMP), or without one.
 
---task is speed, steering, location, dodgeball, get-up, or your own FILE.py:Class. The policy sees the estimate and its
-goal; it decides joint targets around the home pose as often as its prior has frames. --rewards weighs the task, the
-prior (manner) and their product (both); the paper adds the first two. With --prior none manner is 1 everywhere, and
---decide-every and --reach say what the prior would. With --demonstrations it begins as a network that
-does what a dataset shows, instead of at random: that is kept as imitation.safetensors, and others can begin with it by
---init.
+--task is speed, steering, location, dodgeball, get-up, clip:NAME for a clip of the library, or your own FILE.py:Class.
+The policy sees the estimate and its goal; it decides joint targets around the home pose as often as its prior has
+frames. --rewards weighs the task, the prior (manner) and their product (both); the paper adds the first two. With
+--prior none manner is 1 everywhere, and --decide-every and --reach say what the prior would. With --demonstrations it
+begins as a network that does what a dataset shows, instead of at random: that is kept as imitation.safetensors, and
+others can begin with it by --init.
 
 Ctrl-C saves, and the same command continues. The newest network is policy.safetensors.
 """
@@ -170,6 +170,7 @@ def environment(
 ) -> TaskEnvironment:
     """Worlds of a task under a prior, under a rival of it, or without one. Raises ConfigError."""
     from servoid.stack.estimation.odometry import load_odometry
+    from servoid.tools.learn.envs.along_clip import AlongClip
     from servoid.tools.learn.envs.down import Down
     from servoid.tools.learn.envs.score_term import (
         AdversarialTerm,
@@ -181,7 +182,7 @@ def environment(
 
     robot = task.robot
     score = Manner(worlds, settings.decide_every, np.full(len(robot.joints), settings.reach))
-    starts: GeneratedStarts | Down | None = None
+    starts: GeneratedStarts | Down | AlongClip | None = None
     if prior is not None:
         given = prior, style, worlds, settings, seed
         if rival is None:
@@ -190,6 +191,8 @@ def environment(
             score = SmilingTerm(*given) if rival == SMILING else AdversarialTerm(*given, rival)
     if task.lies:
         starts = Down(robot, settings.eased, settings.starts, seed)
+    elif task.motion is not None:
+        starts = AlongClip(robot, task.motion, settings.generated, seed)
     elif prior is not None:
         starts = GeneratedStarts(prior, style, settings, seed)
     return TaskEnvironment(task, score, starts, load_odometry(robot), settings, worlds, seed)
