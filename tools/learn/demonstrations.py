@@ -26,9 +26,10 @@ _EPS = 1e-2  # added to the deviation of inputs, as rsl-rl's normaliser adds it
 
 
 def demonstrated(
-    recording: Recording, robot: Robot, goal: SeenGoal, stride: int, rng: np.random.Generator
+    recording: Recording, robot: Robot, goal: SeenGoal, stride: int, rng: np.random.Generator, mirrored: bool = True
 ) -> tuple[Array, Array]:
-    """Observations `(n, size)` and joint targets `(n, n_joints)` rad at the decisions of a recording and in a mirror.
+    """Observations `(n, size)` and joint targets `(n, n_joints)` rad at the decisions of a recording and, where
+    `mirrored`, in a mirror.
 
     Each is given as a goal what the episode then did, over a time drawn from `AHEAD_SECONDS`: the mean velocity, the
     way it faced, the place where it was. Raises DatasetError where no episode is long enough.
@@ -40,7 +41,7 @@ def demonstrated(
     applied = np.concatenate([recording.applied, joints(recording.applied)])
     wanted = np.concatenate([recording.action, joints(recording.action)])
     targets = []
-    for first, end in [*recording.spans, *(recording.spans + n)]:
+    for first, end in [*recording.spans, *(recording.spans + n)][: (1 + mirrored) * len(recording.spans)]:
         decided = np.arange(1, end - first - round(AHEAD_SECONDS[0] * robot.rate), stride)
         if not len(decided):
             continue
@@ -78,10 +79,10 @@ class Mirrors:
 
 
 def cloned(
-    observations: Array, actions: Array, mirrors: Mirrors, hidden: tuple[int, ...], steps: int, seed: int
+    observations: Array, actions: Array, mirrors: Mirrors | None, hidden: tuple[int, ...], steps: int, seed: int
 ) -> Mlp:
-    """A network with so many `hidden` units, trained on the squared error of actions `(n, action_size)`, and to decide
-    in a mirror what it decides: PPO on mirrored samples made one that did not worse."""
+    """A network with so many `hidden` units, trained on the squared error of actions `(n, action_size)`, and, with
+    `mirrors`, to decide in a mirror what it decides: PPO on mirrored samples made one that did not worse."""
     import torch
     from torch import nn
 
@@ -97,9 +98,12 @@ def cloned(
         for group in optimiser.param_groups:
             group["lr"] = _RATE * (1.0 - 0.98 * step / steps)
         pick = torch.randint(len(x), (_BATCH,), generator=generator)
-        both = torch.cat([x[pick], mirrors.seen(x[pick])])
-        done, mirrored = network((both - centre) / scale).chunk(2)
-        loss = (done - y[pick]).square().mean() + (mirrored - mirrors.decided(done)).square().mean()
+        if mirrors is None:
+            loss = (network((x[pick] - centre) / scale) - y[pick]).square().mean()
+        else:
+            both = torch.cat([x[pick], mirrors.seen(x[pick])])
+            done, mirrored = network((both - centre) / scale).chunk(2)
+            loss = (done - y[pick]).square().mean() + (mirrored - mirrors.decided(done)).square().mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()

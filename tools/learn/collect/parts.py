@@ -45,7 +45,9 @@ class FleetRecipe:
 
     @property
     def disturbances(self) -> DisturbanceSettings:
-        return DisturbanceSettings(scale=self.noise)
+        """Skills alone are shown undisturbed: nobody is pushed while it kicks, standing on a foot."""
+        pushed = 0.0 if self.only else DisturbanceSettings.pushed_share
+        return DisturbanceSettings(scale=self.noise, pushed_share=pushed)
 
     def sources(self) -> dict[str, Any]:
         """Names, hashes and commits of the checkpoints that record. Raises ConfigError."""

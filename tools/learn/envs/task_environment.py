@@ -18,9 +18,9 @@ from servoid.policy.references.gait import gait_of
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.safety.limits import clamp
 from servoid.stack.tasks.learned import LearnedTask, TaskState
-from servoid.tools.learn.envs.along_clip import AlongClip
 from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.score_term import GeneratedStarts, Manner
+from servoid.tools.learn.envs.starts import AlongClip
 from servoid.tools.learn.prior_settings import EpisodeSettings
 from servoid.tools.learn.terms import Terms
 

@@ -170,7 +170,6 @@ def environment(
 ) -> TaskEnvironment:
     """Worlds of a task under a prior, under a rival of it, or without one. Raises ConfigError."""
     from servoid.stack.estimation.odometry import load_odometry
-    from servoid.tools.learn.envs.along_clip import AlongClip
     from servoid.tools.learn.envs.down import Down
     from servoid.tools.learn.envs.score_term import (
         AdversarialTerm,
@@ -179,6 +178,7 @@ def environment(
         ScoreTerm,
         SmilingTerm,
     )
+    from servoid.tools.learn.envs.starts import AlongClip
 
     robot = task.robot
     score = Manner(worlds, settings.decide_every, np.full(len(robot.joints), settings.reach))
@@ -291,9 +291,10 @@ class PolicyTrainer(PpoTrainer):
         env, seed = self.env, self.settings.seed
         recording = read_recording(folder, env.robot)
         rng = np.random.default_rng(seed)
-        seen, targets = demonstrated(recording, env.robot, env.task.seen, env.stride, rng)
+        both = self.settings.mirror > 0.0  # sides: where a mirror image counts as little, the task has one
+        seen, targets = demonstrated(recording, env.robot, env.task.seen, env.stride, rng, both)
         actions = (targets - env.robot.home) / env.reach
-        mirrors = Mirrors(env.mirrors["actor"], env.mirrors["action"])
+        mirrors = Mirrors(env.mirrors["actor"], env.mirrors["action"]) if both else None
         self.begin_with(cloned(seen, actions, mirrors, self.settings.hidden, self.settings.imitation_steps, seed))
         self.begun_with = {"demonstrations": source_of(folder, recording)}
         self.ship(self.out / _IMITATION, self.progress)
