@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from servoid.policy.diffusion.model.denoiser import Block, tick_encoding
 from servoid.policy.diffusion.prefix.config import PlannerConfig
 
+_BEGINS = 20  # place of the first frame to come, whatever the prefix: a network learns on with a longer or shorter one
+
 
 class CrossAttention(nn.Module):
     """Pre-norm attention of the frames to the conditions."""
@@ -53,7 +55,8 @@ class PlannerNetwork(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.head = nn.Linear(width, config.size)
         self.register_buffer("mask", torch.ones(tokens, tokens, dtype=torch.bool), persistent=False)
-        self.register_buffer("places", tick_encoding(np.arange(tokens), width), persistent=False)
+        places = np.arange(tokens) - config.prefix + _BEGINS
+        self.register_buffer("places", tick_encoding(places, width), persistent=False)
         self.register_buffer("word_places", tick_encoding(np.arange(config.words), width), persistent=False)
         self.register_buffer("levels", tick_encoding(np.arange(config.levels + 1), width, 4.0 * config.levels))
 

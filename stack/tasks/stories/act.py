@@ -68,6 +68,7 @@ class Act:
     targets: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     # where parts shall be, m from the thing's middle: along its heading, to the left and up; by name
     skill: str | None = None  # that performs it; none: standing there does
+    limb: str | None = None  # key point that strikes a bag ("left hand")
     approach: Approach | None = None  # none: from where the robot is
     sits: bool = False  # begins on the seat
     share: float = 0.0  # how often it is drawn, of all that may follow

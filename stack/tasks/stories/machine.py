@@ -150,7 +150,8 @@ class Machine(BaseBehaviour):
         """The thing's pose `(7,)` in the odometry frame, and why it is not gone by."""
         index = self.episode.things[self._number]
         if index < 0:
-            return self.episode.point(self._number, percept.objects), None
+            mark = percept.goal if percept.age <= self._settings.stale else None
+            return self.episode.point(self._number, percept.objects, mark), None
         kind, nothing = self.episode.objects[index].kind, np.full(7, np.nan)
         if percept.objects is None or len(percept.objects) <= index or not np.isfinite(percept.objects[index]).all():
             return nothing, f"the {kind} is not seen any more"

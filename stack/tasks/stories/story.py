@@ -18,6 +18,7 @@ from servoid.stack.tasks.stories.act import Act, drawn, load_acts
 from servoid.stack.tasks.stories.condition import Conditions, first, held_ticks, moments
 from servoid.stack.tasks.stories.layout import laid_out
 from servoid.stack.tasks.stories.machine import Machine
+from servoid.stack.tasks.stories.strike import struck_by
 from servoid.stack.tasks.stories.told import StoryEpisode, StorySettings
 
 ARM = 1.25  # of the base's height at home: a hand reaches no higher by its skill
@@ -66,12 +67,14 @@ class Story(BaseTask):
     def scenario(self, rng: np.random.Generator) -> StoryEpisode:
         acts = self._drawn(rng)
         layout = laid_out(acts, self.settings.things, rng)
-        scene = Scene(np.zeros((0, 3)), np.zeros((0, 4)), objects=layout.objects)
+        point = next((layout.points[n, :2] for n, index in enumerate(layout.things) if index < 0), None)
+        mark = point.copy() if self.settings.seen and point is not None else None
+        scene = Scene(np.zeros((0, 3)), np.zeros((0, 4)), mark, objects=layout.objects)
         sits = any(act.done.seated for act in acts)
         s = self.settings
         return StoryEpisode(
-            scene if layout.objects else None, acts=acts, things=layout.things, points=layout.points,
-            headings=layout.headings, seated=sits,
+            scene if layout.objects or mark is not None else None, acts=acts, things=layout.things,
+            points=layout.points, headings=layout.headings, seated=sits,
             pushes=drawn_pushes(rng, self.seconds, s.push, s.push_every, self.ticks(s.push_every)),
         )  # fmt: skip
 
@@ -92,6 +95,8 @@ class Story(BaseTask):
         found = {"acts_done": float(_count(done)), "acts_share": _count(done) / len(episode.acts)}
         if episode.acts[-1].sits and _count(done) >= len(done) - 1:
             found["rose_share"] = float(done[-1] is not None and not trace.fallen)
+        if (told := self._struck_as_told(trace, episode, done)) is not None:
+            found["struck_as_told"] = told
         if done[-1] is not None:
             found["seconds_to_done"] = (done[-1] + 1) * trace.dt
         return found
@@ -113,12 +118,26 @@ class Story(BaseTask):
             begin = len(trace.yaw) if at is None else at + 1
         return found
 
+    def _struck_as_told(self, trace: Trace, episode: StoryEpisode, done: Sequence[int | None]) -> float | None:
+        """Share of bags that fell by the limb that was to strike them; None where there is none to strike."""
+        strikes = [number for number, act in enumerate(episode.acts) if act.limb is not None]
+        if not strikes or trace.objects is None or not len(trace.yaw):
+            return None
+        now, struck = moments(trace, self.conditions.legs), 0
+        for number in strikes:
+            index = episode.things[number]
+            limb = struck_by(
+                self.conditions.points, now, trace.objects[:, index], np.array(episode.objects[index].size)
+            )
+            struck += done[number] is not None and limb == episode.acts[number].limb
+        return struck / len(strikes)
+
     def _thing(self, trace: Trace, episode: StoryEpisode, number: int) -> Array:
         index = episode.things[number]
         if index >= 0:
             lost = np.full((len(trace.yaw), 7), np.nan)
             return lost if trace.objects is None else trace.objects[:, index]
-        return np.broadcast_to(episode.point(number, trace.objects), (len(trace.yaw), 7))
+        return np.broadcast_to(episode.point(number, trace.objects, trace.goal), (len(trace.yaw), 7))
 
 
 def _count(done: Sequence[int | None]) -> int:

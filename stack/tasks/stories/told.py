@@ -36,6 +36,9 @@ class StorySettings(Settings):
         3.1416
     )
     least_bearing: Annotated[float, Setting("how far off it is at least", "rad", least=0)] = 0.0
+    seen: Annotated[
+        bool, Setting("whether the robot sees its first point, a mark on the floor: else odometry tells it, or a seat")
+    ] = False
     touch: Annotated[Range, Setting("height of a point for a hand", "m", above=0)] = (0.26, 0.31)
     seat_height: Annotated[Range, Setting("height of a seat", "m", above=0)] = (0.14, 0.15)
     seat_depth: Annotated[float, Setting("of a seat, from front to back", "m", above=0)] = 0.2
@@ -77,11 +80,20 @@ class StoryEpisode(Episode):
         index = self.things[number]
         return self.objects[index] if index >= 0 and self.objects[index].kind == "seat" else None
 
-    def point(self, number: int, objects: Array | None) -> Array:
-        """That of an act, as poses `(..., 7)`: where it was drawn, as seen from a seat where `objects`, seen in poses
-        `(..., objects, 7)`, have one: a seat stays where it is, and odometry drifts."""
+    @property
+    def mark(self) -> int | None:
+        """Number of the act whose point is a mark on the floor, where points can be seen: the first that has one."""
+        return next((number for number, index in enumerate(self.things) if index < 0), None)
+
+    def point(self, number: int, objects: Array | None, mark: Array | None = None) -> Array:
+        """That of an act, as poses `(..., 7)`: where it was drawn, as odometry drifts as seen from what stays where it
+        is, a `mark` seen at `(..., 2)` m, or a seat where `objects`, seen in poses `(..., objects, 7)`, have one."""
         facing = self.headings[number]
         drawn = np.array([*self.points[number], math.cos(facing / 2), 0.0, 0.0, math.sin(facing / 2)])
+        if mark is not None and number == self.mark:
+            found = np.broadcast_to(drawn, (*mark.shape[:-1], 7)).copy()
+            found[..., :2] = np.where(np.isfinite(mark), mark, drawn[:2])
+            return found
         seat = next((i for i, thing in enumerate(self.objects) if thing.kind == "seat"), None)
         if seat is None or objects is None:
             return drawn

@@ -299,3 +299,44 @@ def test_a_point_is_where_the_seat_puts_it() -> None:
         episode.point(2, np.stack([seen, drifted]))[:, 0] - episode.points[2, 0], [0, 0.3], atol=1e-9
     )
     np.testing.assert_allclose(episode.point(2, None)[:2], episode.points[2, :2])
+
+
+def test_a_point_that_is_seen_is_where_its_mark_is() -> None:
+    """By odometry alone, robots that slip come to a stand beside it, and believe to be there."""
+    _, episode, machine = _story(plan="sit,rise,reach", seen="true")
+    assert episode.scene is not None
+    assert episode.scene.goal is not None
+    np.testing.assert_array_equal(episode.scene.goal, episode.points[2, :2])
+    seen = np.array([[1.0, 2.0], [np.nan, np.nan]])
+    found = episode.point(2, None, seen)
+    np.testing.assert_allclose(found[0, :2], seen[0])
+    np.testing.assert_allclose(found[1, :2], episode.points[2, :2], err_msg="out of sight it is where it was drawn")
+    _, episode, machine = _story(plan="reach", seen="true")
+    for age, led in ((0.0, True), (3.0, False)):
+        asked = machine.instruct(0, _at(np.zeros(2), 0.0), Percept("scene", age, goal=np.array([0.5, -0.1])))
+        assert asked.goal is not None
+        assert np.allclose(asked.goal, [0.5, -0.1]) == led, "what was seen long ago is not gone by"
+    assert _story(plan="reach")[1].scene is None
+
+
+def test_a_bag_is_struck_by_what_is_nearest_as_it_leans() -> None:
+    """A bag that the robot walks over falls, too, and was not struck by the hand that was told."""
+    task, episode, _ = _story(plan="punch-left")
+    height, names = episode.objects[0].size[2], task.conditions.points.names
+    body = task.conditions.points(ROBOT.home)
+    base = np.array([0.0, 0.0, ROBOT.standing_height])
+    for part in ("left hand", "right hand", "right foot"):
+        place = base + body[names.index(part)]
+        bag = np.tile([*place[:2], height / 2, 1.0, 0.0, 0.0, 0.0], (6, 1))
+        bag[:, 1] += np.sign(place[1]) * 0.04 if "hand" in part else 0.0
+        bag[:, 0] += 0.0 if "hand" in part else 0.12
+        bag[3:, 3:] = [np.cos(0.8), 0.0, np.sin(0.8), 0.0]  # it falls
+        trace = Trace(
+            dt=ROBOT.dt, displacement=np.tile(base, (6, 1)), yaw=np.zeros(6), velocity=np.zeros((6, 3)),
+            yaw_rate=np.zeros(6), command=np.zeros((6, 3)), fallen=False,
+            orientation=np.tile([1.0, 0, 0, 0], (6, 1)),
+            joints=np.tile(ROBOT.home, (6, 1)), objects=bag[:, None],
+        )  # fmt: skip
+        assert task.metrics(trace, episode)["struck_as_told"] == float(part == "left hand"), part
+    still = replace(trace, objects=np.repeat(trace.objects[:1], 6, 0))  # type: ignore[index]
+    assert task.metrics(still, episode)["struck_as_told"] == 0.0

@@ -6,6 +6,7 @@ import argparse
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -125,14 +126,20 @@ def test_recorded_walks_are_learned_from_too(synthetic_dataset: Path) -> None:
 def test_a_training_learns_goes_on_and_says_what_it_measured(tmp_path: Path) -> None:
     small = ["--layers", "1", "--width", "32", "--batch", "16", "--threads", "1", "--evaluate-every", "0",
              "--clips", "wave", "sit-down", "rise", "--clip-takes", "40", "--walk-takes", "10",
-             "--walk-seconds", "8", "--out", str(tmp_path)]  # fmt: skip
-    before, errors = torch.get_num_threads(), []
-    for steps in ("20", "40"):
-        parser = argparse.ArgumentParser()
-        planner.add_arguments(parser)
-        assert planner.main(parser.parse_args([*small, "--steps", steps])) == 0
-        errors.append(read_header(tmp_path / "planner.safetensors")["results"]["validation_loss"])
+             "--walk-seconds", "8"]  # fmt: skip
+    before, parser = torch.get_num_threads(), argparse.ArgumentParser()
+    planner.add_arguments(parser)
+
+    def trained(out: Path, *options: str) -> dict[str, Any]:
+        assert planner.main(parser.parse_args([*small, "--out", str(out), *options])) == 0
+        return read_header(out / "planner.safetensors")
+
+    errors = [trained(tmp_path, "--steps", steps)["results"]["validation_loss"] for steps in ("20", "40")]
+    begun = str(tmp_path / "planner.safetensors")
+    other = trained(tmp_path / "other", "--init", begun, "--steps", "1", "--levels", "20", "--prefix", "10")
     torch.set_num_threads(before)
+    assert (other["config"]["levels"], other["config"]["prefix"]) == (20, 10)
+    assert other["results"]["validation_loss"] < errors[0], "its weights are those that were learned"
     head = read_header(tmp_path / "planner.safetensors")
     assert head["kind"] == "planner"
     assert head["results"]["step"] == 40

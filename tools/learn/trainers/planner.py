@@ -192,14 +192,17 @@ class PlannerTrainer(Trainer):
         self.generator = torch.Generator().manual_seed(settings.seed)
 
     def adopt(self, path: Path) -> None:
-        """Take weights and normalisation of a planner, to go on with other takes. Raises ConfigError."""
+        """Take weights and normalisation of a planner, to go on with other takes, or with another prefix or other noise
+        levels, which change no weight's shape. Raises ConfigError."""
         from servoid.policy.diffusion.prefix.model import load
 
         model = load(path, self.windows.kinematics.robot, self.windows.kinematics)
-        if model.config != self.config:
+        ours = self.config
+        if replace(model.config, prefix=ours.prefix, frames=ours.frames, levels=ours.levels, words=ours.words) != ours:
             raise ConfigError(f"{path}: not the network that the options ask for: {model.config}")
-        self.network.load_state_dict(model.network.state_dict())
-        self.average.weights = {name: p.detach().clone() for name, p in self.network.named_parameters()}
+        weights = {name: p.detach().clone() for name, p in model.network.named_parameters()}
+        self.network.load_state_dict(weights, strict=False)  # the rest are constants
+        self.average.weights = {name: p.detach().clone() for name, p in weights.items()}
         self.windows.normaliser = model.normaliser
 
     @property
