@@ -37,7 +37,7 @@ class PriorWindows:
         validation: list[Array] = []
         start = 0
         for style, recording in recordings.items():
-            rows, yaw = features.of(recording.raw)
+            rows, yaw = features.of(recording.raw, recording.box)
             frames.append(rows)
             yaws.append(yaw)
             presents = _presents(recording, span, standing)

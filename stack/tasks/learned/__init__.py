@@ -8,6 +8,7 @@ from servoid.hw.config import ConfigError, nearest
 from servoid.hw.plugins import load_plugin
 from servoid.hw.robot.description import Robot
 from servoid.stack.tasks.learned.base import LearnedTask, TaskState
+from servoid.stack.tasks.learned.carry import Carry
 from servoid.stack.tasks.learned.clip import PREFIX, ImitatedClip
 from servoid.stack.tasks.learned.dodgeball import Dodgeball
 from servoid.stack.tasks.learned.get_up import GettingUp, GettingUpByClips
@@ -17,7 +18,8 @@ from servoid.stack.tasks.learned.steering import TargetSteering
 
 GROUP = "servoid.learned_tasks"  # of entry points
 LEARNED_TASKS: Mapping[str, type[LearnedTask]] = {
-    cls.name: cls for cls in (TargetSpeed, TargetSteering, TargetLocation, Dodgeball, GettingUp, GettingUpByClips)
+    cls.name: cls
+    for cls in (TargetSpeed, TargetSteering, TargetLocation, Dodgeball, Carry, GettingUp, GettingUpByClips)
 }
 
 

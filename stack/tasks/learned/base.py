@@ -11,6 +11,7 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.world import Scene
 from servoid.hw.geometry import turned
 from servoid.hw.robot.description import Robot
 from servoid.policy.priors.goals import GOALS, SeenGoal
@@ -32,6 +33,7 @@ class TaskState:
     angular_velocity: Array  # (n, 3) rad/s, base frame
     joints: Array  # (n, n_joints) rad
     joint_velocity: Array  # (n, n_joints) rad/s
+    objects: Array | None = None  # (n, objects, 7): m of the middle, and quaternion; None: the task has no things
 
 
 class LearnedTask(ABC):
@@ -58,8 +60,17 @@ class LearnedTask(ABC):
         return None
 
     @property
+    def scene(self) -> Scene | None:
+        """What is there beside the robot, at places that `place` draws; None: nothing."""
+        return None
+
+    def place(self, rng: np.random.Generator) -> Array:
+        """Where the things of the scene are as an episode begins `(things, 7)`, in the frame that it begins in."""
+        return np.zeros((0, 7))
+
+    @property
     def grounded(self) -> bool:
-        """Whether it goes to the ground, so that no fall ends its episodes."""
+        """Whether it goes to the ground, or low: only who tips over has fallen then."""
         return self.lies
 
     @abstractmethod

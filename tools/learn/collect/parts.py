@@ -20,7 +20,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Policy
 from servoid.hw.robot.description import load_robot
 from servoid.tools.learn.collect.disturbances import DisturbanceSettings
-from servoid.tools.learn.collect.episode_cutter import EpisodeCutter, RecordedEpisode
+from servoid.tools.learn.collect.episode_cutter import Drilled, EpisodeCutter, RecordedEpisode
 from servoid.tools.learn.collect.performances import Performances
 from servoid.tools.learn.collect.skills import Commands
 
@@ -41,12 +41,13 @@ class FleetRecipe:
     threads: int
     crouched: float = 0.0
     style: str | None = None
+    carry: bool = False
     only: tuple[str, ...] = ()  # skills that are performed, without walks; none: all, and walks
 
     @property
     def disturbances(self) -> DisturbanceSettings:
-        """Skills alone are shown undisturbed: nobody is pushed while it kicks, standing on a foot."""
-        pushed = 0.0 if self.only else DisturbanceSettings.pushed_share
+        """Skills alone and carrying are shown undisturbed: nobody is pushed while it kicks, standing on a foot."""
+        pushed = 0.0 if self.only or self.carry else DisturbanceSettings.pushed_share
         return DisturbanceSettings(scale=self.noise, pushed_share=pushed)
 
     def sources(self) -> dict[str, Any]:
@@ -84,23 +85,34 @@ class FleetRecipe:
     def cutter(self, seed: int) -> EpisodeCutter:
         """A fleet of that seed, to be recorded. Raises ConfigError."""
         from servoid.policy.references.style import load_style
+        from servoid.sim.model import build
+        from servoid.sim.worlds import Worlds
+        from servoid.stack.control.carrier import Carrier
         from servoid.stack.control.fleet import Fleet
         from servoid.stack.control.gait import GaitPolicy
         from servoid.stack.control.styled import StyledExpert
         from servoid.stack.control.tracker import ExpertPolicy
         from servoid.stack.estimation.odometry import load_odometry
+        from servoid.stack.tasks.learned.carry import Carry
+        from servoid.tools.learn.collect.carrying import Carrying
 
         robot, shape, told = load_robot(self.robot), (self.worlds,), self.performances(self.worlds)
         policy: Policy
+        script: Drilled | None = told
+        count: int | Worlds = self.worlds
         if told is not None:
             policy = told
+        elif self.carry:
+            policy, script = Carrier(robot, shape, self.policy), Carrying(robot, self.worlds)
+            model = build(robot, Carry(robot).scene)
+            count = Worlds(robot, self.worlds, threads=self.threads, randomise=self.randomise, model=model)
         elif self.style is not None:
             policy = StyledExpert(robot, load_style(self.style, robot), self.policy, shape)
         else:
             policy = GaitPolicy(robot, shape) if self.policy == "gait" else ExpertPolicy(robot, self.policy, shape)
         odometry = None if self.plain_odometry else load_odometry(robot)
-        fleet = Fleet(robot, self.worlds, odometry, randomise=self.randomise, seed=seed, threads=self.threads)
-        script = told or Commands(robot, self.worlds, self.crouched)
+        fleet = Fleet(robot, count, odometry, randomise=self.randomise, seed=seed, threads=self.threads)
+        script = script or Commands(robot, self.worlds, self.crouched)
         return EpisodeCutter(fleet, policy, self.disturbances, self.seconds, script)
 
 

@@ -60,6 +60,7 @@ def provenance(
         "crouched",
         "style",
         "only",
+        "carry",
         "parts",
     )
     options = {name: vars(args)[name] for name in names}

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import Robot, Walking
 from servoid.sim.truth import SimulatedTruth
 
@@ -116,6 +119,14 @@ class Commands:
     def columns(self) -> dict[str, Array]:
         """What a recording holds beside what is asked, `(n, size)`: nothing."""
         return {}
+
+    def start(self, rngs: Sequence[np.random.Generator], where: Array) -> Start | None:
+        """How the next episodes of the worlds `where` begin: standing."""
+        return None
+
+    def told(self, state: State, truth: SimulatedTruth) -> Instruction:
+        """What whoever drives the worlds is told."""
+        return Instruction(self.velocity, lower=self.lower)
 
     def fallen(self, truth: SimulatedTruth) -> Array:
         """Which worlds have fallen `(n,)`."""

@@ -43,6 +43,7 @@ class Manner(StatefulTerm[State]):
         """`stride`: ticks between decisions; `reach` `(n_joints,)`: rad of joint target for an action of one."""
         self.stride, self.reach = stride, reach
         self.prior: Prior | None = None
+        self.box: Array | None = None  # (n, 7) as `Instruction.box`, now: of a task about one
         self.ratio = np.ones(n)  # of the error to that of held-out data, running average by world
 
     @property
@@ -156,7 +157,7 @@ class ScoreTerm(Manner):
 
         from servoid.policy.priors.features import seen_from_last
 
-        frame, yaw = self.prior.features.of(raw_row(state))
+        frame, yaw = self.prior.features.of(raw_row(state), self.box)
         self._frames = np.concatenate([self._frames[:, 1:], frame[:, None]], 1)
         self._yaw = np.concatenate([self._yaw[:, 1:], yaw[:, None]], 1)
         if self._fresh.any():

@@ -1,6 +1,7 @@
 """Train a policy for a task with PPO, under a motion prior that rewards what is like its data (SMP), or without one.
 
---task is speed, steering, location, dodgeball, get-up, clip:NAME for a clip of the library, or your own FILE.py:Class.
+--task is speed, steering, location, dodgeball, carry, get-up, clip:NAME for a clip of the library, or your own
+FILE.py:Class.
 The policy sees the estimate and its goal; it decides joint targets around the home pose as often as its prior has
 frames. --rewards weighs the task, the prior (manner) and their product (both); the paper adds the first two. With
 --prior none manner is 1 everywhere, and --decide-every and --reach say what the prior would. With --demonstrations it
@@ -181,6 +182,12 @@ def environment(
     from servoid.tools.learn.envs.starts import AlongClip
 
     robot = task.robot
+    if prior is not None and prior.features.box != (task.scene is not None):
+        knows = "knows a box" if prior.features.box else "knows no box"
+        raise ConfigError(
+            f"task {task.name} has {'no ' if task.scene is None else 'a '}box, and this prior {knows}: train one on "
+            f"data that {'show none' if task.scene is None else 'show one (servoid collect --carry)'}"
+        )
     score = Manner(worlds, settings.decide_every, np.full(len(robot.joints), settings.reach))
     starts: GeneratedStarts | Down | AlongClip | None = None
     if prior is not None:
@@ -191,6 +198,8 @@ def environment(
             score = SmilingTerm(*given) if rival == SMILING else AdversarialTerm(*given, rival)
     if task.lies:
         starts = Down(robot, settings.eased, settings.starts, seed)
+    elif task.scene is not None:
+        pass  # standing: a box that is held takes hands that touch it, which a sample does not come close enough to
     elif task.motion is not None:
         starts = AlongClip(robot, task.motion, settings.generated, seed)
     elif prior is not None:

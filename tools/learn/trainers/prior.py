@@ -62,7 +62,10 @@ def main(args: argparse.Namespace) -> int:
     torch.set_num_threads(args.threads)
     robot = load_robot(args.robot)
     recordings = read_by_style(args.data, robot)
-    features = PriorFeatures(robot, limbs_of(robot))
+    boxes = [recording.box is not None for recording in recordings.values()]
+    if any(boxes) != all(boxes):
+        raise ConfigError(f"{args.data}: only some of its datasets show a box: a prior is of all of them, or of none")
+    features = PriorFeatures(robot, limbs_of(robot), all(boxes))
     shape = {f.name: getattr(settings, f.name) for f in fields(PriorShape)}
     config = PriorConfig(features.layout.size, **shape, styles=tuple(style for style in recordings if style))
     windows = PriorWindows(recordings, features, config, settings.standing, settings.seconds, settings.mirrored)
