@@ -340,3 +340,16 @@ def test_a_bag_is_struck_by_what_is_nearest_as_it_leans() -> None:
         assert task.metrics(trace, episode)["struck_as_told"] == float(part == "left hand"), part
     still = replace(trace, objects=np.repeat(trace.objects[:1], 6, 0))  # type: ignore[index]
     assert task.metrics(still, episode)["struck_as_told"] == 0.0
+
+
+def test_a_robot_that_stops_beside_a_point_walks_there_again() -> None:
+    """It stood there until its time was over: nothing asked it to step back."""
+    _, episode, machine = _story(plan="reach", by="words")
+    point, percept = episode.points[0, :2], Percept("task", 0.0)
+    assert machine.instruct(0, _at(point, 0.0), percept).text is not None, "it is there, and stands"
+    beside = _at(point + [0.07, 0.0], 0.0)
+    assert machine.instruct(10, beside, percept).goal is None, "it may still be coming to a stand"
+    asked = machine.instruct(60, beside, percept)
+    assert asked.goal is not None
+    np.testing.assert_allclose(asked.goal, [-0.07, 0.0], atol=1e-9)
+    assert machine.instruct(61, _at(point + [0.04, 0.0], 0.0), percept).goal is None
