@@ -27,7 +27,6 @@ from servoid.stack.tasks.stories.told import StoryEpisode, StorySettings
 AGAIN_SECONDS = 2.0  # after a skill that did not do it, before another try
 READY_SECONDS = 0.8  # in which a planner comes to a stand before what it is told, and may be told otherwise
 STAGE = 0.04  # m from there that will do
-SETTLE_SECONDS = 2.0  # of standing at a place, from which on a planner that shuffles nearer to it is told to stand
 STRAYED = 0.8  # of how far from there an act that is done by standing there may be
 FAR = 0.25  # m from there beyond which a robot that had come near walks there anew: turning, it drifts
 AWAY = 0.08  # m farther off that a robot turns its back to a seat: its toes need room
@@ -265,12 +264,6 @@ class Machine(BaseBehaviour):
 
     def _told(self, act: Act, state: State, thing: Array) -> Instruction:
         """A sentence, and where parts of the body shall be at the end of a plan."""
-        if (
-            act.sentence is None
-            and self._acting is not None
-            and self._tick - self._acting > self._ticks(SETTLE_SECONDS)
-        ):
-            return Instruction(np.zeros(3), stand=True)
         facing = float(yaw_of(thing[3:])) if self.episode.things[self._number] >= 0 else float(state.yaw)
         targets = {}
         for part, offset in act.targets.items():
