@@ -25,6 +25,7 @@ import yaml
 # Reads as SafeLoader does, eight times as fast, where PyYAML was built with libyaml.
 YAML_LOADER: type[yaml.SafeLoader] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
+_SHOWN = 60  # characters of a value that an error shows
 
 T = TypeVar("T")
 
@@ -292,4 +293,5 @@ def _describe(node: yaml.Node) -> str:
         return f"a list of {len(node.value)}"
     kind = {"int": "the number ", "float": "the number ", "bool": "the boolean ", "timestamp": "the date "}
     name = node.tag.rsplit(":", 1)[-1]
-    return "nothing" if name == "null" and not node.value else f"{kind.get(name, '')}'{node.value}'"
+    shown = f"{node.value[:_SHOWN]}..." if len(node.value) > _SHOWN else node.value
+    return "nothing" if name == "null" and not node.value else f"{kind.get(name, '')}'{shown}'"

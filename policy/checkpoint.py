@@ -169,10 +169,11 @@ def check(path: Path, head: Mapping[str, Any], kind: str, robot: Robot) -> None:
     if head["kind"] != kind:
         raise CheckpointError(f"{path}: holds a {head['kind']} network, but a {kind} network is needed")
     theirs, ours = list(head["joints"]), list(robot.names)
-    # The network that a robot of one's own needs first.
+    # The network that a robot of one's own needs first, and what it walks by until it has the others.
     own = Path(robot.folder) / f"{path.stem}.safetensors"
-    remedy = f"; train it once: servoid train odometry --policy gait --robot FILE --out {own}"
-    remedy = remedy if kind == "odometry" else ""
+    remedies = {"odometry": f"; train it once: servoid train odometry --policy gait --robot FILE --out {own}"}
+    remedies |= dict.fromkeys(("diffusion", "tracker"), "; a robot that has no such network yet goes by --policy gait")
+    remedy = remedies.get(kind, "")
     if theirs != ours:
         reason = difference(theirs, ours)
         raise CheckpointError(f"{path}: made for {head['robot']}, its joints do not fit {robot.name}: {reason}{remedy}")

@@ -207,6 +207,10 @@ class Normaliser:
         """The gradient by what is decoded, of a gradient by what it is decoded to."""
         return gradient * self.std
 
+    def decoding(self) -> tuple[Array, Array]:
+        """`decode` as a matrix `(inputs, features)` and an offset, numpy: `x @ matrix + offset`, one product."""
+        return np.diag(np.asarray(self.std)), np.asarray(self.mean)
+
 
 def joints_seen(states: Normaliser) -> int:
     """How many joints the tokens describe that `states` normalises."""
@@ -248,3 +252,6 @@ class Emphasis(Normaliser):
 
     def pull_back(self, gradient: AnyArray) -> AnyArray:
         return super().pull_back(gradient) @ self.recover.T
+
+    def decoding(self) -> tuple[Array, Array]:
+        return np.asarray(self.recover) * np.asarray(self.std), np.asarray(self.mean)

@@ -346,6 +346,8 @@ def save_servo(servo: Servo, path: Path, head: str = "") -> None:
 
 def load_robot(name: str | Path = "op3") -> Robot:
     """Load a robot by name or file, with what its MJCF says, checked. Raises ConfigError naming file, line and key."""
+    if Path(name).suffix.lower() in (".urdf", ".xml") and Path(name).is_file():
+        raise ConfigError(f"{name}: is a model; a robot's file is YAML, and servoid robot import {name} drafts it")
     path = resolve("robots", name)
     robot, marks = load_marked(path, Robot)
     check_robot(robot, marks)

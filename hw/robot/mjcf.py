@@ -205,7 +205,9 @@ def _adapted(path: Path) -> str:
                 elif kind == "visual":
                     link.remove(part)
                 else:
-                    what = "no such file" if found is None else f"MuJoCo reads {', '.join(_MESHES)}"
+                    what = f"MuJoCo reads {', '.join(_MESHES)}"
+                    if found is None:
+                        what = "no such file beside the URDF or in the four folders above: put its package there"
                     raise ConfigError(f"{path}: link {link.get('name')!r}: collision mesh {name}: {what}")
     return ElementTree.tostring(root, encoding="unicode")
 

@@ -19,6 +19,7 @@ Predictor = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 ANALYTIC = "analytic"
 NETWORK = "network"
 _LARGEST = 1e38
+_DIFFERENCE = 0.05  # length of the step that a Jacobian is taken by: far above what float32 rounds, and short
 
 
 # Clean states `(batch, state tokens, features)`, normalised -> cost `(batch,)` and its gradient, shaped like the states
@@ -61,6 +62,11 @@ class Guidance:
     `even` gives each token's gradient the same norm, the mean over those that move. With `limited` no step is longer
     than to where the cost would be zero if it were linear. At each level `repeats` steps are taken, each with its share
     of the weight and the gradient where the step before it led.
+
+    With `actions` those that are denoised move as well, by `-weight` times the change of predicted actions along the
+    gradient: the network's Jacobian of actions by noisy states, which for `scaled` steps makes the covariance of both
+    times the gradient. A gradient on actions themselves would be zero where states see no action. The Jacobian is taken
+    by a difference, which is one call more; actions go as large a share of their step as states do of theirs.
     """
 
     slope: CostSlope
@@ -72,20 +78,28 @@ class Guidance:
     even: bool = False
     limited: bool = False
     repeats: int = 1
+    actions: bool = False
 
     def __post_init__(self) -> None:
         if self.gradient not in (ANALYTIC, NETWORK):
             raise ConfigError(f"guidance: gradient must be '{ANALYTIC}' or '{NETWORK}', not '{self.gradient}'")
 
     def predict(
-        self, network: Predictor, states: Tensor, actions: Tensor, levels: tuple[Tensor, Tensor], step: DenoisingStep
+        self,
+        network: Predictor,
+        states: Tensor,
+        actions: Tensor,
+        levels: tuple[Tensor, Tensor],
+        step: DenoisingStep,
+        moving_actions: Array | None = None,
     ) -> tuple[Array, Array]:
-        """What a `network` predicts of a noisy window, the states that `step` moves being guided. Raises Diverged."""
+        """What a `network` predicts of a noisy window, guided: the states that `step` moves, and `moving_actions`
+        `(action tokens,)` where actions are guided too. Raises Diverged."""
         through = self.gradient == NETWORK
         with torch.set_grad_enabled(through):
             source = states.detach().requires_grad_(through)
             predicted, clean_actions = network(source, actions, *levels)
-        clean = predicted.detach().numpy()
+        clean, along = predicted.detach().numpy(), np.zeros(states.shape, np.float32)
         for again in reversed(range(self.repeats)):
             cost, slope = self.slope(clean)
             if not np.isfinite(cost).all():  # its slope may be finite all the same, but leads nowhere
@@ -96,19 +110,44 @@ class Guidance:
                 gradient = torch.autograd.grad(predicted, source, pulled, retain_graph=again > 0)[0].numpy()
             if self.scaled:
                 gradient = gradient * (step.noise**2 / step.signal if through else step.noise**2)
-            clean = clean - self._limited(self.step(gradient, step.moving), slope, cost)
-        return clean, clean_actions.detach().numpy()
+            moved, share = self.step(gradient, step.moving)
+            part = self._limited(moved, slope, cost)
+            clean = clean - part * moved
+            if self.actions:
+                along += part * share * self._along(slope, step)
+        acted = clean_actions.detach().numpy()
+        if self.actions and moving_actions is not None:
+            acted = acted - moving_actions[:, None] * self._change(network, states, actions, levels, along, acted)
+        return clean, acted
 
-    def _limited(self, step: Array, slope: Array, cost: Array) -> Array:
-        """A step cut to where a `cost` `(batch,)` with this `slope` would be zero."""
+    def _along(self, slope: Array, step: DenoisingStep) -> Array:
+        """A gradient on clean states as a direction of noisy ones, with its share of the weight."""
+        along: Array = slope * (step.moving[:, None] * np.float32(min(self.weight / self.repeats, _LARGEST)))
+        return along * (step.noise**2 / step.signal) if self.scaled else along
+
+    @staticmethod
+    def _change(
+        network: Predictor, states: Tensor, actions: Tensor, levels: tuple[Tensor, Tensor], along: Array, acted: Array
+    ) -> Array:
+        """By how much predicted actions, `acted`, change with noisy states that go `along`: the network's Jacobian."""
+        size = np.sqrt(np.square(along).sum((1, 2), keepdims=True))  # of each window
+        reach = np.float32(_DIFFERENCE) / np.maximum(size, np.float32(1e-12))
+        with torch.set_grad_enabled(False):
+            there = network(states + torch.from_numpy(along * reach), actions, *levels)[1].numpy()
+        change: Array = (there - acted) / reach
+        return change
+
+    def _limited(self, step: Array, slope: Array, cost: Array) -> Array | float:
+        """How much of a step, `(batch, 1, 1)`, leads to where a `cost` `(batch,)` with this `slope` would be zero."""
         if not self.limited:
-            return step
+            return 1.0
         drop = (slope * step).sum((1, 2))
-        share = np.where(drop > cost, cost / np.maximum(drop, 1e-12), 1.0)
-        return step * share.astype(step.dtype)[:, None, None]
+        share: Array = np.where(drop > cost, cost / np.maximum(drop, 1e-12), 1.0).astype(step.dtype)
+        return share[:, None, None]
 
-    def step(self, gradient: Array, moving: Array) -> Array:
-        """How far states go, `(batch, state tokens, features)`: those `moving` `(state tokens,)`. Raises Diverged."""
+    def step(self, gradient: Array, moving: Array) -> tuple[Array, Array]:
+        """How far states go, `(batch, state tokens, features)`: those `moving` `(state tokens,)`; and what share
+        `(batch, 1, 1)` that is of the step that `clip` would not shorten. Raises Diverged."""
         if self.even:
             size = np.linalg.norm(gradient, axis=2, keepdims=True)
             gradient = gradient * (size[:, moving].mean(1, keepdims=True) / np.maximum(size, 1e-12))
@@ -125,9 +164,8 @@ class Guidance:
             raise Diverged(
                 f"guidance with a weight of {self.weight:g} moves this trajectory out of all bounds; lower it"
             )
-        share = np.minimum(self.clip / self.repeats / np.maximum(norm, 1e-12), 1.0)
-        limited: Array = step * share.astype(step.dtype)[:, None, None]
-        return limited
+        share = np.minimum(self.clip / self.repeats / np.maximum(norm, 1e-12), 1.0).astype(step.dtype)[:, None, None]
+        return step * share, share
 
 
 def classifier_free(denoise: Callable[..., tuple[Tensor, Tensor]], text: Tensor | None, weight: float) -> Predictor:

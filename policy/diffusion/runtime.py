@@ -62,9 +62,11 @@ class Runtime:
         settings.check(config, model.header.get("training"))
         self.model, self.settings = model, settings
         self._joints = joints_seen(model.states)
+        self._decoding = model.states.decoding()
         self._dt, self._top = robot.dt, robot.walking.scale
         self.cost = sloped(cost) if cost is not None and settings.guidance.weight > 0 else None
-        self.engine = engine or load_engine(settings.engine, model.denoiser)
+        self._through = self.cost is not None and settings.guidance.gradient == NETWORK
+        self.engine = engine or load_engine(settings.engine, model.denoiser, self._through)
         self.samples = settings.guidance.samples if self.cost else 1
         self.horizon = settings.horizon or config.horizon  # ticks that are planned
         self.ticks = config.future_ticks[config.future_ticks <= self.horizon]  # those of them with states,
@@ -135,8 +137,7 @@ class Runtime:
         """
         self._check(states, actions)
         n, history = self.samples, self.model.config.history
-        through = self.cost is not None and self.settings.guidance.gradient == NETWORK
-        with one_thread(), torch.no_grad() if through else torch.inference_mode():
+        with one_thread(), torch.no_grad() if self._through else torch.inference_mode():
             # Sample i of a robot's n draws noise of its own; the first one's does not depend on n.
             keys = [(*pair, *((i,) if i else ())) for pair in seeds for i in range(n)]
             known = self.known(states, actions, instruction)
@@ -270,16 +271,16 @@ class Runtime:
     def _guidance(self, instruction: Instruction) -> Guidance | None:
         if (cost := self.cost) is None:
             return None
-        history, normaliser = self.model.config.history, self.model.states
+        history, (matrix, offset) = self.model.config.history, self._decoding
         future = slice(history, history + len(self.ticks))
 
         def slope(states: Array) -> tuple[Array, Array]:
-            tokens = normaliser.decode(torch.from_numpy(states[:, future])).numpy()
+            tokens = states[:, future] @ matrix
+            tokens += offset
             trajectory = Trajectory.of(tokens, self._joints, self._dt, self.ticks)
             value, on_trajectory = cost.slope(trajectory, instruction)
             gradient = np.zeros_like(states)
-            on_tokens = torch.from_numpy(by_tokens(on_trajectory, tokens, self._joints))
-            gradient[:, future] = normaliser.pull_back(on_tokens).numpy()
+            np.matmul(by_tokens(on_trajectory, tokens, self._joints), matrix.T, out=gradient[:, future])
             return value, gradient
 
         chosen = self.settings.guidance
@@ -294,6 +295,7 @@ class Runtime:
             even=chosen.even,
             limited=chosen.limited,
             repeats=chosen.repeats,
+            actions=chosen.actions,
         )
 
 

@@ -88,7 +88,9 @@ class Sampler:
             if guidance is None or not call.guided:
                 clean_states, clean_actions = (x.numpy() for x in self._predict(*window, *call.levels))
             else:
-                clean_states, clean_actions = guidance.predict(self._predict, *window, call.levels, call.states)
+                clean_states, clean_actions = guidance.predict(
+                    self._predict, *window, call.levels, call.states, call.actions.moving
+                )
             if known.impute is not None:
                 clean_states = known.impute(torch.from_numpy(clean_states)).numpy()
             states = self._step(states, clean_states, call.states, generators)

@@ -44,6 +44,7 @@ class GuidanceSettings:
     even: bool = False  # each token's gradient has the same norm
     limited: bool = False  # no step is longer than to where the cost would be zero
     repeats: int = 1  # gradient steps a network call, which share weight and clip
+    actions: bool = False  # actions move too, by the network's own Jacobian, for a network call more
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.weight) and self.weight >= 0 and self.clip > 0):
@@ -120,9 +121,11 @@ class DiffusionSettings:
             raise ValueError(f"no schedule is called '{self.schedule}': {nearest(self.schedule, SCHEDULES)}")
         if self.engine not in ENGINES:
             raise ValueError(f"no engine is called '{self.engine}': {nearest(self.engine, ENGINES)}")
-        if self.engine != REFERENCE and self.guidance.gradient == "network" and self.guidance.weight > 0:
+        through = self.guidance.gradient == "network" and self.guidance.weight > 0
+        if through and not ENGINES[self.engine].gradient:
+            able = " or ".join(name for name, kind in ENGINES.items() if kind.gradient)
             raise ValueError(
-                f"the engine '{self.engine}' has no gradient through the network: set engine: {REFERENCE}, or "
+                f"the engine '{self.engine}' has no gradient through the network: set engine: {able}, or "
                 "guidance.gradient: analytic"
             )
         if not 0.0 <= self.eta <= 1.0:

@@ -87,6 +87,7 @@ def test_reads_what_people_write(tmp_path: Path) -> None:
         (("id: 7", "id: 7\nid: 8"), 3, "id: duplicate key, first given on line 2"),
         (("id: 7", "on: 7"), 2, "on: expected text as key, got the boolean 'on'"),
         (("gains:\n  kp: 8", "gains: 8"), 4, "gains: expected keys and values, got the number '8'"),
+        (("gains:\n  kp: 8", f"gains: {'a' * 200}"), 4, f"keys and values, got '{'a' * 60}...'"),
         (("id: 7", "id: [7"), 3, "not valid YAML"),
         (("id: 7", "\tid: 7"), 2, "not valid YAML"),
         (("id: 7", "id: 7\n--- \nid: 8"), 3, "not valid YAML"),

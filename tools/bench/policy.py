@@ -38,6 +38,7 @@ COLUMNS = (
     "plan_p99_ms",
     "plan_cpu_ms",
     "plan_per_call",
+    "plan_per_pass",
     "plans_per_s",
     "gflops",
 )
@@ -109,7 +110,7 @@ def _run(args: argparse.Namespace, report: Report) -> None:
     pairs = [(network, engine) for network in networks for engine in args.engine or ENGINES]
     for network, engine in tqdm(pairs, unit="engine", leave=False, disable=None):
         try:
-            loaded = load_engine(engine, network.model.denoiser)
+            loaded = load_engine(engine, network.model.denoiser, ENGINES[engine].gradient)
         except ConfigError as error:
             skipped[f"{network.name}: {engine}"] = str(error)
             continue
@@ -151,39 +152,27 @@ class _Timed:
     call_ms: list[float]
 
 
-class _Counted:
-    """An engine that counts the processor's time of its calls, as they are in plans: with caches that others filled."""
-
-    def __init__(self, engine: Engine) -> None:
-        self._engine, self.seconds = engine, 0.0
-
-    def __call__(self, *inputs: torch.Tensor, **text: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        start = time.process_time()
-        clean = self._engine(*inputs, **text)
-        self.seconds += time.process_time() - start
-        return clean
-
-
 def _time(
     network: Network, timed: _Timed, runtime: str, settings: DiffusionSettings, robot: Robot, plans: int
 ) -> list[dict[str, Any]]:
     """Rows of one engine and runtime: unguided, and guided by each kind of gradient that the engine has."""
-    from servoid.policy.diffusion.engines import REFERENCE
+    from servoid.policy.diffusion.engines import ENGINES
     from servoid.policy.diffusion.runtime import Runtime
     from servoid.stack.tasks import load_task
+    from servoid.tools.bench.planning.counted import CountedEngine
 
     cost = load_task("walk", dt=robot.dt).objective
     request = _request(robot, network.model, settings.delay)
     rows = []
-    for gradient in (NONE, "analytic", "network") if timed.name == REFERENCE else (NONE, "analytic"):
+    for gradient in (NONE, "analytic", "network") if ENGINES[timed.name].gradient else (NONE, "analytic"):
         guided = gradient != NONE
         guidance = replace(settings.guidance, gradient=gradient if guided else "analytic")
         guidance = replace(guidance, weight=guidance.weight or 1.0)  # timed even where it is switched off
         chosen = replace(settings, engine=timed.name, guidance=guidance)
-        engine = _Counted(timed.engine)
-        planner = Runtime(network.model, chosen, robot, cost if guided else None, engine)
+        engine = CountedEngine(timed.engine)
+        planner = Runtime(network.model, chosen, robot, cost if guided else None, engine.engine)
         _plan_times(planner, request, WARM_UP)
-        engine.seconds = 0.0
+        engine.clear()
         plan_ms, cpu_ms = _plan_times(planner, request, plans)
         rows.append(
             {
@@ -201,6 +190,7 @@ def _time(
                 "plan_p99_ms": float(np.percentile(plan_ms, 99)),
                 "plan_cpu_ms": float(np.median(cpu_ms)),
                 "plan_per_call": sum(cpu_ms) / (1000 * engine.seconds),
+                "plan_per_pass": sum(cpu_ms) / (1000 * (engine.seconds + engine.back)),
                 "plans_per_s": 1000 / float(np.median(plan_ms)),
                 "plan_due_ms": due_ms(settings, robot.dt),
                 "gflops": network.gflop / (float(np.median(timed.call_ms)) / 1000),

@@ -47,9 +47,13 @@ def main(args: argparse.Namespace) -> int:
 def work(args: argparse.Namespace, desk: Desk) -> int:
     """Do it, and show the person at the desk."""
     report, robot = desk.report, assembled(args, desk.report)
+    if is_virtual(args):
+        from servoid.sim.rig.servo.board import on_the_board
+
+        robot = on_the_board(robot)  # of which a virtual rig has the IMU that would be on a port of its own
     with open_line(args, robot, patient=False) as line, ExitStack() as stack:
         imu = None
-        if robot.imu.kind not in ("opencr", "none") and not is_virtual(args):  # a virtual rig has it on its board
+        if robot.imu.kind not in ("opencr", "none"):
             from servoid.hw.imu.serial_imu import SerialImu
 
             imu = SerialImu(robot.imu, robot.rate, clock=line.clock)

@@ -52,6 +52,8 @@ def findings(robot: Robot) -> list[Comparison]:
         Comparison(
             True, "weight and height", f"{mass:.2f} kg, base {robot.standing_height:.3f} m above the ground at home"
         ),
+        Comparison(True, "walking", _asked(robot)),
+        _supply(robot),
         _kinematics(robot, model, data, joints),
         *_gears(robot),
         _apart(robot, model),
@@ -62,7 +64,7 @@ def findings(robot: Robot) -> list[Comparison]:
         _balance(robot, model, data, joints),
         _load(robot, model, data, joints),
         _stiffness(robot, model, data, joints),
-        _steps(robot),
+        steps(robot),
     ]
     _put(model, data, joints, robot.home)
     at = {name: data.xanchor[model.joint(name).id].copy() for name in robot.names}
@@ -91,6 +93,30 @@ def _kinematics(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints
             worst = max(worst, float(np.abs(data.sensor(f"servoid/{foot}_position").data - sole).max()))
     text, at_home = f"soles {worst:.1e} m from MuJoCo's at {_POSES} random poses", legs.soles(legs.pick(robot.home))[0]
     return Comparison(worst < _EXACT, "kinematics", text, places=_places(*at_home) if worst >= _EXACT else ())
+
+
+def _asked(robot: Robot) -> str:
+    """What a controller may ask of the robot."""
+    walks = robot.walking
+    return (
+        f"at most {walks.forward:.2f} m/s ahead, {walks.backward:.2f} back, {walks.sideways:.2f} aside and "
+        f"{walks.turning:.2f} rad/s: give less as `walking` if its servos are too slow or too weak for it"
+    )
+
+
+def _supply(robot: Robot) -> Comparison:
+    """One voltage suits all servos, as they hang on one bus and one supply."""
+    lowest = max(robot.servos, key=lambda servo: servo.voltage_range[0])
+    highest = min(robot.servos, key=lambda servo: servo.voltage_range[1])
+    low, high, given = lowest.voltage_range[0], highest.voltage_range[1], robot.bus.supply_voltage
+    if low > high:
+        text = f"a {lowest.name} needs {low:g} V, and a {highest.name} bears {high:g} V at most"
+    elif given is not None and not low <= given <= high:
+        text = f"bus.supply_voltage, {given:g} V, is outside the {low:g} to {high:g} V that all servos work at"
+    else:
+        return Comparison(True, "supply", f"all servos work at {low:g} to {high:g} V")
+    wrong = [j.name for j, servo in zip(robot.joints, robot.servos, strict=True) if servo.name == highest.name]
+    return Comparison(False, "supply", text, tuple(wrong) if low > high else ())
 
 
 def _gears(robot: Robot) -> list[Comparison]:
@@ -249,7 +275,7 @@ def _stiffness(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints:
     return Comparison(good, "stiffness at home", f"{times:.1f} times what it takes to stand{hint}")
 
 
-def _steps(robot: Robot) -> Comparison:
+def steps(robot: Robot) -> Comparison:
     """The gait's steps are within the joints' ranges."""
     gait, phase = Gait(robot), np.linspace(0.0, 1.0, 24, endpoint=False)
     velocity = np.broadcast_to(np.array([0.5, 0.0, 0.0]) * gait.upper, (24, 3))

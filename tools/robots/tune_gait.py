@@ -1,7 +1,8 @@
 """Search for the steps that a robot walks best by, in simulation, and write them to the robot's own folder.
 
 The search is CMA-ES over the lengths and times of the gait, each candidate walking in all directions on nominal and
-randomised robots. The best so far is kept: Ctrl-C ends the search and writes it.
+randomised robots. The best so far is written whenever there is a better one, so that Ctrl-C may end the search. Where
+every walk fell, nothing is written.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
+from servoid.tools.common import exit_codes
 from servoid.tools.common.output import add_json_argument, check_writable, reporting
 
 if TYPE_CHECKING:
@@ -64,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Search; returns 0. Raises ConfigError."""
+    """Search; returns 1 where every walk fell. Raises ConfigError."""
     with reporting(args.json) as report:
         for option, least in (("generations", 1), ("candidates", 4), ("seconds", _SETTLE + 1)):
             if getattr(args, option) < least:
@@ -94,15 +96,31 @@ def main(args: argparse.Namespace) -> int:
                 leader = int(np.argmin([walked.cost for walked in walks]))
                 if walks[leader].cost < best.cost:
                     best, kept = walks[leader], _moved(start, points[leader])
+                    _write(out, robot, kept, best)
                 report.line(
                     f"{generation + 1:3d} of {args.generations}: {_words(walks[leader])}; best so far {best.cost:.3f}"
                 )
         except KeyboardInterrupt:
             report.line("stopped: the best so far is kept")
-        out.write_text(_text(robot, kept, best))
-        report.line(f"{robot.name}: {_words(best)}; written to {out}")
-        report.result({"out": str(out), "before": asdict(first), "after": asdict(best), "gait": asdict(kept)})
-    return 0
+        written = _write(out, robot, kept, best)
+        report.line(
+            f"{robot.name}: {_words(best)}; written to {out}"
+            if written
+            else f"{robot.name}: every walk fell; nothing is written. See servoid robot check, and "
+            f"give lower speeds than {robot.walking.forward:.2f} m/s ahead as `walking` in the robot's file"
+        )
+        report.result(
+            {"out": str(out) if written else None, "before": asdict(first), "after": asdict(best), "gait": asdict(kept)}
+        )
+    return exit_codes.DONE if written else exit_codes.FAILED
+
+
+def _write(out: Path, robot: Robot, gait: GaitSettings, walked: Walked) -> bool:
+    """Write a gait by which some walk stays up, and say whether it is one."""
+    if walked.falls >= 1.0:
+        return False
+    out.write_text(_text(robot, gait, walked))
+    return True
 
 
 def _words(walked: Walked) -> str:

@@ -1,16 +1,17 @@
 """Engines that run a denoiser: torch, which is the reference, and others that are given the network as an ONNX graph.
 
 Each computes the same function on one thread, and is compared with torch on two windows when it is loaded. What an
-output may differ by, root mean square over that of torch's output, is the engine's tolerance. Nothing heavy is imported
-before an engine is loaded.
+output may differ by, root mean square over that of torch's output, is the engine's tolerance; so is it for the gradient
+through the network, where that is asked for. Nothing heavy is imported before an engine is loaded.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,17 +25,18 @@ if TYPE_CHECKING:
 
 # The call of a Denoiser: (states, actions, state levels, action levels, text, text_mask) -> clean states, clean actions
 Engine = Callable[..., "tuple[Tensor, Tensor]"]
-# Inputs by name -> clean states, clean actions
-RunGraph = Callable[[Mapping[str, Array]], "tuple[Array, Array]"]
+# Inputs by name -> outputs, in the order of the graph
+RunGraph = Callable[[Mapping[str, Array]], "Sequence[Array]"]
 
 REFERENCE = "torch"
 
 
 @dataclass(frozen=True)
 class EngineKind:
-    """What an engine needs, and how far it may be from torch."""
+    """What an engine needs, how far it may be from torch, and whether it has a gradient through the network."""
 
     tolerance: float
+    gradient: bool
     packages: tuple[str, ...] = ()
     extra: str = ""  # of this project, which installs the packages
 
@@ -42,11 +44,11 @@ class EngineKind:
 _ONNX = ("onnxruntime", "onnxscript")
 _OPENVINO = ("openvino", "onnxscript")
 ENGINES: dict[str, EngineKind] = {
-    REFERENCE: EngineKind(0.0),
-    "onnx": EngineKind(1e-4, _ONNX, "onnx"),
-    "onnx-int8": EngineKind(0.08, _ONNX, "onnx"),
-    "openvino": EngineKind(1e-4, _OPENVINO, "openvino"),
-    "openvino-bf16": EngineKind(0.04, _OPENVINO, "openvino"),
+    REFERENCE: EngineKind(1e-5, True),  # of its own gradient, by autograd
+    "onnx": EngineKind(1e-4, True, _ONNX, "onnx"),
+    "onnx-int8": EngineKind(0.08, False, _ONNX, "onnx"),
+    "openvino": EngineKind(1e-4, True, _OPENVINO, "openvino"),
+    "openvino-bf16": EngineKind(0.04, False, _OPENVINO, "openvino"),
 }
 
 
@@ -63,23 +65,31 @@ def check_engine(name: str) -> None:
         )
 
 
-def load_engine(name: str, denoiser: Denoiser) -> Engine:
-    """A function with the signature of `denoiser` that computes it with the engine `name`, without gradients.
+def load_engine(name: str, denoiser: Denoiser, gradient: bool = False) -> Engine:
+    """A function with the signature of `denoiser` that computes it with the engine `name`.
 
-    Raises ConfigError where there is no such engine, where it is not installed, and where what it computes differs from
-    torch by more than its tolerance.
+    With `gradient` it has one on the states, which autograd finds. Raises ConfigError where there is no such engine,
+    where it is not installed or has no gradient, and where what it computes differs from torch by more than its
+    tolerance.
     """
     check_engine(name)
+    if gradient and not ENGINES[name].gradient:
+        able = ", ".join(engine for engine, kind in ENGINES.items() if kind.gradient)
+        raise ConfigError(f"the engine '{name}' has no gradient through the network: set another one ({able})")
     if name == REFERENCE:
-        return denoiser
-    from servoid.policy.diffusion.engines.export import exported, quantised
+        return _torch(denoiser) if gradient else denoiser
+    from servoid.policy.diffusion.engines import export
 
-    graph = exported(denoiser)
+    graph = export.exported(denoiser)
     if name == "onnx-int8":
-        graph = quantised(graph)
-    run = _onnx_runtime(graph) if name.startswith("onnx") else _openvino(graph, "bf16" if "bf16" in name else "f32")
-    engine = Exported(run, denoiser.config.text_size)
-    error = deviation(engine, denoiser)
+        graph = export.quantised(graph)
+    load = _onnx_runtime if name.startswith("onnx") else partial(_openvino, "bf16" if "bf16" in name else "f32")
+    whole = Exported(load(graph), denoiser.config.text_size)
+    engine: Engine = whole
+    if gradient:
+        passes = [load(export.exported(denoiser, part)) for part in (export.FORWARD, export.BACKWARD)]
+        engine = _with_gradient(whole, denoiser, *passes)
+    error = deviation(engine, denoiser, gradient)
     if not error <= ENGINES[name].tolerance:
         raise ConfigError(
             f"the engine '{name}' differs from torch by {error:.2g} of its output on this network, more than the "
@@ -88,14 +98,58 @@ def load_engine(name: str, denoiser: Denoiser) -> Engine:
     return engine
 
 
+def _torch(denoiser: Denoiser) -> Engine:
+    """Torch by the written-out passes, which take two thirds of what autograd does."""
+    from servoid.policy.diffusion.engines.differentiable import Differentiable
+    from servoid.policy.diffusion.model.backward import Backward, Forward
+
+    forward, backward = Forward(denoiser), Backward(denoiser)
+
+    def ahead(*inputs: Tensor, **text: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+        states, actions, *kept = forward(*inputs, **text)
+        return states, actions, tuple(kept)
+
+    return Differentiable(denoiser, ahead, lambda pull, kept: backward(pull, *kept))
+
+
+def _with_gradient(engine: Exported, denoiser: Denoiser, forward: RunGraph, backward: RunGraph) -> Engine:
+    """Exported passes of a network; what one keeps for the other stays in numpy."""
+    import torch
+
+    from servoid.policy.diffusion.engines.differentiable import Differentiable
+    from servoid.policy.diffusion.model.backward import kept_names
+
+    names = kept_names(denoiser)
+
+    def ahead(*inputs: Tensor, **text: Tensor) -> tuple[Tensor, Tensor, tuple[Array, ...]]:
+        states, actions, *kept = forward(engine.inputs(*inputs, **text))
+        return torch.from_numpy(states), torch.from_numpy(actions), tuple(kept)
+
+    def back(pull: Tensor, kept: tuple[Array, ...]) -> Tensor:
+        (gradient,) = backward({"pull": pull.numpy(), **dict(zip(names, kept, strict=True))})
+        return torch.from_numpy(gradient)
+
+    return Differentiable(engine, ahead, back)
+
+
 class Exported:
     """A denoiser's graph, called with torch tensors like the denoiser itself."""
 
     def __init__(self, run: RunGraph, text_size: int) -> None:
         self._run = run
         self._text_size = text_size
+        self._told: dict[int, tuple[Array, Array]] = {}  # by batch: all are told, and an instruction for those without
 
-    def __call__(
+    def __call__(self, *inputs: Tensor, **text: Any) -> tuple[Tensor, Tensor]:
+        """See `Denoiser.forward`. Raises RuntimeError when a gradient is wanted, which a graph has not."""
+        import torch
+
+        if inputs[0].requires_grad or inputs[1].requires_grad:
+            raise RuntimeError("this engine was loaded without a gradient through the network")
+        states, actions = self._run(self.inputs(*inputs, **text))
+        return torch.from_numpy(states), torch.from_numpy(actions)
+
+    def inputs(
         self,
         states: Tensor,
         actions: Tensor,
@@ -103,34 +157,31 @@ class Exported:
         action_levels: Tensor,
         text: Tensor | None = None,
         text_mask: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """See `Denoiser.forward`. Raises RuntimeError when a gradient is wanted: only torch has one."""
-        import torch
-
-        if states.requires_grad or actions.requires_grad:
-            raise RuntimeError("this engine has no gradient through the network; the engine torch has")
+    ) -> dict[str, Array]:
+        """What the graph is given. Levels that a batch shares are given for each, and a text always."""
         batch = len(states)
-        inputs = {
-            "states": states,
-            "actions": actions,
-            "state_levels": state_levels.expand(batch, -1),
-            "action_levels": action_levels.expand(batch, -1),
-        }
-        if self._text_size:
-            # The graph always reads a text; a window that is not told it has none.
-            if text is None:
-                text, text_mask = torch.zeros(batch, self._text_size), torch.zeros(batch, dtype=torch.bool)
-            inputs["text"] = text
-            inputs["text_mask"] = torch.ones(batch, dtype=torch.bool) if text_mask is None else text_mask
-        clean = self._run({name: np.ascontiguousarray(value.numpy()) for name, value in inputs.items()})
-        return torch.from_numpy(clean[0]), torch.from_numpy(clean[1])
+        levels = [
+            levels.numpy() if levels.ndim == 2 else np.ascontiguousarray(levels.expand(batch, -1).numpy())
+            for levels in (state_levels, action_levels)
+        ]
+        given = {"states": states.numpy(), "actions": actions.numpy()}
+        given |= {"state_levels": levels[0], "action_levels": levels[1]}
+        if not self._text_size:
+            return given
+        if batch not in self._told:
+            self._told[batch] = np.ones(batch, bool), np.zeros((batch, self._text_size), np.float32)
+        all_told, nothing = self._told[batch]
+        if text is None:
+            return given | {"text": nothing, "text_mask": ~all_told}
+        return given | {"text": text.numpy(), "text_mask": all_told if text_mask is None else text_mask.numpy()}
 
 
-def deviation(engine: Engine, denoiser: Denoiser) -> float:
+def deviation(engine: Engine, denoiser: Denoiser, gradient: bool = False) -> float:
     """Root mean square of what `engine` differs by from `denoiser`, over that of the denoiser's output.
 
     Taken over a window alone, with one level for each tick of its tokens, and over two with levels of their own, where
-    one is told a text and the other is not, as classifier-free guidance asks. The larger of states and actions.
+    one is told a text and the other is not, as classifier-free guidance asks. The larger of states and actions, and,
+    where it is asked for, of the `gradient` on the states.
     """
     import torch
 
@@ -153,6 +204,15 @@ def deviation(engine: Engine, denoiser: Denoiser) -> float:
         with torch.no_grad():
             for ours, theirs in zip(engine(*inputs, **text), denoiser(*inputs, **text), strict=True):
                 found.append((ours - theirs).norm() / theirs.norm().clamp_min(1e-9))
+        if gradient:
+            pull = torch.randn(inputs[0].shape, generator=generator)
+            slopes = []
+            for network in (engine, denoiser):
+                source = inputs[0].clone().requires_grad_()
+                with torch.enable_grad():
+                    clean, _ = network(source, *inputs[1:], **text)
+                slopes.append(torch.autograd.grad(clean, source, pull)[0])
+            found.append((slopes[0] - slopes[1]).norm() / slopes[1].norm().clamp_min(1e-9))
     return float(torch.stack(found).max())  # not a number where any of them is not
 
 
@@ -164,14 +224,16 @@ def _onnx_runtime(graph: bytes) -> RunGraph:
     options.log_severity_level = 3  # errors: warnings about the graph help nobody at the robot
     session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
-    def run(inputs: Mapping[str, Array]) -> tuple[Array, Array]:
-        states, actions = session.run(["clean_states", "clean_actions"], dict(inputs))
-        return states, actions
+    outputs = [output.name for output in session.get_outputs()]
+
+    def run(inputs: Mapping[str, Array]) -> Sequence[Array]:
+        found: Sequence[Array] = session.run(outputs, inputs)
+        return found
 
     return run
 
 
-def _openvino(graph: bytes, precision: str) -> RunGraph:
+def _openvino(precision: str, graph: bytes) -> RunGraph:
     """`precision` is "f32" or "bf16". It must be said: left to itself, OpenVINO takes bf16 where the CPU has it."""
     import openvino
 
@@ -184,8 +246,8 @@ def _openvino(graph: bytes, precision: str) -> RunGraph:
     core = openvino.Core()
     request = core.compile_model(core.read_model(graph), "CPU", settings).create_infer_request()
 
-    def run(inputs: Mapping[str, Array]) -> tuple[Array, Array]:
-        clean = request.infer(dict(inputs))
-        return clean["clean_states"], clean["clean_actions"]
+    def run(inputs: Mapping[str, Array]) -> Sequence[Array]:
+        found = request.infer(dict(inputs))
+        return [found[i] for i in range(len(found))]
 
     return run

@@ -9,30 +9,35 @@ import logging
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor, nn
 
 from servoid.hw.user_folders import user_folder
+from servoid.policy.diffusion.model.backward import Backward, Forward, kept_names
 from servoid.policy.diffusion.model.denoiser import Denoiser
 
 OPSET = 18
 OUTPUTS = ("clean_states", "clean_actions")
+# What is exported: the network, or the two passes of its gradient (see servoid.policy.diffusion.model.backward).
+WHOLE, FORWARD, BACKWARD = "whole", "forward", "backward"
+GRADIENT = "gradient"
 _DIGEST = 32  # bytes of a file before the graph: its SHA-256
 _VERSION = 2  # of the graph that is made of a denoiser: files of another one are not read
 
 
-def exported(denoiser: Denoiser) -> bytes:
+def exported(denoiser: Denoiser, part: str = WHOLE) -> bytes:
     """The graph of `to_onnx`, kept in the user's cache folder, because exporting takes seconds."""
-    path = cache_path(denoiser)
+    path = cache_path(denoiser, part)
     with contextlib.suppress(OSError):  # it was not made before, or the folder cannot be read
         kept = path.read_bytes()
         if hashlib.sha256(kept[_DIGEST:]).digest() == kept[:_DIGEST]:  # else the file is damaged
             return kept[_DIGEST:]
-    graph = to_onnx(denoiser)
+    graph = to_onnx(denoiser, part)
     with contextlib.suppress(OSError):  # without a folder to write to, it is made anew the next time
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=path.stem, suffix=".partial", delete=False) as file:
@@ -41,10 +46,11 @@ def exported(denoiser: Denoiser) -> bytes:
     return graph
 
 
-def cache_path(denoiser: Denoiser) -> Path:
+def cache_path(denoiser: Denoiser, part: str = WHOLE) -> Path:
     """Where the graph of these weights is kept: under servoid/ in $XDG_CACHE_HOME, or ~/.cache. For a user without a
     home it is where nothing can be."""
     made_by = {"config": asdict(denoiser.config), "torch": torch.__version__, "opset": OPSET, "version": _VERSION}
+    made_by |= {} if part == WHOLE else {"part": part}
     digest = hashlib.sha256(json.dumps(made_by, sort_keys=True).encode())
     for name, weights in sorted(denoiser.state_dict().items()):
         digest.update(name.encode() + weights.numpy().tobytes())
@@ -52,12 +58,14 @@ def cache_path(denoiser: Denoiser) -> Path:
     return folder / "engines" / digest.hexdigest()[:32]
 
 
-def to_onnx(denoiser: Denoiser) -> bytes:
+def to_onnx(denoiser: Denoiser, part: str = WHOLE) -> bytes:
     """The graph, its weights included.
 
     Inputs `states` `(batch, state tokens, state_size)`, `actions` `(batch, action tokens, action_size)` float32,
     `state_levels` and `action_levels` `(batch, tokens)` int64 and, where the network reads instructions, `text`
-    `(batch, text_size)` float32 and `text_mask` `(batch,)` bool. Outputs `clean_states` and `clean_actions`. Any batch.
+    `(batch, text_size)` float32 and `text_mask` `(batch,)` bool. Outputs `clean_states` and `clean_actions`; of the
+    forward pass those that are kept as well. The backward pass takes these, and `pull` on clean states, and gives
+    `gradient` on noisy ones. Any batch.
     """
     config = denoiser.config
     n_states, n_actions, batch = len(config.state_ticks), len(config.action_ticks), 2  # 1 would be taken for fixed
@@ -70,18 +78,33 @@ def to_onnx(denoiser: Denoiser) -> bytes:
     if config.text_size:
         inputs["text"] = torch.zeros(batch, config.text_size)
         inputs["text_mask"] = torch.ones(batch, dtype=torch.bool)
+    if part == WHOLE:
+        return _graph(denoiser, inputs, OUTPUTS)
+    forward, kept = Forward(denoiser), kept_names(denoiser)
+    if part == FORWARD:
+        return _graph(forward, inputs, (*OUTPUTS, *kept))
+    with torch.no_grad():
+        made = forward(*inputs.values())[len(OUTPUTS) :]
+    inputs = {"pull": torch.zeros_like(inputs["states"]), **dict(zip(kept, made, strict=True))}
+    return _graph(Backward(denoiser), inputs, (GRADIENT,))
+
+
+def _graph(module: nn.Module, inputs: dict[str, Tensor], outputs: Sequence[str]) -> bytes:
     any_batch = {0: torch.export.Dim("batch")}
+    shapes: tuple[Any, ...] = (any_batch,) * len(inputs)
+    if isinstance(module, Backward):  # takes as many as are kept
+        shapes = (any_batch, shapes[1:])
     # With gradients enabled attention is spelled out (see denoiser._attend), which every engine can read and fuse.
     with _quiet(), torch.enable_grad():
         program = torch.onnx.export(
-            denoiser,
+            module,
             tuple(inputs.values()),
             dynamo=True,
             verbose=False,
             opset_version=OPSET,
             input_names=list(inputs),
-            output_names=list(OUTPUTS),
-            dynamic_shapes=(any_batch,) * len(inputs),
+            output_names=list(outputs),
+            dynamic_shapes=shapes,
         )
     assert program is not None
     graph: bytes = program.model_proto.SerializeToString()

@@ -123,16 +123,27 @@ class Denoiser(nn.Module):
         instruction, None for a window without one; `text_mask` `(batch,)` bool says which windows of a batch have one.
         """
         n = states.shape[1]
-        state_place, action_place = self._places(actions.shape[1])
-        at_state = self.embed_state(states) + self.level(state_levels) + state_place + self.kind[0]
-        at_action = self.embed_action(actions) + self.level(action_levels) + action_place + self.kind[1]
-        x = torch.cat([at_state, at_action], 1)
-        if self.config.text_size:
-            x = x + self._instruction(text, text_mask)
+        x = self.joined(self.embed_state(states), actions, state_levels, action_levels, text, text_mask)
         for block in self.blocks:
             x = block(x, self.mask)
         x = self.norm(x)
         return self.head_state(x[:, :n]), self.head_action(x[:, n:])
+
+    def joined(
+        self,
+        embedded: Tensor,
+        actions: Tensor,
+        state_levels: Tensor,
+        action_levels: Tensor,
+        text: Tensor | None,
+        text_mask: Tensor | None,
+    ) -> Tensor:
+        """Tokens `(batch, tokens, width)` that the blocks begin with, of states that are `embedded` already."""
+        state_place, action_place = self._places(actions.shape[1])
+        at_state = embedded + self.level(state_levels) + state_place + self.kind[0]
+        at_action = self.embed_action(actions) + self.level(action_levels) + action_place + self.kind[1]
+        x = torch.cat([at_state, at_action], 1)
+        return x + self._instruction(text, text_mask) if self.config.text_size else x
 
     def _places(self, actions: int) -> tuple[Tensor, Tensor]:
         """What says at which tick a token is, `(tokens, width)` of states and of `actions` actions."""

@@ -14,9 +14,11 @@ import torch
 from test_runtime import ROBOT, model, request, seeded_with, speed_cost
 
 from servoid.hw.config import ConfigError, load_yaml
+from servoid.hw.contracts.body import Array
 from servoid.policy.diffusion import engines
-from servoid.policy.diffusion.engines import ENGINES, REFERENCE, check_engine, deviation, export, load_engine
+from servoid.policy.diffusion.engines import ENGINES, REFERENCE, Engine, check_engine, deviation, export, load_engine
 from servoid.policy.diffusion.guidance import classifier_free
+from servoid.policy.diffusion.model.backward import reached
 from servoid.policy.diffusion.model.checkpoint import Model
 from servoid.policy.diffusion.model.config import DenoiserConfig
 from servoid.policy.diffusion.model.denoiser import Denoiser
@@ -171,15 +173,46 @@ def test_what_is_not_installed_is_named_with_the_remedy(monkeypatch: pytest.Monk
     Runtime(made, DiffusionSettings(), ROBOT)  # torch needs nothing
 
 
+@pytest.mark.parametrize("mask", ["state_full_action_causal", "causal"])
+def test_the_way_back_that_is_written_out_is_that_of_autograd(mask: str) -> None:
+    """Where states see no action it is about states alone; the causal mask has them see actions."""
+    made = told_model(mask=mask).denoiser
+    assert reached(made) == (len(made.config.state_ticks) if mask != "causal" else len(made.mask))
+    assert deviation(load_engine(REFERENCE, made, gradient=True), made, gradient=True) <= ENGINES[REFERENCE].tolerance
+    assert deviation(made, told_model(mask=mask, seed=5).denoiser, gradient=True) > 0.1
+
+
 @pytest.mark.slow
-def test_the_gradient_through_the_network_needs_torch() -> None:
+def test_a_plan_guided_through_the_network_is_that_of_autograd_with_every_engine_that_can() -> None:
+    """With and without an instruction, three steps a call, for two robots at once; in rad."""
+    made = told_model(width=64, text_size=load_encoder("words").size)
+    guidance = GuidanceSettings(weight=20.0, clip=10.0, gradient="network", scaled=True, repeats=3)
+    settings = DiffusionSettings(steps=4, delay=2, text_weight=2.0, guidance=guidance)
+    asked = request()
+    two = replace(asked, states=np.stack([asked.states] * 2), actions=np.stack([asked.actions] * 2))
+    two = replace(seeded_with(two, 7), seeds=np.array([7, 8]))
+
+    def planned(settings: DiffusionSettings, engine: Engine | None = None) -> Array:
+        return Runtime(made, settings, ROBOT, speed_cost, engine).plan(two).actions
+
+    theirs = planned(settings, made.denoiser)  # autograd
+    unguided = planned(replace(settings, guidance=replace(guidance, weight=0.0)))
+    assert np.abs(theirs - unguided).max() > 0.01
+    for name in ("torch", "onnx", "openvino"):
+        assert np.abs(planned(replace(settings, engine=installed(name))) - theirs).max() < 1e-5
+
+
+@pytest.mark.slow
+def test_an_engine_without_a_gradient_through_the_network_says_so() -> None:
     guidance = GuidanceSettings(gradient="network")
-    with pytest.raises(ValueError, match="set engine: torch"):
-        DiffusionSettings(engine="onnx", guidance=guidance)
-    DiffusionSettings(engine="onnx", guidance=replace(guidance, weight=0.0))  # unguided
+    with pytest.raises(ValueError, match="set engine: torch or onnx or openvino"):
+        DiffusionSettings(engine="onnx-int8", guidance=guidance)
+    DiffusionSettings(engine="onnx-int8", guidance=replace(guidance, weight=0.0))  # unguided
     denoiser = model().denoiser
     states, *rest = window(denoiser.config, 1, shared=True)
-    with pytest.raises(RuntimeError, match="no gradient through the network"):
+    with pytest.raises(ConfigError, match="'onnx-int8' has no gradient"):
+        load_engine(installed("onnx-int8"), denoiser, gradient=True)
+    with pytest.raises(RuntimeError, match="without a gradient through the network"):
         load_engine(installed("onnx"), denoiser)(states.requires_grad_(), *rest)
 
 
@@ -212,7 +245,7 @@ def test_a_network_is_exported_once_and_a_damaged_file_again(monkeypatch: pytest
     assert not list(path.parent.glob("*.partial"))
     calls = []
 
-    def count(_: Denoiser) -> bytes:
+    def count(_: Denoiser, part: str) -> bytes:
         calls.append(1)
         return made
 
@@ -229,5 +262,5 @@ def test_a_network_is_exported_once_and_a_damaged_file_again(monkeypatch: pytest
 def test_a_cache_that_cannot_be_written_is_done_without(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "servoid").write_text("a file where the folder should be")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(export, "to_onnx", lambda denoiser: b"graph")
+    monkeypatch.setattr(export, "to_onnx", lambda denoiser, part: b"graph")
     assert export.exported(model().denoiser) == b"graph"

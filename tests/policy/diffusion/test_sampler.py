@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -217,6 +219,28 @@ def test_scaled_guidance_moves_the_mean_of_a_normal_distribution_to_where_theory
     guided, _ = sampler.sample(matrix, known, generators(2000), guidance)
     assert (plain - guided).mean().item() == pytest.approx(slope * deviation**2, rel=0.06)
     assert guided.std().item() == pytest.approx(deviation, rel=0.06)
+
+
+def test_actions_guided_by_the_networks_jacobian_go_where_theory_puts_them() -> None:
+    """Of a state and an action that vary together, exp(-c state) moves the action's mean by c times the covariance."""
+    both = torch.tensor([[1.0, 0.6], [0.6, 0.8]])
+
+    def predict(s: Tensor, a: Tensor, ks: Tensor, ka: Tensor) -> tuple[Tensor, Tensor]:
+        signal = SIGNAL[ks[0]]  # that of both: they are denoised together
+        noisy = torch.cat([s, a], -1)[:, 0]
+        clean = signal.sqrt() * noisy @ torch.linalg.inv(signal * both + (1 - signal) * torch.eye(2)) @ both
+        return clean[:, None, :1], clean[:, None, 1:]
+
+    def means(guidance: Guidance | None) -> Tensor:
+        sampler = Sampler(predict, cosine_signal(LEVELS))
+        parts = sampler.sample(full_sequence(LEVELS, 50, 1, 1), unknown(500), generators(500), guidance)
+        return torch.cat(parts, -1)[:, 0].mean(0)
+
+    guidance = Guidance(by_torch(lambda s: 0.8 * s.sum((1, 2))), 1.0, clip=100.0, gradient="network", scaled=True)
+    plain = means(None)
+    assert (plain - means(replace(guidance, actions=True))).tolist() == pytest.approx([0.8, 0.48], rel=0.06)
+    assert (plain - means(replace(guidance, actions=True, repeats=3))).tolist() == pytest.approx([0.8, 0.48], rel=0.06)
+    assert (plain - means(guidance))[1].item() < 0.4, "they follow the states, but not so far"
 
 
 def fixed(value: float, guidance: Guidance, tokens: int = 1) -> Tensor:

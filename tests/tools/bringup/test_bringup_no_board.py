@@ -43,6 +43,14 @@ def test_a_boards_imu_needs_a_board(tmp_path: Path) -> None:
         load_robot(without_board(tmp_path, "opencr"))
 
 
+def test_a_virtual_rig_has_the_imu_that_would_be_on_a_port_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    """It was said to send nothing, and its cable to be looked at."""
+    assert main(["bringup", "watch", "--port", "virtual", "--robot", "wren", "--seconds", "0.2"]) == 0
+    said = capsys.readouterr().out
+    assert "IMU: force" in said
+    assert "cable" not in said
+
+
 @pytest.mark.parametrize("verb", [["scan", "--baud", "2000000"], ["check"], ["off"], ["watch", "--seconds", "0.2"]])
 def test_bring_up_asks_no_board(
     robot: Path, verb: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]

@@ -6,9 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from servoid.hw.config import ConfigError
+from servoid.hw.config import ConfigError, load_yaml
+from servoid.hw.robot.description import load_robot
+from servoid.policy.references.gait import GaitSettings, gait_of
 from servoid.tools.cli import main
 from servoid.tools.common.output import check_writable
+from servoid.tools.robots import tune_gait
+from servoid.tools.robots.tune_gait import Walked
 
 
 @pytest.mark.parametrize("verb", ["gait", "kick"])
@@ -33,3 +37,11 @@ def test_looking_whether_a_file_can_be_written_changes_nothing(tmp_path: Path) -
     assert not list((tmp_path / "new").iterdir())
     with pytest.raises(ConfigError, match="Is a directory"):
         check_writable(tmp_path)
+
+
+def test_steps_by_which_every_walk_fell_are_not_written(tmp_path: Path) -> None:
+    robot, out = load_robot("wren"), tmp_path / "gait.yaml"
+    assert not tune_gait._write(out, robot, gait_of(robot), Walked(7.0, 1.0, 0.0))
+    assert not out.exists()
+    assert tune_gait._write(out, robot, gait_of(robot), Walked(6.0, 0.9, 0.2))
+    assert load_yaml(out, GaitSettings).cycle == pytest.approx(gait_of(robot).cycle, abs=1e-4)

@@ -29,10 +29,11 @@ EVERY = 5  # of this many plans one is made without guidance, too
 # Changes of `guidance`. All but the first are complete: what a file of settings says besides does not count.
 _PAPER: dict[str, Any] = {
     "gradient": "network", "weight": 3000.0, "clip": 20.0,
-    "scaled": False, "even": False, "limited": False, "repeats": 1,
+    "scaled": False, "even": False, "limited": False, "repeats": 1, "actions": False,
 }  # fmt: skip
 VARIANTS: dict[str, dict[str, Any]] = {
     "settings": {},
+    "actions": {"actions": True},
     "paper": _PAPER,
     "half-clip": _PAPER | {"clip": 10.0},
     "limited": _PAPER | {"limited": True},
