@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -34,6 +34,11 @@ class TaskState:
     joints: Array  # (n, n_joints) rad
     joint_velocity: Array  # (n, n_joints) rad/s
     objects: Array | None = None  # (n, objects, 7): m of the middle, and quaternion; None: the task has no things
+
+    def only(self, rows: slice) -> TaskState:
+        """Of these worlds, or ticks."""
+        parts: dict[str, Any] = {part.name: getattr(self, part.name) for part in fields(self)}
+        return TaskState(**{name: None if part is None else part[rows] for name, part in parts.items()})
 
 
 class LearnedTask(ABC):

@@ -49,7 +49,7 @@ class Carrying:
     def advance(self, rngs: list[np.random.Generator]) -> None:
         """Nothing changes within an episode."""
 
-    def told(self, state: State, truth: SimulatedTruth) -> Instruction:
+    def instruction(self, state: State, truth: SimulatedTruth) -> Instruction:
         """Where the boxes and their places are, now."""
         told = self._task.instruct(self._places, state)
         assert told.goal is not None

@@ -51,7 +51,7 @@ class Drilled(Protocol):
         """Episodes begin in the worlds `ids`."""
         ...
 
-    def told(self, state: State, truth: SimulatedTruth) -> Instruction:
+    def instruction(self, state: State, truth: SimulatedTruth) -> Instruction:
         """What whoever drives the worlds is told at a tick."""
         ...
 
@@ -153,7 +153,7 @@ class EpisodeCutter:
         self._script.advance(rngs)
         fleet.worlds.push(self._disturbances.push(rngs))
         command = self._script.velocity
-        target = self._policy.act(state, fleet.applied, self._script.told(state, fleet.truth))
+        target = self._policy.act(state, fleet.applied, self._script.instruction(state, fleet.truth))
         clean = fleet.step(target, self._disturbances.noise(rngs))
         worlds, at = np.arange(fleet.n), self._length
         values = {"observation.state": raw_row(state), "action": clean, "action_applied": fleet.applied}

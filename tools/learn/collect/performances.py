@@ -75,7 +75,7 @@ class Performances(BasePolicy):
         """How the next episodes of the worlds `where` begin: standing."""
         return None
 
-    def told(self, state: State, truth: SimulatedTruth) -> Instruction:
+    def instruction(self, state: State, truth: SimulatedTruth) -> Instruction:
         """What whoever drives the worlds is told."""
         return Instruction(self.velocity, lower=self.lower)
 
