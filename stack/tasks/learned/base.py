@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -37,8 +37,8 @@ class TaskState:
 
     def only(self, rows: slice) -> TaskState:
         """Of these worlds, or ticks."""
-        parts: dict[str, Any] = {part.name: getattr(self, part.name) for part in fields(self)}
-        return TaskState(**{name: None if part is None else part[rows] for name, part in parts.items()})
+        known = (part.name for part in fields(self) if getattr(self, part.name) is not None)
+        return TaskState(**{name: getattr(self, name)[rows] for name in known})
 
 
 class LearnedTask(ABC):
