@@ -60,7 +60,7 @@ def _expert(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[
 
 
 def _carrier(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
-    from servoid.stack.control.scripted.carrier import Carrier
+    from servoid.stack.control.carrier import Carrier
 
     policy: Policy = Carrier(robot, shape)
     return policy

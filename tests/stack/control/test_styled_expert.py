@@ -14,7 +14,7 @@ from servoid.hw.robot.description import load_robot
 from servoid.policy.references.gait import gait_of
 from servoid.policy.references.style import WalkingStyle, load_style
 from servoid.stack.control.fleet import Fleet
-from servoid.stack.control.scripted.styled import StyledExpert
+from servoid.stack.control.styled import StyledExpert
 
 ROBOT = load_robot()
 LEGS = ROBOT.leg_index.ravel()

@@ -12,7 +12,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import load_robot
 from servoid.policy.priors.goals import GOALS
-from servoid.stack.control.scripted.carrier import facing
+from servoid.stack.control.carrier import facing
 from servoid.stack.runtime.run import RunSettings
 from servoid.stack.tasks import load_task
 from servoid.stack.tasks.learned.carry import STANDS, Carry, seen_box

@@ -87,10 +87,10 @@ class FleetRecipe:
         from servoid.policy.references.style import load_style
         from servoid.sim.model import build
         from servoid.sim.worlds import Worlds
+        from servoid.stack.control.carrier import Carrier
         from servoid.stack.control.fleet import Fleet
         from servoid.stack.control.gait import GaitPolicy
-        from servoid.stack.control.scripted.carrier import Carrier
-        from servoid.stack.control.scripted.styled import StyledExpert
+        from servoid.stack.control.styled import StyledExpert
         from servoid.stack.control.tracker import ExpertPolicy
         from servoid.stack.estimation.odometry import load_odometry
         from servoid.stack.tasks.learned.carry import Carry

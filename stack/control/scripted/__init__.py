@@ -1,1 +1,0 @@
-"""The expert under a script that has the upper body do something else: a style, a box that is carried."""
