@@ -77,6 +77,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="share of the commands that ask for a walk lower than upright (default: 0)",
     )
     parser.add_argument(
+        "--velocity",
+        type=float,
+        nargs=3,
+        metavar=("FORWARD", "LEFT", "TURN"),
+        help="ask for this all the time, m/s and rad/s (default: what changes every few seconds)",
+    )
+    parser.add_argument(
         "--style", metavar="NAME|FILE", help="walk in this style, of configs/styles (default: as the expert walks)"
     )
     parser.add_argument("--carry", action="store_true", help="pick up boxes and bring them, by a script")
@@ -148,6 +155,8 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError("--style is how the expert walks upright: drop --skills, --crouched or --policy gait")
     if args.carry and (args.skills or args.crouched or args.style is not None or args.policy == "gait"):
         raise ConfigError("--carry is what a script does: drop --skills, --crouched, --style or --policy gait")
+    if args.velocity is not None and (args.skills or args.crouched or args.carry):
+        raise ConfigError("--velocity is of walks alone: drop --skills, --crouched or --carry")
     if args.only and not args.skills:
         raise ConfigError("--only names skills to perform: give --skills, too")
     if args.skills and args.policy == "gait":
@@ -187,6 +196,7 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
         style=args.style,
         only=tuple(args.only),
         carry=args.carry,
+        velocity=None if args.velocity is None else (args.velocity[0], args.velocity[1], args.velocity[2]),
         threads=args.threads or (1 if args.workers > 1 or args.ray is not None else 0),
     )
     performances, tally = how.performances(1), RecordingTally()

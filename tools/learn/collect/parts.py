@@ -42,6 +42,7 @@ class FleetRecipe:
     crouched: float = 0.0
     style: str | None = None
     carry: bool = False
+    velocity: tuple[float, float, float] | None = None  # that is asked all the time; None: those of the drills
     only: tuple[str, ...] = ()  # skills that are performed, without walks; none: all, and walks
 
     @property
@@ -112,7 +113,7 @@ class FleetRecipe:
             policy = GaitPolicy(robot, shape) if self.policy == "gait" else ExpertPolicy(robot, self.policy, shape)
         odometry = None if self.plain_odometry else load_odometry(robot)
         fleet = Fleet(robot, count, odometry, randomise=self.randomise, seed=seed, threads=self.threads)
-        script = script or Commands(robot, self.worlds, self.crouched)
+        script = script or Commands(robot, self.worlds, self.crouched, self.velocity)
         return EpisodeCutter(fleet, policy, self.disturbances, self.seconds, script)
 
 

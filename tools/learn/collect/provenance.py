@@ -61,6 +61,7 @@ def provenance(
         "style",
         "only",
         "carry",
+        "velocity",
         "parts",
     )
     options = {name: vars(args)[name] for name in names}

@@ -12,6 +12,7 @@ from servoid.hw.contracts.body import Array, Command, Mode
 from servoid.hw.contracts.world import Start
 from servoid.hw.geometry import turned, up_vector
 from servoid.hw.robot.description import Robot
+from servoid.hw.robot.legs import Legs
 from servoid.policy.motion.clip import Clip
 from servoid.policy.references.clip import ClipReference
 from servoid.sim.truth import SimulatedTruth
@@ -145,13 +146,16 @@ def falling(robot: Robot, n: int, seed: int) -> States:
 
 
 class AlongClip:
-    """Draws the states that episodes begin in: a `share` of them along the clip, as it really goes."""
+    """Draws the states that episodes begin in: a `share` of them along the clip, as it really goes; the others in its
+    first pose or, of a loop, standing at home."""
 
     def __init__(self, robot: Robot, clip: Clip, share: float, seed: int) -> None:
         """Rolls out bodies first. Raises ConfigError where a share is to begin along a clip that fails open loop."""
         self._share, self._states = share, None
-        joints = np.clip(clip.joints[:1], robot.lower, robot.upper)
-        self._first = joints, clip.root_orientation[:1]
+        joints, orientation = np.clip(clip.joints[:1], robot.lower, robot.upper), clip.root_orientation[:1]
+        if clip.about.loop:
+            joints, orientation = robot.home[None], Legs(robot).stand(robot.home[None])[1]
+        self._first = joints, orientation
         if share > 0.0:
             self._states = along(robot, [clip], _ROLLED_OUT, seed)
             if not len(self._states.joints):
