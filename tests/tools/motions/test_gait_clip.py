@@ -15,7 +15,7 @@ from servoid.policy.references.gait import gait_of
 from servoid.tools import cli
 from servoid.tools.learn.collect.skills import Commands
 from servoid.tools.learn.envs.starts import AlongClip
-from servoid.tools.motions.verbs.gait import cycle
+from servoid.tools.motions.verbs.derive.gait import cycle
 
 ROBOT = load_robot()
 
