@@ -64,7 +64,7 @@ def findings(robot: Robot) -> list[Comparison]:
         _balance(robot, model, data, joints),
         _load(robot, model, data, joints),
         _stiffness(robot, model, data, joints),
-        _steps(robot),
+        steps(robot),
     ]
     _put(model, data, joints, robot.home)
     at = {name: data.xanchor[model.joint(name).id].copy() for name in robot.names}
@@ -275,7 +275,7 @@ def _stiffness(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints:
     return Comparison(good, "stiffness at home", f"{times:.1f} times what it takes to stand{hint}")
 
 
-def _steps(robot: Robot) -> Comparison:
+def steps(robot: Robot) -> Comparison:
     """The gait's steps are within the joints' ranges."""
     gait, phase = Gait(robot), np.linspace(0.0, 1.0, 24, endpoint=False)
     velocity = np.broadcast_to(np.array([0.5, 0.0, 0.0]) * gait.upper, (24, 3))

@@ -12,8 +12,9 @@ from servoid.hw.robot.description import Robot
 from servoid.hw.robot.inverse import NumericInverse, stance_at_home
 from servoid.hw.robot.legs import Legs
 from servoid.sim.model import build
+from servoid.tools.robots.compare import steps
 
-_LOWER = 0.07  # of a leg's length that the base comes down: knees of equal halves bend by 0.75 rad
+_LOWERED = (0.07, 0.1, 0.13)  # of a leg's length that the base comes down: knees of equal halves bend by 0.75 to 1 rad
 _HIGHER = 0.02  # of it, that a leg reaches down further where its knee is bent already
 _REACHED = 0.25  # of that
 _ROUNDS = 4  # of shifting the feet under the centre of mass
@@ -21,9 +22,26 @@ _FLEX = 0.8  # rad of the knees from which a bent pose is looked for
 _EVEN = 0.1  # rad, of a range's middle, from which a knee has no side
 
 
-def bent_home(robot: Robot) -> Array | None:
-    """Joints `(n_joints,)` rad that stand lower than at home, soles level, the centre of mass above their middle; None
-    where the legs are bent already, or do not reach such a pose. Knees that bend to either side are given one."""
+def drafted_home(robot: Robot) -> Array | None:
+    """As `bent_home`, but bent as far as it takes for servos to follow the gait's steps."""
+    best = bent_home(robot)
+    for lowered in _LOWERED[1:]:
+        if best is None or steps(_at(robot, best)).good:
+            break
+        lower = bent_home(robot, lowered)
+        best = best if lower is None else lower
+    return best
+
+
+def _at(robot: Robot, pose: Array) -> Robot:
+    joints = (replace(joint, home=float(at)) for joint, at in zip(robot.joints, pose, strict=True))
+    return replace(robot, joints=tuple(joints))
+
+
+def bent_home(robot: Robot, lowered: float = _LOWERED[0]) -> Array | None:
+    """Joints `(n_joints,)` rad that stand lower than at home by `lowered` of a leg's length, soles level, the centre of
+    mass above their middle; None where legs are bent already, or do not reach such a pose. Knees that bend to either
+    side are given one."""
     legs = Legs(robot)
     at, turn, _, _ = legs.forward(legs.pick(robot.home))
     turn = _level(turn)
@@ -40,7 +58,7 @@ def bent_home(robot: Robot) -> Array | None:
     model = build(robot)
     data = mujoco.MjData(model)
     joints = [int(model.joint(name).qposadr[0]) for name in robot.names]
-    pose, goal = robot.home.copy(), at + _LOWER * down
+    pose, goal = robot.home.copy(), at + lowered * down
     for _ in range(_ROUNDS):
         pose[legs.index] = inverse(goal, turn)
         if misses(legs.pick(pose), goal):

@@ -57,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
         from servoid.sim.model import build
         from servoid.tools.robots.compare import overlaps
         from servoid.tools.robots.draft import Choices, draft
-        from servoid.tools.robots.home import bent_home
+        from servoid.tools.robots.home import drafted_home
         from servoid.tools.robots.pictures import poses
 
         out = args.out or Path(f"{args.model.stem}.yaml")
@@ -67,7 +67,7 @@ def main(args: argparse.Namespace) -> int:
         _write(found, out)
         robot, notes = load_robot(out), list(found.notes)
         if not found.posed:
-            home = bent_home(robot)
+            home = drafted_home(robot)
             if home is None:
                 notes.append(
                     "home of every joint: the model has no keyframe, and its zero angles were taken: legs are bent "

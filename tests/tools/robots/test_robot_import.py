@@ -77,7 +77,7 @@ def test_feet_that_are_turned_at_zero_are_found_whole_and_put_level(
     assert "home of every joint: the model has no keyframe; its knees were bent by geometry" in said["todo"]
     robot = load_robot(tmp_path / "tilted.yaml")
     assert [foot.geoms for foot in robot.feet.values()] == [tuple(f"{side}{i}" for i in range(4)) for side in "lr"]
-    assert {one.what for one in findings(robot) if not one.good} <= {"steps of the gait"}
+    assert [one.what for one in findings(robot) if not one.good] == []  # knees bent until servos can follow the steps
     straight = replace(robot, joints=tuple(replace(joint, home=max(0.0, joint.range[0])) for joint in robot.joints))
     look = {one.what: one.found for one in findings(straight) if not one.good}
     assert "leans ahead by 0.4" in look["trunk at home"]
