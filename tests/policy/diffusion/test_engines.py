@@ -186,7 +186,7 @@ def test_the_way_back_that_is_written_out_is_that_of_autograd(mask: str) -> None
 def test_a_plan_guided_through_the_network_is_that_of_autograd_with_every_engine_that_can() -> None:
     """As told, and beyond that by two windows; three steps a call, for two robots at once; in rad."""
     made = told_model(width=64, text_size=load_encoder("words").size)
-    guidance = GuidanceSettings(weight=100.0, clip=10.0, gradient="network", scaled=True, repeats=3)
+    guidance = GuidanceSettings(weight=100.0, clip=300.0, gradient="network", scaled=True, repeats=3)
     asked = request()
     two = replace(asked, states=np.stack([asked.states] * 2), actions=np.stack([asked.actions] * 2))
     two = replace(seeded_with(two, 7), seeds=np.array([7, 8]))
