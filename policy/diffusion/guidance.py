@@ -124,7 +124,9 @@ class Guidance:
 
     def _along(self, slope: Array, step: DenoisingStep) -> Array:
         """A gradient on clean states as a direction of noisy ones, with its share of the weight."""
-        along: Array = self._shared(slope) * (step.moving[:, None] * np.float32(min(self.weight / self.repeats, _LARGEST)))
+        along: Array = self._shared(slope) * (
+            step.moving[:, None] * np.float32(min(self.weight / self.repeats, _LARGEST))
+        )
         return along * (step.noise**2 / step.signal) if self.scaled else along
 
     @staticmethod
