@@ -21,6 +21,8 @@ from servoid.policy.features import recorded_names
 
 COLUMNS = ("observation.state", "action", "action_applied", "command", "episode_index", "frame_index")
 CLOCK = "clock"  # column of a recording of skills: s since the one that is told began
+BOX, PLACE = "box", "goal"  # columns of a recording of carrying: the thing, and where it shall be
+BOX_NAMES, PLACE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz"), ("x", "y")
 SKILLS_NOTE = "skills"  # beside it: their names, in the order of their tasks' numbers, which follow those of walking
 
 
@@ -40,6 +42,8 @@ class Recording:
     info: dict[str, Any]  # meta/info.json
     told: Array | None = None  # (rows,) int, number of the task; None: walks alone, told by their commands
     clock: Array | None = None  # (rows,) s since the skill began that is told, 0 of a walk
+    box: Array | None = None  # (rows, 7) a thing that is carried, as `Instruction.box` has it,
+    place: Array | None = None  # (rows, 2) m and where it shall be, heading frame
 
     @property
     def skills(self) -> tuple[str, ...]:
@@ -83,6 +87,9 @@ def read_recording(folder: Path, robot: Robot) -> Recording:
     columns_read: tuple[str, ...] = COLUMNS
     if skills := CLOCK in info.get("features", {}):
         sizes[CLOCK], columns_read = 1, (*COLUMNS, CLOCK, "task_index")
+    if carries := BOX in info.get("features", {}):
+        sizes |= {BOX: len(BOX_NAMES), PLACE: len(PLACE_NAMES)}
+        columns_read = (*columns_read, BOX, PLACE)
     parts: dict[str, list[Array]] = {name: [] for name in columns_read}
     for file in files:
         try:
@@ -122,4 +129,6 @@ def read_recording(folder: Path, robot: Robot) -> Recording:
         info=info,
         told=columns["task_index"] if skills else None,
         clock=columns[CLOCK][:, 0] if skills else None,
+        box=columns[BOX] if carries else None,
+        place=columns[PLACE] if carries else None,
     )

@@ -18,6 +18,7 @@ from servoid.stack import tasks
 from servoid.stack.control.policies import names as policies
 from servoid.stack.runtime.backends import BACKENDS
 from servoid.stack.tasks.learned import LEARNED_TASKS
+from servoid.stack.tasks.learned.clip import PREFIX
 from servoid.tools.cli import VERBS, Verb, main
 from servoid.tools.commands import rollout
 from servoid.tools.common.parser import Parser, settings
@@ -65,7 +66,7 @@ def look_up(args: Namespace, verb: Verb) -> None:
     """Names that are not placeholders must exist."""
     task = getattr(args, "task", None)
     if verb.module == "servoid.tools.learn.trainers.policy":
-        assert task in LEARNED_TASKS
+        assert task in LEARNED_TASKS or task.startswith(PREFIX)
     elif task and task != "TASK" and not is_file_reference(task):  # which its page writes, and its test runs
         given = settings(args) if hasattr(args, "set") else {}
         tasks.load_settings(task, given)

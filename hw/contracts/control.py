@@ -111,6 +111,9 @@ class Instruction:
     # Bars to pass under (n, 5): x, y m of the middle in the heading frame, rad of its direction there, half its length
     # and the height of its lower edge above the ground, m.
     bars: Array | None = None
+    # A thing to be carried to `goal` (..., 7): x, y, z m of its middle in the heading frame from below the base, and
+    # its quaternion there.
+    box: Array | None = None
     lower: Array | None = None  # (...) m that a gait shall go lower than it does; None: not at all
 
 

@@ -30,13 +30,14 @@ class Percept:
 
 @dataclass(frozen=True, slots=True)
 class SceneObject:
-    """A thing with a body of its own: a ball that rolls and a bag that stands and falls; or one that is fixed: a seat,
-    a bar that lies across the way at a height, or a target, a ball in the air that nothing bumps into.
+    """A thing with a body of its own: a ball that rolls, a bag that stands and falls and a box that hands can hold; or
+    one that is fixed: a seat, a bar that lies across the way at a height, or a target, a ball in the air that nothing
+    bumps into.
 
     Raises ValueError for a size or mass that no thing has.
     """
 
-    kind: Literal["ball", "bag", "seat", "bar", "target"]
+    kind: Literal["ball", "bag", "box", "seat", "bar", "target"]
     place: tuple[float, float]  # m, its middle, in the frame that the robot starts in
     size: tuple[float, float, float]  # m along its x, y and z; of a ball or target the first, its diameter
     mass: float = 0.0  # kg; of what is fixed it is not asked for
@@ -53,7 +54,7 @@ class SceneObject:
 
     @property
     def movable(self) -> bool:
-        return self.kind in ("ball", "bag")
+        return self.kind in ("ball", "bag", "box")
 
     @property
     def round(self) -> bool:

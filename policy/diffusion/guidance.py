@@ -16,6 +16,9 @@ from servoid.hw.contracts.body import Array
 # (states, actions, state levels, action levels) -> clean states, clean actions
 Predictor = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
+# The same, and also what takes a gradient on clean states to that on noisy ones, shaped alike
+Differentiator = Callable[..., tuple[Tensor, Tensor, Callable[[Array], Array]]]
+
 ANALYTIC = "analytic"
 NETWORK = "network"
 _LARGEST = 1e38
@@ -79,6 +82,7 @@ class Guidance:
     limited: bool = False
     repeats: int = 1
     actions: bool = False
+    differentiated: Differentiator | None = None  # of the predictor, for "network"; None: autograd's
 
     def __post_init__(self) -> None:
         if self.gradient not in (ANALYTIC, NETWORK):
@@ -96,18 +100,16 @@ class Guidance:
         """What a `network` predicts of a noisy window, guided: the states that `step` moves, and `moving_actions`
         `(action tokens,)` where actions are guided too. Raises Diverged."""
         through = self.gradient == NETWORK
-        with torch.set_grad_enabled(through):
-            source = states.detach().requires_grad_(through)
-            predicted, clean_actions = network(source, actions, *levels)
-        clean, along = predicted.detach().numpy(), np.zeros(states.shape, np.float32)
-        for again in reversed(range(self.repeats)):
+        if through:
+            predicted, clean_actions, back = (self.differentiated or by_autograd(network))(states, actions, *levels)
+        else:
+            predicted, clean_actions = network(states, actions, *levels)
+        clean, along = predicted.numpy(), np.zeros(states.shape, np.float32)
+        for _ in range(self.repeats):
             cost, slope = self.slope(clean)
             if not np.isfinite(cost).all():  # its slope may be finite all the same, but leads nowhere
                 raise Diverged("the guidance cost is not finite on this trajectory; check the task's cost")
-            gradient = slope
-            if through:
-                pulled = torch.from_numpy(slope)
-                gradient = torch.autograd.grad(predicted, source, pulled, retain_graph=again > 0)[0].numpy()
+            gradient = back(slope) if through else slope
             if self.scaled:
                 gradient = gradient * (step.noise**2 / step.signal if through else step.noise**2)
             moved, share = self.step(gradient, step.moving)
@@ -115,14 +117,16 @@ class Guidance:
             clean = clean - part * moved
             if self.actions:
                 along += part * share * self._along(slope, step)
-        acted = clean_actions.detach().numpy()
+        acted = clean_actions.numpy()
         if self.actions and moving_actions is not None:
             acted = acted - moving_actions[:, None] * self._change(network, states, actions, levels, along, acted)
         return clean, acted
 
     def _along(self, slope: Array, step: DenoisingStep) -> Array:
         """A gradient on clean states as a direction of noisy ones, with its share of the weight."""
-        along: Array = slope * (step.moving[:, None] * np.float32(min(self.weight / self.repeats, _LARGEST)))
+        along: Array = self._shared(slope) * (
+            step.moving[:, None] * np.float32(min(self.weight / self.repeats, _LARGEST))
+        )
         return along * (step.noise**2 / step.signal) if self.scaled else along
 
     @staticmethod
@@ -136,6 +140,12 @@ class Guidance:
             there = network(states + torch.from_numpy(along * reach), actions, *levels)[1].numpy()
         change: Array = (there - acted) / reach
         return change
+
+    def _shared(self, gradient: Array) -> Array:
+        """Of neighbours that are samples of one window, the mean for each."""
+        if self.samples == 1:
+            return gradient
+        return np.repeat(gradient.reshape(-1, self.samples, *gradient.shape[1:]).mean(1), self.samples, 0)
 
     def _limited(self, step: Array, slope: Array, cost: Array) -> Array | float:
         """How much of a step, `(batch, 1, 1)`, leads to where a `cost` `(batch,)` with this `slope` would be zero."""
@@ -151,9 +161,7 @@ class Guidance:
         if self.even:
             size = np.linalg.norm(gradient, axis=2, keepdims=True)
             gradient = gradient * (size[:, moving].mean(1, keepdims=True) / np.maximum(size, 1e-12))
-        if self.samples > 1:
-            mean = gradient.reshape(-1, self.samples, *gradient.shape[1:]).mean(1)
-            gradient = np.repeat(mean, self.samples, 0)
+        gradient = self._shared(gradient)
         # What does not move uses nothing of the step up; weights are beyond all bounds before float32 is.
         step = gradient * (moving[:, None] * np.float32(min(self.weight / self.repeats, _LARGEST)))
         flat = step.reshape(len(step), -1)
@@ -166,6 +174,25 @@ class Guidance:
             )
         share = np.minimum(self.clip / self.repeats / np.maximum(norm, 1e-12), 1.0).astype(step.dtype)[:, None, None]
         return step * share, share
+
+
+def by_autograd(network: Predictor) -> Differentiator:
+    """A predictor and its gradient on noisy states, by torch."""
+
+    def differentiated(states: Tensor, *others: Tensor) -> tuple[Tensor, Tensor, Callable[[Array], Array]]:
+        with torch.enable_grad():
+            source = states.detach().requires_grad_()
+            predicted, clean_actions = network(source, *others)
+
+        def back(pull: Array) -> Array:
+            gradient: Array = torch.autograd.grad(predicted, source, torch.from_numpy(pull), retain_graph=True)[
+                0
+            ].numpy()
+            return gradient
+
+        return predicted.detach(), clean_actions.detach(), back
+
+    return differentiated
 
 
 def classifier_free(denoise: Callable[..., tuple[Tensor, Tensor]], text: Tensor | None, weight: float) -> Predictor:

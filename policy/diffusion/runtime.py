@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,8 @@ from servoid.hw.contracts.control import Instruction, Plan, PlanRequest
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import resolve
 from servoid.policy.diffusion.engines import Engine, load_engine
-from servoid.policy.diffusion.guidance import NETWORK, Diverged, Guidance, classifier_free
+from servoid.policy.diffusion.engines.differentiable import Differentiable
+from servoid.policy.diffusion.guidance import NETWORK, Differentiator, Diverged, Guidance, classifier_free
 from servoid.policy.diffusion.keyframes import imputation, keyframe_tokens
 from servoid.policy.diffusion.model.checkpoint import Model, load
 from servoid.policy.diffusion.rolling import Previous, clean_start, frame_noise, renoise, seeded
@@ -143,13 +144,10 @@ class Runtime:
             known = self.known(states, actions, instruction)
             matrix, start = self._start(keys, states[:, -1], previous)
             text = self._text(instruction, len(states))
-            predict = classifier_free(
-                self.engine,
-                text if text is None or n == 1 else text.repeat_interleave(n, 0),
-                self.settings.text_weight,
-            )
+            text = text if text is None or n == 1 else text.repeat_interleave(n, 0)
+            predict = classifier_free(self.engine, text, self.settings.text_weight)
             sampler = Sampler(predict, self._signal, self.settings.eta, self.settings.stabilization_level)
-            guidance = self._guidance(_repeat(instruction, n))
+            guidance = self._guidance(_repeat(instruction, n), text)
             drawn = start is None or self.settings.eta > 0
             clean = sampler.sample(matrix, known, [seeded(*key) for key in keys if drawn], guidance, start)
             reach = [np.abs(x.numpy()).max(initial=0.0, where=used) for x, used in zip(clean, self._used, strict=True)]
@@ -268,7 +266,7 @@ class Runtime:
         since = np.zeros(batch) if instruction.since is None else np.broadcast_to(instruction.since, batch)
         return torch.cat([codes, torch.from_numpy(clock_code(since, waves))], 1)
 
-    def _guidance(self, instruction: Instruction) -> Guidance | None:
+    def _guidance(self, instruction: Instruction, text: Tensor | None) -> Guidance | None:
         if (cost := self.cost) is None:
             return None
         history, (matrix, offset) = self.model.config.history, self._decoding
@@ -285,6 +283,13 @@ class Runtime:
 
         chosen = self.settings.guidance
         shared = self.samples if chosen.choose == "mean" else 1
+        differentiated: Differentiator | None = None
+        if (
+            self._through
+            and isinstance(self.engine, Differentiable)
+            and (text is None or self.settings.text_weight == 1)
+        ):
+            differentiated = partial(self.engine.differentiated, text=text)
         return Guidance(
             slope,
             chosen.weight,
@@ -296,6 +301,7 @@ class Runtime:
             limited=chosen.limited,
             repeats=chosen.repeats,
             actions=chosen.actions,
+            differentiated=differentiated,
         )
 
 

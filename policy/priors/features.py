@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.geometry import rotate
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.limbs import Limbs
 from servoid.hw.robot.mirror import Mirror
@@ -22,10 +23,10 @@ SMALLEST_SHARE = 0.2  # of the deviation of its field that a feature's deviation
 
 
 class PriorFeatures:
-    """Features of a robot with these limbs."""
+    """Features of a robot with these limbs, and of a `box` that it carries: what interacts is one motion (SMP, 8.3)."""
 
-    def __init__(self, robot: Robot, limbs: Limbs) -> None:
-        self.robot, self.limbs = robot, limbs
+    def __init__(self, robot: Robot, limbs: Limbs, box: bool = False) -> None:
+        self.robot, self.limbs, self.box = robot, limbs, box
         n = len(robot.joints)
         self.layout = Layout(
             (
@@ -35,6 +36,7 @@ class PriorFeatures:
                 ("gravity", 3),  # unit vector, base frame
                 ("position", n),  # rad
                 ("ends", limbs.size),  # m, base frame
+                *([("box", 9)] if box else []),  # m from below the base, and its x and z axes; the frame's own heading
             )
         )
         self._raw = raw_layout(n)
@@ -44,7 +46,8 @@ class PriorFeatures:
         """Of a frame's features."""
         joints = Mirror.joints(self.robot)
         root = Mirror.VECTOR, Mirror.ROTATION, Mirror.SCALAR, Mirror.VECTOR
-        return Mirror.join(*root, joints, self.limbs.mirror(joints))
+        box = [Mirror.VECTOR] * 3 if self.box else []
+        return Mirror.join(*root, joints, self.limbs.mirror(joints), *box)
 
     @cached_property
     def lower(self) -> Array:
@@ -58,11 +61,21 @@ class PriorFeatures:
         mask[self.layout.slice("ends")] = np.repeat(ends, 3)
         return mask
 
-    def of(self, raw: Array) -> tuple[Array, Array]:
-        """Features `(..., size)` float32 of raw rows, each seen from its own heading; and their yaw `(...)` rad."""
+    def of(self, raw: Array, box: Array | None = None) -> tuple[Array, Array]:
+        """Features `(..., size)` float32 of raw rows, each seen from its own heading; and their yaw `(...)` rad.
+
+        `box` `(..., 7)` is as `Instruction.box`. Raises ValueError where it is lacking.
+        """
+        if self.box and box is None:
+            raise ValueError("these features are of a robot and a box, and there is none")
         row = self._raw.split(raw)
         parts = [row["velocity"], row["angular_velocity"], row["displacement"][..., 2:], row["gravity"]]
-        frames = np.concatenate([*parts, row["position"], self.limbs.ends(row["position"])], -1)
+        if self.box and box is not None:
+            axes = [rotate(box[..., 3:], np.broadcast_to(axis, box[..., :3].shape)) for axis in np.eye(3)[[0, 2]]]
+            held = [box[..., :3], *axes]
+        else:
+            held = []
+        frames = np.concatenate([*parts, row["position"], self.limbs.ends(row["position"]), *held], -1)
         return frames.astype(np.float32), row["yaw"][..., 0]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction
+from servoid.hw.geometry import rotate
 from servoid.hw.robot.description import Walking
 from servoid.hw.robot.mirror import Mirror
 
@@ -17,6 +18,8 @@ AHEAD = 1.0  # s of turning that an instruction which gives a yaw rate asks to f
 FARTHEST = 1.0  # m: no ball is nearer, where there is none
 BESIDE = 1.8  # of the height of the base: as far from the way of a ball, none hits
 FACED = 0.4  # of the height of the base, by which a side may be farther that is faced
+_AXES = np.eye(3)[[0, 2]]
+_HAND, _HELD = 0.66, 0.4  # of the height of the base: a box is taken so far ahead, and is held from that height on
 STOPPED = 0.05  # m/s of a ball that goes nowhere, or was not seen for long enough to know
 SLOWING = 0.3  # m from a place within which the velocity that leads to it is less than the top speed
 TURNING = (0.05, 0.2)  # m from a place: nearer than the first it is not faced, from the second on wholly
@@ -95,6 +98,25 @@ def _ball(instruction: Instruction, walking: Walking) -> Array:
     return np.concatenate([beside, place, way / walking.forward], -1)
 
 
+def _box(instruction: Instruction, walking: Walking) -> Array:
+    """The way that leads to where a box can be taken or, where it is held, to where it shall be, as `_location` sees
+    one; then the place of the box and its x and z axes, and its place to be, in the heading frame `(..., 15)`.
+    Raises ConfigError where the task has no box."""
+    if instruction.stand:  # where nobody says any more where a box is: as if it were held, where it shall be
+        shape, ahead = np.shape(instruction.velocity)[:-1], _HAND * walking.height
+        seen = [1.0, 0.0, ahead, 0.0, walking.height, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, ahead, 0.0]
+        return np.broadcast_to([0.0, 0.0, *seen], (*shape, 15))
+    if instruction.box is None or instruction.goal is None:
+        raise ConfigError("this policy carries a box to a place, and the task gives none: run carry")
+    box, goal = np.asarray(instruction.box, float), np.asarray(instruction.goal, float)
+    place, (x, z) = box[..., :3], (rotate(box[..., 3:], np.broadcast_to(axis, box[..., :3].shape)) for axis in _AXES)
+    x = x * np.where(x[..., :1] < 0.0, -1.0, 1.0)  # either side of it is as good
+    held = place[..., 2:] > walking.height * _HELD
+    way = np.where(held, goal - place[..., :2], place[..., :2] - _HAND * walking.height * x[..., :2])
+    leads = _location(Instruction(instruction.velocity, goal=way), walking)
+    return np.concatenate([leads, place, x, z, goal], -1)
+
+
 def nothing(instruction: Instruction, walking: Walking) -> Array:
     """No numbers `(..., 0)`: what is asked is always the same."""
     return np.zeros((*np.shape(instruction.velocity)[:-1], 0))
@@ -107,6 +129,13 @@ GOALS: Mapping[str, SeenGoal] = {
         SeenGoal("steering", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _steering, velocity=True),
         SeenGoal("location", 4, Mirror.join(Mirror.PLANAR, Mirror.PLANAR), _location),
         SeenGoal("ball", 8, Mirror.join(*[Mirror.PLANAR] * 4), _ball, begins_as=("location", "steering")),
+        SeenGoal(
+            "box",
+            15,
+            Mirror.join(Mirror.PLANAR, Mirror.PLANAR, *[Mirror.VECTOR] * 3, Mirror.PLANAR),
+            _box,
+            begins_as=("location", "steering"),
+        ),
         SeenGoal("stand", 0, Mirror(np.zeros(0, int), np.zeros(0, np.float32)), nothing, odometry=False),
     )
 }

@@ -13,11 +13,12 @@ from servoid.hw.contracts.world import SceneObject
 
 COLOURS = {
     "ball": (0.95, 0.55, 0.10, 1.0), "bag": (0.35, 0.30, 0.65, 1.0), "seat": (0.55, 0.42, 0.32, 1.0),
-    "bar": (0.80, 0.20, 0.20, 1.0), "target": (0.15, 0.65, 0.30, 0.8),
+    "bar": (0.80, 0.20, 0.20, 1.0), "box": (0.76, 0.60, 0.40, 1.0), "target": (0.15, 0.65, 0.30, 0.8),
 }  # fmt: skip
 POSE, RATE = 7, 6  # numbers of a free body's pose and velocity
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _PLATE = 0.03  # m, of a seat
+_GRIP = (1.0, 0.01, 0.0001)  # sliding, and m of turning about the contact's normal, as of a pad of 15 mm
 _ROLLING = 0.0005  # m: a ball of 0.07 m slows down by 0.1 m/s2
 
 
@@ -49,6 +50,8 @@ def add_object(model: mujoco.MjSpec, name: str, thing: SceneObject) -> None:
     more: dict[str, Any] = {"mass": thing.mass} if thing.movable else {}
     if thing.kind == "ball":  # rolling friction counts in contacts of six dimensions, and against the floor's own
         more |= {"condim": 6, "priority": 2, "friction": [0.8, 0.005, _ROLLING]}
+    if thing.kind == "box":  # between soft hands, which stick rather than slip; stiff, or it would creep out of them
+        more |= {"condim": 4, "priority": 2, "friction": list(_GRIP), "solimp": [0.98, 0.999, 0.001, 0.5, 2.0]}
     if thing.movable:
         body.add_freejoint(name=name)
     meets = int(thing.kind != "target")

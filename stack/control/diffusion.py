@@ -30,7 +30,7 @@ from servoid.policy.features import raw_row
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.control.planning.plan_buffer import History, Pace, PlanBuffer
 from servoid.stack.control.planning.planner import Answer, InlinePlanner, Planner, ProcessPlanner
-from servoid.stack.control.trim import Trim
+from servoid.stack.control.planning.trim import Trim
 from servoid.stack.safety.min_jerk import MinJerk
 from servoid.stack.tasks.terms.guidance import Stopping
 

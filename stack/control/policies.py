@@ -59,6 +59,13 @@ def _expert(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[
     return policy
 
 
+def _carrier(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
+    from servoid.stack.control.carrier import Carrier
+
+    policy: Policy = Carrier(robot, shape)
+    return policy
+
+
 def _gait(source: str, robot: Robot, task: Task, realtime: bool, shape: tuple[int, ...]) -> Policy:
     from servoid.stack.control.gait import GaitPolicy
 
@@ -113,6 +120,7 @@ def _loop_settings(source: str) -> ClosedLoopSettings:
 
 # Policies of Servoid's own; besides there are the planner's other settings in configs/policies/.
 POLICIES: dict[str, Maker] = {
+    "carrier": _carrier,
     "diffusion": _diffusion,
     "dodgeball": _task_policy,
     "expert": _expert,

@@ -20,6 +20,8 @@ from servoid.stack.tasks.cross import Cross
 from servoid.stack.tasks.forest import Forest
 from servoid.stack.tasks.goal import Goal
 from servoid.stack.tasks.inbetween import Inbetween
+from servoid.stack.tasks.learned.carry_run import RunCarry
+from servoid.stack.tasks.learned.clip_run import RunClip
 from servoid.stack.tasks.learned.run import RunDodgeball, RunLocation, RunSpeed, RunSteering
 from servoid.stack.tasks.obstacle import Obstacle
 from servoid.stack.tasks.path import Path
@@ -48,7 +50,8 @@ class TaskEntry:
 
 _CLASSES: tuple[type[BaseTask], ...] = (
     Stand, Walk, Goal, Velocity, Path, Forest, Obstacle, Cross, ReachHand, CrouchUnder, Inbetween, Survive, Text, Steer,
-    PerformSkills, Kick, LieAndStand, Story, RunSpeed, RunSteering, RunLocation, RunDodgeball,
+    PerformSkills, Kick, LieAndStand, Story, RunSpeed, RunSteering, RunLocation, RunDodgeball, RunClip,
+    RunCarry,
 )  # fmt: skip
 _OWN: dict[str, TaskEntry] = {
     **{cls.name: TaskEntry(cls.name, cls, cls.description) for cls in _CLASSES},

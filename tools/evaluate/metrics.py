@@ -100,6 +100,7 @@ METRICS: dict[str, Metric] = {
     "cadence": Metric("cadence", "of the data's"),
     "style": Metric("style", "of its windows"),
     "hit": Metric("hit", share=True, lower=True),
+    "clip_error": Metric("clip_error_m", "m", lower=True),
     "ticks": Metric("ticks", "ticks", unfinished="whole"),
     "velocity_error": Metric("velocity_error_mps", "m/s", lower=True, unfinished="whole"),
     "seconds_to_goal": Metric("seconds_to_goal", "s", lower=True, unfinished="left out"),

@@ -21,17 +21,20 @@ from servoid.tools.learn.progress import counted
 
 AHEAD_SECONDS = (0.48, 2.0)  # how far ahead what came to pass is taken for what was asked
 _BATCH = 512
+_BOX_MIRROR = Mirror(np.arange(7), np.array([1, -1, 1, 1, -1, 1, -1], np.float32))  # of a place and a quaternion
 _RATE = 1e-3  # learning rate at the start
 _EPS = 1e-2  # added to the deviation of inputs, as rsl-rl's normaliser adds it
 
 
 def demonstrated(
-    recording: Recording, robot: Robot, goal: SeenGoal, stride: int, rng: np.random.Generator
+    recording: Recording, robot: Robot, goal: SeenGoal, stride: int, rng: np.random.Generator, mirrored: bool = True
 ) -> tuple[Array, Array]:
-    """Observations `(n, size)` and joint targets `(n, n_joints)` rad at the decisions of a recording and in a mirror.
+    """Observations `(n, size)` and joint targets `(n, n_joints)` rad at the decisions of a recording and, where
+    `mirrored`, in a mirror.
 
     Each is given as a goal what the episode then did, over a time drawn from `AHEAD_SECONDS`: the mean velocity, the
-    way it faced, the place where it was. Raises DatasetError where no episode is long enough.
+    way it faced, the place where it was; or what it was told, where that is a box and its place. Raises DatasetError
+    where no episode is long enough.
     """
     mirror, joints, rows, seen = raw_mirror(robot), Mirror.joints(robot), [], []
     n = len(recording.raw)
@@ -39,13 +42,19 @@ def demonstrated(
     raw = np.concatenate([recording.raw, mirror(recording.raw)])
     applied = np.concatenate([recording.applied, joints(recording.applied)])
     wanted = np.concatenate([recording.action, joints(recording.action)])
+    carried = _told(recording)
     targets = []
-    for first, end in [*recording.spans, *(recording.spans + n)]:
+    for first, end in [*recording.spans, *(recording.spans + n)][: (1 + mirrored) * len(recording.spans)]:
         decided = np.arange(1, end - first - round(AHEAD_SECONDS[0] * robot.rate), stride)
         if not len(decided):
             continue
         rows.append(first + decided)
-        seen.append(goal.observe(_hindsight(raw[first:end], decided, robot, rng), robot.walking))
+        if carried is None:
+            asked = _hindsight(raw[first:end], decided, robot, rng)
+        else:
+            box, place = (x[first + decided] for x in carried)
+            asked = Instruction(np.zeros((len(decided), 3)), goal=place, box=box)
+        seen.append(goal.observe(asked, robot.walking))
         # What was decided at each tick that the decision lasts: held for as long, it is late by half of that.
         lasting = np.minimum(decided[:, None] + np.arange(stride), end - first - 1)
         targets.append(wanted[first:end][lasting].mean(1))
@@ -57,6 +66,14 @@ def demonstrated(
     goals = np.stack([np.concatenate([x, np.repeat(x[-1:], last - len(x), 0)]) for x in seen])
     found = np.stack([observe.of_rows(raw[at[:, i]], applied[at[:, i] - 1], goals[:, i]) for i in range(last)], 1)
     return np.concatenate([found[i, : len(row)] for i, row in enumerate(rows)]), np.concatenate(targets)
+
+
+def _told(recording: Recording) -> tuple[Array, Array] | None:
+    """Poses of the box and places for it, and their mirror images after them; None of a recording without one."""
+    if recording.box is None or recording.place is None:
+        return None
+    box, place = _BOX_MIRROR(recording.box), Mirror.PLANAR(recording.place)
+    return np.concatenate([recording.box, box]), np.concatenate([recording.place, place])
 
 
 def _hindsight(raw: Array, rows: Array, robot: Robot, rng: np.random.Generator) -> Instruction:
@@ -78,10 +95,10 @@ class Mirrors:
 
 
 def cloned(
-    observations: Array, actions: Array, mirrors: Mirrors, hidden: tuple[int, ...], steps: int, seed: int
+    observations: Array, actions: Array, mirrors: Mirrors | None, hidden: tuple[int, ...], steps: int, seed: int
 ) -> Mlp:
-    """A network with so many `hidden` units, trained on the squared error of actions `(n, action_size)`, and to decide
-    in a mirror what it decides: PPO on mirrored samples made one that did not worse."""
+    """A network with so many `hidden` units, trained on the squared error of actions `(n, action_size)`, and, with
+    `mirrors`, to decide in a mirror what it decides: PPO on mirrored samples made one that did not worse."""
     import torch
     from torch import nn
 
@@ -97,9 +114,12 @@ def cloned(
         for group in optimiser.param_groups:
             group["lr"] = _RATE * (1.0 - 0.98 * step / steps)
         pick = torch.randint(len(x), (_BATCH,), generator=generator)
-        both = torch.cat([x[pick], mirrors.seen(x[pick])])
-        done, mirrored = network((both - centre) / scale).chunk(2)
-        loss = (done - y[pick]).square().mean() + (mirrored - mirrors.decided(done)).square().mean()
+        if mirrors is None:
+            loss = (network((x[pick] - centre) / scale) - y[pick]).square().mean()
+        else:
+            both = torch.cat([x[pick], mirrors.seen(x[pick])])
+            done, mirrored = network((both - centre) / scale).chunk(2)
+            loss = (done - y[pick]).square().mean() + (mirrored - mirrors.decided(done)).square().mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()

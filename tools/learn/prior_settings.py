@@ -45,6 +45,7 @@ class PriorTraining(DecayedOptimiser, PriorShape, StepRun):
     unstyled: Annotated[float, "share of windows that are shown without their style, for guidance"] = 0.1
     standing: Annotated[bool, "learn from windows in which the robot was asked to stand, too"] = False
     seconds: Annotated[float, "how much of the data is learned from [s], what is measured on not counted; 0: all"] = 0.0
+    mirrored: Annotated[bool, "learn from the data's mirror image, too: not of a clip that has a side"] = True
     licence: Annotated[str, "licence of the data, kept in the checkpoint"] = "Apache-2.0"
 
     def __post_init__(self) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from servoid.hw.contracts.body import Array
 from servoid.policy.diffusion.engines import Engine
 
 # The call of a Denoiser -> clean states, clean actions, and what the way back needs, whatever it is
@@ -31,6 +32,12 @@ class Differentiable:
             return self.engine(states, *others, **text)
         clean: tuple[Tensor, Tensor] = _Passes.apply(states, self, others, text)  # type: ignore[no-untyped-call]
         return clean
+
+    def differentiated(self, *inputs: Tensor, **text: Any) -> tuple[Tensor, Tensor, Callable[[Array], Array]]:
+        """Clean states and actions, and what takes a gradient on clean states to that on noisy ones: without autograd,
+        whose own work is a tenth of a plan."""
+        states, actions, kept = self.passes[0](*inputs, **text)
+        return states, actions, lambda pull: self.passes[1](torch.from_numpy(pull), kept).numpy()
 
 
 class _Passes(torch.autograd.Function):

@@ -20,6 +20,7 @@ from torch.nn import functional
 from servoid.hw.contracts.body import Array
 from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.priors.adversarial.memory import Memory
 from servoid.policy.priors.score_matching.model import Prior
 from servoid.policy.priors.score_matching.windows import PriorWindows
 
@@ -28,7 +29,6 @@ _HIDDEN = (256, 128)
 _RATE, _DECAY = 2.5e-4, 1e-4  # of AdamW
 _GRADIENT_PENALTY, _LOGIT_PENALTY = 5.0, 0.01
 _SCALE = 2.0  # of the reward
-_MEMORY = 200_000  # windows of the policy
 _BATCH, _STEPS = 256, 4  # of an update
 _SMALLEST = 1e-4
 
@@ -66,20 +66,14 @@ class Adversary:
         self.discriminator, self._data = discriminator, data
         self._optimiser = torch.optim.AdamW(discriminator.parameters(), _RATE, weight_decay=_DECAY)
         self._generator = torch.Generator().manual_seed(seed)
-        self._memory: list[Tensor] = []  # of the policy's windows, oldest first
-
-    def see(self, windows: Tensor) -> None:
-        """Remember what the policy did."""
-        self._memory.append(windows.clone())
-        while sum(map(len, self._memory[1:])) >= _MEMORY:
-            del self._memory[0]
+        self.memory = Memory()
 
     def learn(self) -> dict[str, float]:
         """A few steps; returns how often it tells the data's windows, and the policy's."""
-        memory = torch.cat(self._memory)
+        memory = self.memory.windows
         found: list[tuple[float, float]] = []
         for _ in range(_STEPS):
-            mine = memory[torch.randint(len(memory), (_BATCH,), generator=self._generator)]
+            mine = Memory.drawn(memory, _BATCH, self._generator)
             real, _ = self._data.draw(_BATCH, self._generator)
             real = (real * self._data.std + self._data.mean).requires_grad_()
             of_data, of_policy = self.discriminator(real), self.discriminator(mine)

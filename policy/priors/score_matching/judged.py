@@ -20,12 +20,12 @@ def manner_of(raw: Array, prior: Prior, style: Style | None = None) -> dict[str,
     `beside` says of its joints at its mean speed, which means something where one speed was asked for all the time;
     of a policy with a `style`, how often that is what it shows.
 
-    Empty for a run too short to tell.
+    Empty for a run too short to tell, and for a prior of carrying: a run's estimates do not tell where a box was.
     """
     config, robot = prior.config, prior.features.robot
     span, first = (config.frames - 1) * config.stride, round(SETTLED * robot.rate)
     last = np.arange(max(first, span), len(raw), config.stride)
-    if not len(last):
+    if not len(last) or prior.features.box:
         return {}
     frames, yaw = prior.features.of(raw)
     rows = last[:, None] + np.arange(-config.frames + 1, 1) * config.stride

@@ -121,6 +121,7 @@ def save_prior(path: Path, trained: TrainedPrior, origin: Origin) -> None:
         **vars(origin),
         prior_layout=features.layout.to_header(),
         limbs=features.limbs.to_header(),
+        box=features.box,
         manner=dict(trained.manner),
     )
     tensors = {f"network.{k}": v.detach().float().cpu().numpy() for k, v in trained.weights.items()}
@@ -145,7 +146,7 @@ def load_prior(path: Path, robot: Robot, limbs: Limbs | None = None) -> Prior:
         )
     try:
         theirs = Limbs.from_header(head["limbs"])
-        features = PriorFeatures(robot, theirs)
+        features = PriorFeatures(robot, theirs, head.get("box", False))
         checkpoint.check_layout(path, "prior", head["prior_layout"], features.layout.to_header())
         config = PriorConfig.from_header(head["config"])
         network = PriorNetwork(config)

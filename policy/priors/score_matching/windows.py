@@ -22,22 +22,22 @@ class PriorWindows:
 
     def __init__(
         self, recordings: Mapping[str, Recording], features: PriorFeatures, config: PriorConfig, standing: bool = False,
-        seconds: float = 0.0,
+        seconds: float = 0.0, mirrored: bool = True,
     ) -> None:  # fmt: skip
         """`recordings` by style; those of one that has none are under an empty name.
 
         With `standing` False, windows in which the robot was asked to stand throughout are left out. Of each style so
-        many `seconds` are learned from, 0 being all; those that are held out stay the same. Raises DatasetError where
-        nothing is left to train on.
+        many `seconds` are learned from, 0 being all; those that are held out stay the same. Half of the windows are
+        `mirrored`, or none. Raises DatasetError where nothing is left to train on.
         """
-        self.config, self.features = config, features
+        self.config, self.features, self._sides = config, features, 2 if mirrored else 1
         span = (config.frames - 1) * config.stride
         frames, yaws, styles = [], [], []
         training: list[Array] = []
         validation: list[Array] = []
         start = 0
         for style, recording in recordings.items():
-            rows, yaw = features.of(recording.raw)
+            rows, yaw = features.of(recording.raw, recording.box)
             frames.append(rows)
             yaws.append(yaw)
             presents = _presents(recording, span, standing)
@@ -67,7 +67,7 @@ class PriorWindows:
         self._back = torch.arange(-config.frames + 1, 1) * config.stride
         generator = torch.Generator().manual_seed(0)
         pick = self.training[torch.randint(len(self.training), (_MEASURED,), generator=generator)]
-        seen = torch.cat([self._gather(pick, torch.full((len(pick),), side)) for side in (False, True)])
+        seen = torch.cat([self._gather(pick, torch.full((len(pick),), side)) for side in (False, True)[: self._sides]])
         mean, std = deviations(seen.reshape(-1, config.size).numpy(), features.layout)
         self.mean, self.std = torch.from_numpy(mean), torch.from_numpy(std)
 
@@ -77,16 +77,19 @@ class PriorWindows:
         return torch.where(mirrored[:, None, None], self.features.mirror(windows), windows)
 
     def draw(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Normalised windows `(batch, frames, size)`, half of them mirrored by chance, and their styles `(batch,)`."""
+        """Normalised windows `(batch, frames, size)`, half of them mirrored by chance where any are, and their styles
+        `(batch,)`."""
         last = self.training[torch.randint(len(self.training), (batch,), generator=generator)]
-        mirrored = torch.rand(batch, generator=generator) < 0.5
+        mirrored = torch.rand(batch, generator=generator) < 0.5 * (self._sides - 1)
         return (self._gather(last, mirrored) - self.mean) / self.std, self._styles[last]
 
     def held_out(self, count: int) -> tuple[Tensor, Tensor]:
         """Up to `count` normalised windows that were not trained on, the same every time, and their styles."""
         pick = torch.linspace(0, len(self.validation) - 1, min(count, len(self.validation))).long()
         last = self.validation[pick]
-        return (self._gather(last, torch.arange(len(last)) % 2 == 1) - self.mean) / self.std, self._styles[last]
+        return (
+            self._gather(last, torch.arange(len(last)) % 2 >= 3 - self._sides) - self.mean
+        ) / self.std, self._styles[last]
 
 
 def _presents(recording: Recording, span: int, standing: bool) -> list[Array]:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.world import Scene
 from servoid.hw.geometry import turned
 from servoid.hw.robot.description import Robot
 from servoid.policy.priors.goals import GOALS, SeenGoal
 
 if TYPE_CHECKING:
+    from servoid.policy.motion.clip import Clip
     from servoid.policy.rising.lead import Rising
 
 
@@ -31,6 +33,12 @@ class TaskState:
     angular_velocity: Array  # (n, 3) rad/s, base frame
     joints: Array  # (n, n_joints) rad
     joint_velocity: Array  # (n, n_joints) rad/s
+    objects: Array | None = None  # (n, objects, 7): m of the middle, and quaternion; None: the task has no things
+
+    def only(self, rows: slice) -> TaskState:
+        """Of these worlds, or ticks."""
+        known = (part.name for part in fields(self) if getattr(self, part.name) is not None)
+        return TaskState(**{name: getattr(self, name)[rows] for name in known})
 
 
 class LearnedTask(ABC):
@@ -50,6 +58,25 @@ class LearnedTask(ABC):
     @property
     def seen(self) -> SeenGoal:
         return GOALS[self.goal]
+
+    @property
+    def motion(self) -> Clip | None:
+        """The clip that it is about, in which episodes begin; None: about none."""
+        return None
+
+    @property
+    def scene(self) -> Scene | None:
+        """What is there beside the robot, at places that `place` draws; None: nothing."""
+        return None
+
+    def place(self, rng: np.random.Generator) -> Array:
+        """Where the things of the scene are as an episode begins `(things, 7)`, in the frame that it begins in."""
+        return np.zeros((0, 7))
+
+    @property
+    def grounded(self) -> bool:
+        """Whether it goes to the ground, or low: only who tips over has fallen then."""
+        return self.lies
 
     @abstractmethod
     def draw(self, rng: np.random.Generator, position: Array) -> Array:

@@ -91,7 +91,7 @@ class LearnedRun(BaseTask):
         known, n = _states(trace, self.ticks(self.cycle)), len(trace.yaw)
         found, before = np.zeros(n), -1
         for tick in range(n):
-            at = TaskState(*(column[tick : tick + 1] for column in known))
+            at = known.only(slice(tick, tick + 1))
             if (number := episode.number(tick)) != before:
                 asked, before = self.drawn(episode, number, at.position[0])[None], number
             if self.asks.ended(asked, at)[0]:
@@ -118,15 +118,16 @@ class _AskAnew(BaseBehaviour):
         return task.told(self._asked, state)
 
 
-def _states(trace: Trace, cycle: int) -> tuple[Array, ...]:
-    """The columns of `TaskState` over a trace `(ticks, ...)`, NaN where it does not tell; velocity is averaged over the
+def _states(trace: Trace, cycle: int) -> TaskState:
+    """Over a trace, a row for each tick, NaN where it does not tell; velocity is averaged over the
     last `cycle` ticks, before the first of which the robot stood where it began."""
     place, n = trace.displacement[:, :2], len(trace.yaw)
     before = np.concatenate([np.tile(place[:1], (cycle, 1)), place])[:n]
     unknown = np.full((n, 3), math.nan)
     velocity, height = (place - before) / (cycle * trace.dt), trace.displacement[:, 2]
     joints = unknown if trace.joints is None else trace.joints
-    return place, trace.yaw, velocity, height, unknown, unknown, joints, np.full_like(joints, math.nan)
+    rates = np.full_like(joints, math.nan)
+    return TaskState(place, trace.yaw, velocity, height, unknown, unknown, joints, rates, trace.objects)
 
 
 class RunSpeed(LearnedRun):

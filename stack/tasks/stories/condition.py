@@ -61,7 +61,7 @@ class Conditions:
         self._robot, self.legs = robot, robot.leg_index.reshape(-1)
 
     @cached_property
-    def points(self) -> KeyPoints:
+    def _points(self) -> KeyPoints:
         return KeyPoints(self._robot)
 
     def hold(self, act: Act, now: Moment, thing: Array, seat: SceneObject | None) -> Array:
@@ -71,7 +71,7 @@ class Conditions:
         if done.part == PELVIS:
             found &= np.linalg.norm(now.base[..., :2] - thing[..., :2], axis=-1) <= done.within
         elif done.part is not None:
-            at = self.points(now.joints)[..., self.points.names.index(done.part), :]
+            at = self._points(now.joints)[..., self._points.names.index(done.part), :]
             found &= np.linalg.norm(now.base + rotate(now.orientation, at) - thing[..., :3], axis=-1) <= done.within
         if done.faces is not None:
             off = (yaw_of(now.orientation) - yaw_of(thing[..., 3:]) + np.pi) % (2 * np.pi) - np.pi

@@ -20,13 +20,14 @@ from servoid.stack.navigation.go_to_point import SpeedProfile
 from servoid.stack.navigation.go_to_pose import NEAR, go_to_pose
 from servoid.stack.skills.skill import Skill
 from servoid.stack.tasks.base import BaseBehaviour
-from servoid.stack.tasks.stories.act import Act
+from servoid.stack.tasks.stories.act import PELVIS, Act
 from servoid.stack.tasks.stories.condition import REST_SECONDS, Conditions, Moment, held_ticks, rests
 from servoid.stack.tasks.stories.told import StoryEpisode, StorySettings
 
 AGAIN_SECONDS = 2.0  # after a skill that did not do it, before another try
 READY_SECONDS = 0.8  # in which a planner comes to a stand before what it is told, and may be told otherwise
 STAGE = 0.04  # m from there that will do
+STRAYED = 0.8  # of how far from there an act that is done by standing there may be
 FAR = 0.25  # m from there beyond which a robot that had come near walks there anew: turning, it drifts
 AWAY = 0.08  # m farther off that a robot turns its back to a seat: its toes need room
 ROUND = 0.7  # of how far a robot is beside a seat
@@ -176,6 +177,9 @@ class Machine(BaseBehaviour):
     # -- what is asked -------------------------------------------------------------------------------------------------
 
     def _ask(self, act: Act, state: State, thing: Array) -> Instruction:
+        if self._acting is not None and self._strayed(act, state, thing):
+            self._events.append(f"'{act.name}': it came to a stand beside the place, and walks there again")
+            self._acting = self._facing = None
         if self._acting is not None and self._too_late(act):
             self._events.append(f"'{act.name}' is tried again")
             self._acting = self._facing = None
@@ -193,6 +197,13 @@ class Machine(BaseBehaviour):
         if self._acting is None or act.approach is None or act.skill is None or act.done.seated:
             return False
         return self._tick - self._acting > self._ticks(self._lasts(act, act.skill) + AGAIN_SECONDS)
+
+    def _strayed(self, act: Act, state: State, thing: Array) -> bool:
+        """Whether an act that is done by standing somewhere is not, since the robot went on a little as it stopped."""
+        if self._acting is None or act.approach is None or act.done.part != PELVIS:
+            return False
+        away = float(np.linalg.norm(self._place(act, state, thing)[0]))
+        return self._tick - self._acting > self._ticks(READY_SECONDS) and away > STRAYED * act.done.within
 
     def _lasts(self, act: Act, skill: str) -> float:
         """s that an act takes by its skill, or by a planner."""

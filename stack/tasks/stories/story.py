@@ -12,6 +12,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Criterion, Trace
 from servoid.hw.contracts.world import Scene
 from servoid.hw.robot.description import Robot, shipped_robot
+from servoid.policy.diffusion.prefix.key_points import KeyPoints
 from servoid.stack.skills.skill import Skill, load_skills
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, drawn_pushes
 from servoid.stack.tasks.stories.act import Act, drawn, load_acts
@@ -123,12 +124,10 @@ class Story(BaseTask):
         strikes = [number for number, act in enumerate(episode.acts) if act.limb is not None]
         if not strikes or trace.objects is None or not len(trace.yaw):
             return None
-        now, struck = moments(trace, self.conditions.legs), 0
+        now, body, struck = moments(trace, self.conditions.legs), KeyPoints(self._robot, whole=True), 0
         for number in strikes:
             index = episode.things[number]
-            limb = struck_by(
-                self.conditions.points, now, trace.objects[:, index], np.array(episode.objects[index].size)
-            )
+            limb = struck_by(body, now, trace.objects[:, index], np.array(episode.objects[index].size))
             struck += done[number] is not None and limb == episode.acts[number].limb
         return struck / len(strikes)
 

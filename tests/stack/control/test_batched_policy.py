@@ -11,7 +11,7 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Plan, PlanRequest, State
 from servoid.stack.control.diffusion import DiffusionPolicy
 from servoid.stack.control.planning.plan_buffer import Pace
-from servoid.stack.control.trim import Trim
+from servoid.stack.control.planning.trim import Trim
 
 
 def marked(asked: PlanRequest) -> Plan:

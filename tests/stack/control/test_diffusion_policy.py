@@ -26,7 +26,7 @@ from servoid.policy.features import Normaliser, raw_layout
 from servoid.stack.control.diffusion import DiffusionPolicy, diffusion_policy
 from servoid.stack.control.planning.plan_buffer import Pace
 from servoid.stack.control.planning.planner import InlinePlanner, ProcessPlanner
-from servoid.stack.control.trim import Trim
+from servoid.stack.control.planning.trim import Trim
 from servoid.stack.safety.min_jerk import MinJerk
 
 ROBOT = load_robot()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from servoid.hw.robot.description import load_robot
-from servoid.stack.control.trim import Trim
+from servoid.stack.control.planning.trim import Trim
 
 ROBOT = load_robot()
 DT = ROBOT.dt

@@ -15,6 +15,7 @@ from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Trace
 from servoid.hw.contracts.world import Percept
 from servoid.hw.robot.description import load_robot
+from servoid.policy.diffusion.prefix.key_points import KeyPoints
 from servoid.policy.diffusion.prefix.planning import HIGHEST
 from servoid.stack.runtime.run import RunSettings
 from servoid.stack.tasks import load_task
@@ -319,24 +320,43 @@ def test_a_point_that_is_seen_is_where_its_mark_is() -> None:
     assert _story(plan="reach")[1].scene is None
 
 
-def test_a_bag_is_struck_by_what_is_nearest_as_it_leans() -> None:
+def test_a_bag_is_struck_by_what_is_nearest_as_it_begins_to_fall() -> None:
     """A bag that the robot walks over falls, too, and was not struck by the hand that was told."""
-    task, episode, _ = _story(plan="punch-left")
-    height, names = episode.objects[0].size[2], task.conditions.points.names
-    body = task.conditions.points(ROBOT.home)
-    base = np.array([0.0, 0.0, ROBOT.standing_height])
-    for part in ("left hand", "right hand", "right foot"):
-        place = base + body[names.index(part)]
-        bag = np.tile([*place[:2], height / 2, 1.0, 0.0, 0.0, 0.0], (6, 1))
-        bag[:, 1] += np.sign(place[1]) * 0.04 if "hand" in part else 0.0
-        bag[:, 0] += 0.0 if "hand" in part else 0.12
-        bag[3:, 3:] = [np.cos(0.8), 0.0, np.sin(0.8), 0.0]  # it falls
+    points = KeyPoints(ROBOT, whole=True)
+    base, body = np.array([0.0, 0.0, ROBOT.standing_height]), dict(zip(points.names, points(ROBOT.home), strict=True))
+
+    def told(plan: str, part: str, falls: bool = True) -> float:
+        task, episode, _ = _story(plan=plan)
+        place = base + body[part]
+        bag = np.tile([*place[:2], episode.objects[0].height, 1.0, 0.0, 0.0, 0.0], (9, 1))
+        bag[:, :2] += [0.05, 0.0] if part == "right toe" else [0.0, np.copysign(0.04, place[1])]
+        bag[1, 3:] = [np.cos(0.05), 0.0, np.sin(0.05), 0.0]  # something brushes it, and it stands again
+        if falls:
+            bag[5:, 3:] = [np.cos(0.03), 0.0, np.sin(0.03), 0.0]
+            bag[6:, 3:] = [np.cos(0.8), 0.0, np.sin(0.8), 0.0]
+        joints, still = np.tile(ROBOT.home, (9, 1)), np.zeros((9, 3))
+        joints[:3] += 0.3
         trace = Trace(
-            dt=ROBOT.dt, displacement=np.tile(base, (6, 1)), yaw=np.zeros(6), velocity=np.zeros((6, 3)),
-            yaw_rate=np.zeros(6), command=np.zeros((6, 3)), fallen=False,
-            orientation=np.tile([1.0, 0, 0, 0], (6, 1)),
-            joints=np.tile(ROBOT.home, (6, 1)), objects=bag[:, None],
+            ROBOT.dt, np.tile(base, (9, 1)), still[:, 0], still, still[:, 0], still, False, joints,
+            np.tile([1.0, 0, 0, 0], (9, 1)), objects=bag[:, None],
         )  # fmt: skip
-        assert task.metrics(trace, episode)["struck_as_told"] == float(part == "left hand"), part
-    still = replace(trace, objects=np.repeat(trace.objects[:1], 6, 0))  # type: ignore[index]
-    assert task.metrics(still, episode)["struck_as_told"] == 0.0
+        return task.metrics(trace, episode)["struck_as_told"]
+
+    assert told("punch-left", "left hand") == 1.0
+    assert told("punch-left", "right hand") == 0.0
+    assert told("punch-right", "right toe") == 0.0
+    assert told("kick-right", "right toe") == 1.0
+    assert told("kick-right", "right toe", falls=False) == 0.0
+
+
+def test_a_robot_that_stops_beside_a_point_walks_there_again() -> None:
+    """It stood there until its time was over: nothing asked it to step back."""
+    _, episode, machine = _story(plan="reach", by="words")
+    point, percept = episode.points[0, :2], Percept("task", 0.0)
+    assert machine.instruct(0, _at(point, 0.0), percept).text is not None, "it is there, and stands"
+    beside = _at(point + np.array([0.07, 0.0]), 0.0)
+    assert machine.instruct(10, beside, percept).goal is None, "it may still be coming to a stand"
+    asked = machine.instruct(60, beside, percept)
+    assert asked.goal is not None
+    np.testing.assert_allclose(asked.goal, [-0.07, 0.0], atol=1e-9)
+    assert machine.instruct(61, _at(point + np.array([0.04, 0.0]), 0.0), percept).goal is None

@@ -44,7 +44,9 @@ NEEDED = {
     "motions author": "authored --out o", "motions keyframes": "--out o",
     "motions retarget": "a.bvh --licence MIT --out o",
     "motions film": "k --library lib --out o",
-    "motions mirror": "k --library lib --out o", "motions blend": "k l --name n --library lib --out o",
+    "motions mirror": "k --library lib --out o",
+    "motions gait": "--name k --velocity 0.2 0 0 --library lib --out o",
+    "motions blend": "k l --name n --library lib --out o",
     "bringup setup": "l_knee --port virtual", "bringup jog": "l_knee --port virtual",
 }  # fmt: skip
 HERE = ("doctor", "bench policy", "bench clients", "bench fuzz")  # measure in this process, at once

@@ -20,7 +20,7 @@ from servoid.tools.evaluate.spec import Experiment
         "hw/robot/legs.py",
         "sim/rig/servo/virtual_servo.py",
         "policy/diffusion/sampler.py",
-        "stack/control/trim.py",
+        "stack/control/planning/trim.py",
         "configs/servos/xm430-w350.yaml",
         "tools/common/ground_truth.py",
         "tools/common/motion_quality.py",

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from made_prior import write_prior
 
 from servoid.hw.config import ConfigError
@@ -19,23 +18,15 @@ from servoid.hw.robot.mirror import Mirror
 from servoid.policy import checkpoint
 from servoid.policy.checkpoint import CheckpointError, read_header
 from servoid.policy.mlp import Mlp
-from servoid.policy.priors.adversarial.discriminator import (
-    Adversary,
-    Discriminator,
-    load_discriminator,
-    save_discriminator,
-)
 from servoid.policy.priors.goals import GOALS
 from servoid.policy.priors.observation import TaskObservation
 from servoid.policy.priors.score_matching.model import Style, load_prior
-from servoid.policy.priors.score_matching.windows import PriorWindows
 from servoid.policy.priors.task_policy import TaskPolicy
 from servoid.policy.recording import DatasetError, read_recording
 from servoid.policy.references.style import load_style
 from servoid.sim.kinematics import limbs_of
 from servoid.stack.tasks.learned import LEARNED_TASKS, TaskState, load_learned_task
 from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
-from servoid.tools.learn.envs.score_term import Rival
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
 from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.policy import PolicyTrainer, environment
@@ -338,37 +329,6 @@ def test_what_a_policy_imitates_is_kept_and_others_can_begin_with_it(
     second.start(resume=False, init=kept)
     seen = first.env.observations["actor"]
     assert np.allclose(first.actor()(seen), second.actor()(seen), atol=1e-6)
-
-
-@pytest.mark.slow
-def test_a_discriminator_learns_along_and_rewards_frozen(prior: Path, synthetic_dataset: Path, tmp_path: Path) -> None:
-    """AMP in the same environment: it comes to tell the policy's windows, and its file rewards another training."""
-    known = load_prior(prior, ROBOT, limbs_of(ROBOT))
-    recordings = {"": read_recording(synthetic_dataset, ROBOT)}
-    discriminator = Discriminator(known)
-    adversary = Adversary(discriminator, PriorWindows(recordings, known.features, known.config), 0)
-    rival = Rival(discriminator, adversary)
-    env = environment(load_learned_task("speed", ROBOT), known, Style(), replace(SETTINGS, generated=0.0), 6, 0, rival)
-    env.reset()
-    for _ in range(6):
-        env.step(np.ones((env.n, env.action_size)))
-    told = [env.score.learn() for _ in range(60)][-1]
-    assert told["tells_data"] > 0.9
-    assert told["tells_policy"] > 0.9
-    file = tmp_path / "discriminator.safetensors"
-    save_discriminator(file, discriminator, known, {"data": "", "licence": "", "results": {}})
-    frozen = load_discriminator(file, known)
-    real = adversary._data.held_out(20)[0] * known.std + known.mean
-    assert np.array_equal(frozen.reward(real), discriminator.reward(real))
-    assert frozen.reward(real).mean() > frozen.reward(torch.cat(adversary._memory)).mean()
-    again = environment(load_learned_task("speed", ROBOT), known, Style(), SETTINGS, 6, 0, Rival(frozen, None))
-    again.reset()
-    again.step(np.zeros((6, again.action_size)))
-    assert again.score.learn() == {}
-    head, tensors = checkpoint.read(file)
-    checkpoint.write(file, tensors, {**head, "config": {**head["config"], "stride": 1}})
-    with pytest.raises(CheckpointError, match="stride 1"):
-        load_discriminator(file, known)
 
 
 def test_a_clone_does_what_was_shown_and_in_a_mirror_its_mirror() -> None:

@@ -11,8 +11,11 @@ With `--style` they walk in a style of configs/styles, arms spread or crouched, 
 styles (`servoid train prior`), one dataset for each in a folder of its name.
 
 With `--skills` the worlds also perform the skills of configs/skills that take nothing but the ground, each for as many
-ticks, and go from any of them to any other and to walking, some in mid motion. Each tick says what was told, and how
-long a skill has lasted: what a model learns from that follows sentences about skills.
+ticks, and go from any of them to any other and to walking, some in mid motion; with `--only` those that it names. Each
+tick says what was told, and how long a skill has lasted: what a model learns from that follows sentences about skills.
+
+With `--carry` each world has a box on the ground, which a script picks up and brings to a place; each tick says where
+both are: data for a prior of carrying.
 
 The same options and the same seed make the same files. With --parts the frames come from so many recordings, each with
 a seed of its own and done by itself: on the machines of a Ray cluster with --ray. Those that are done wait beside the
@@ -61,6 +64,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     parser.add_argument("--skills", action="store_true", help="perform skills, too, by their tracker")
     parser.add_argument(
+        "--only", nargs="+", default=[], metavar="SKILL", help="with --skills: these, again and again, and no walks"
+    )
+    parser.add_argument(
         "--tracker", default="tracker", metavar="NAME|FILE", help="tracker that performs skills (default: tracker)"
     )
     parser.add_argument(
@@ -71,8 +77,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="share of the commands that ask for a walk lower than upright (default: 0)",
     )
     parser.add_argument(
+        "--velocity",
+        type=float,
+        nargs=3,
+        metavar=("FORWARD", "LEFT", "TURN"),
+        help="ask for this all the time, m/s and rad/s (default: what changes every few seconds)",
+    )
+    parser.add_argument(
         "--style", metavar="NAME|FILE", help="walk in this style, of configs/styles (default: as the expert walks)"
     )
+    parser.add_argument("--carry", action="store_true", help="pick up boxes and bring them, by a script")
     parser.add_argument(
         "--seconds", type=positive, default=15.0, metavar="S", help="length of an episode (default: %(default)g)"
     )
@@ -139,6 +153,12 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(f"--noise {args.noise[0]:g} {args.noise[1]:g}: must not be negative, the lower one first")
     if args.style is not None and (args.skills or args.crouched or args.policy == "gait"):
         raise ConfigError("--style is how the expert walks upright: drop --skills, --crouched or --policy gait")
+    if args.carry and (args.skills or args.crouched or args.style is not None or args.policy == "gait"):
+        raise ConfigError("--carry is what a script does: drop --skills, --crouched, --style or --policy gait")
+    if args.velocity is not None and (args.skills or args.crouched or args.carry):
+        raise ConfigError("--velocity is of walks alone: drop --skills, --crouched or --carry")
+    if args.only and not args.skills:
+        raise ConfigError("--only names skills to perform: give --skills, too")
     if args.skills and args.policy == "gait":
         raise ConfigError("--skills goes with --policy expert or a tracker: the gait cannot walk on from a skill")
     if args.workers < 0:
@@ -174,11 +194,14 @@ def collect(args: argparse.Namespace) -> dict[str, Any]:
         plain_odometry=args.plain_odometry,
         crouched=args.crouched,
         style=args.style,
+        only=tuple(args.only),
+        carry=args.carry,
+        velocity=None if args.velocity is None else (args.velocity[0], args.velocity[1], args.velocity[2]),
         threads=args.threads or (1 if args.workers > 1 or args.ray is not None else 0),
     )
     performances, tally = how.performances(1), RecordingTally()
     texts = tuple(skill.text for skill in SKILLS) if performances is None else performances.texts
-    schema = Schema(robot.name, robot.rate, _features(robot, performances), texts)
+    schema = Schema(robot.name, robot.rate, _features(robot, performances, args.carry), texts)
     with locked(args.out), DatasetWriter(args.out, schema, args.force, args.append) as writer:
         before = earlier(args, how)
         episodes, frames = writer.episodes, writer.frames
@@ -248,10 +271,10 @@ def _parts(args: argparse.Namespace, how: FleetRecipe) -> list[Part]:
     return [Part(number, episode_seed(args.seed, number), frames, how) for number in range(args.parts)]
 
 
-def _features(robot: Robot, performances: Performances | None = None) -> dict[str, Feature]:
+def _features(robot: Robot, performances: Performances | None = None, carry: bool = False) -> dict[str, Feature]:
     """The dataset's columns and the names of their numbers."""
     from servoid.policy.features import recorded_names
-    from servoid.policy.recording import CLOCK, SKILLS_NOTE
+    from servoid.policy.recording import BOX, BOX_NAMES, CLOCK, PLACE, PLACE_NAMES, SKILLS_NOTE
     from servoid.tools.learn.collect.provenance import MIRRORING
     from servoid.tools.learn.dataset.schema import Feature
 
@@ -268,4 +291,7 @@ def _features(robot: Robot, performances: Performances | None = None) -> dict[st
             SKILLS_NOTE: ", ".join(performances.names),
         }
         found[CLOCK] = Feature(("seconds",), about)
+    if carry:
+        found[BOX] = Feature(BOX_NAMES, {"meaning": "pose of the box, heading frame from below the base, m"})
+        found[PLACE] = Feature(PLACE_NAMES, {"meaning": "where the box shall be, heading frame from the base, m"})
     return found

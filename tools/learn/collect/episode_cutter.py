@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -10,7 +10,8 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
-from servoid.hw.contracts.control import Instruction, Policy
+from servoid.hw.contracts.control import Instruction, Policy, State
+from servoid.hw.contracts.world import Start
 from servoid.policy.features import raw_layout, raw_row
 from servoid.sim.truth import SimulatedTruth
 from servoid.stack.control.fleet import Fleet
@@ -31,7 +32,7 @@ class RecordedEpisode:
 
 
 class Drilled(Protocol):
-    """What the worlds are asked: `Commands`, or `Performances`."""
+    """What the worlds are asked: `Commands`, `Performances` or `Carrying`."""
 
     velocity: Array  # (n, 3) m/s forward, m/s left, rad/s
     lower: Array  # (n,) m that the base shall be lower than it walks
@@ -42,8 +43,16 @@ class Drilled(Protocol):
         """What else is recorded, `(n, size)` by column."""
         ...
 
+    def start(self, rngs: Sequence[np.random.Generator], where: Array) -> Start | None:
+        """How the next episodes of the worlds `where` `(n,)` bool begin, a row for each world; None: standing."""
+        ...
+
     def begin(self, ids: Array) -> None:
         """Episodes begin in the worlds `ids`."""
+        ...
+
+    def instruction(self, state: State, truth: SimulatedTruth) -> Instruction:
+        """What whoever drives the worlds is told at a tick."""
         ...
 
     def advance(self, rngs: list[np.random.Generator]) -> None:
@@ -130,7 +139,8 @@ class EpisodeCutter:
         ids = np.flatnonzero(where)
         if not len(ids):
             return
-        self.fleet.reset(where)
+        self.fleet.draw(where)
+        self.fleet.reset(where, self._script.start(self.fleet.rngs, where))
         self._policy.reset(where, self.fleet.seeds)
         self._script.begin(ids)
         self._disturbances.reset(ids, self.fleet.rngs)
@@ -143,7 +153,7 @@ class EpisodeCutter:
         self._script.advance(rngs)
         fleet.worlds.push(self._disturbances.push(rngs))
         command = self._script.velocity
-        target = self._policy.act(state, fleet.applied, Instruction(command, lower=self._script.lower))
+        target = self._policy.act(state, fleet.applied, self._script.instruction(state, fleet.truth))
         clean = fleet.step(target, self._disturbances.noise(rngs))
         worlds, at = np.arange(fleet.n), self._length
         values = {"observation.state": raw_row(state), "action": clean, "action_applied": fleet.applied}

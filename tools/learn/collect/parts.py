@@ -20,7 +20,7 @@ from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Policy
 from servoid.hw.robot.description import load_robot
 from servoid.tools.learn.collect.disturbances import DisturbanceSettings
-from servoid.tools.learn.collect.episode_cutter import EpisodeCutter, RecordedEpisode
+from servoid.tools.learn.collect.episode_cutter import Drilled, EpisodeCutter, RecordedEpisode
 from servoid.tools.learn.collect.performances import Performances
 from servoid.tools.learn.collect.skills import Commands
 
@@ -41,10 +41,15 @@ class FleetRecipe:
     threads: int
     crouched: float = 0.0
     style: str | None = None
+    carry: bool = False
+    velocity: tuple[float, float, float] | None = None  # that is asked all the time; None: those of the drills
+    only: tuple[str, ...] = ()  # skills that are performed, without walks; none: all, and walks
 
     @property
     def disturbances(self) -> DisturbanceSettings:
-        return DisturbanceSettings(scale=self.noise)
+        """Skills alone and carrying are shown undisturbed: nobody is pushed while it kicks, standing on a foot."""
+        pushed = 0.0 if self.only or self.carry else DisturbanceSettings.pushed_share
+        return DisturbanceSettings(scale=self.noise, pushed_share=pushed)
 
     def sources(self) -> dict[str, Any]:
         """Names, hashes and commits of the checkpoints that record. Raises ConfigError."""
@@ -61,34 +66,54 @@ class FleetRecipe:
 
     def performances(self, worlds: int) -> Performances | None:
         """What so many worlds are told, where they perform skills. Raises ConfigError."""
-        from servoid.stack.skills.skill import load_skills
+        from servoid.stack.skills.skill import UPRIGHT, chosen, load_skills, way
 
         if not self.skills:
             return None
         robot = load_robot(self.robot)
-        skills = {name: skill for name, skill in load_skills(robot).items() if skill.alone}
-        return Performances(robot, skills, worlds, expert=self.policy, tracker=self.tracker)
+        known = load_skills(robot)
+        skills = {name: skill for name, skill in known.items() if skill.alone}
+        share = 0.7
+        if self.only:
+            skills, share = {name: chosen(name, skills) for name in self.only}, 1.0
+            if not any(skill.entry == UPRIGHT for skill in skills.values()):
+                raise ConfigError(f"--only {' '.join(self.only)}: none of them begins upright, as episodes do")
+            for skill in skills.values():
+                if skill.end != UPRIGHT:
+                    way(skill.end, UPRIGHT, skills)
+        return Performances(robot, skills, worlds, share, expert=self.policy, tracker=self.tracker)
 
     def cutter(self, seed: int) -> EpisodeCutter:
         """A fleet of that seed, to be recorded. Raises ConfigError."""
         from servoid.policy.references.style import load_style
+        from servoid.sim.model import build
+        from servoid.sim.worlds import Worlds
+        from servoid.stack.control.carrier import Carrier
         from servoid.stack.control.fleet import Fleet
         from servoid.stack.control.gait import GaitPolicy
         from servoid.stack.control.styled import StyledExpert
         from servoid.stack.control.tracker import ExpertPolicy
         from servoid.stack.estimation.odometry import load_odometry
+        from servoid.stack.tasks.learned.carry import Carry
+        from servoid.tools.learn.collect.carrying import Carrying
 
         robot, shape, told = load_robot(self.robot), (self.worlds,), self.performances(self.worlds)
         policy: Policy
+        script: Drilled | None = told
+        count: int | Worlds = self.worlds
         if told is not None:
             policy = told
+        elif self.carry:
+            policy, script = Carrier(robot, shape, self.policy), Carrying(robot, self.worlds)
+            model = build(robot, Carry(robot).scene)
+            count = Worlds(robot, self.worlds, threads=self.threads, randomise=self.randomise, model=model)
         elif self.style is not None:
             policy = StyledExpert(robot, load_style(self.style, robot), self.policy, shape)
         else:
             policy = GaitPolicy(robot, shape) if self.policy == "gait" else ExpertPolicy(robot, self.policy, shape)
         odometry = None if self.plain_odometry else load_odometry(robot)
-        fleet = Fleet(robot, self.worlds, odometry, randomise=self.randomise, seed=seed, threads=self.threads)
-        script = told or Commands(robot, self.worlds, self.crouched)
+        fleet = Fleet(robot, count, odometry, randomise=self.randomise, seed=seed, threads=self.threads)
+        script = script or Commands(robot, self.worlds, self.crouched, self.velocity)
         return EpisodeCutter(fleet, policy, self.disturbances, self.seconds, script)
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import Robot
 from servoid.policy.references.either import GaitOrClip
 from servoid.policy.text.captions import MOTIONS, NAMES, motion_of
@@ -69,6 +70,14 @@ class Performances(BasePolicy):
     def columns(self) -> dict[str, Array]:
         """What a recording holds beside what is asked in walking, `(n, size)`."""
         return {"clock": self.clock[:, None]}
+
+    def start(self, rngs: Sequence[np.random.Generator], where: Array) -> Start | None:
+        """How the next episodes of the worlds `where` begin: standing."""
+        return None
+
+    def instruction(self, state: State, truth: SimulatedTruth) -> Instruction:
+        """What whoever drives the worlds is told."""
+        return Instruction(self.velocity, lower=self.lower)
 
     def fallen(self, truth: SimulatedTruth) -> Array:
         """Which worlds have fallen `(n,)`: one that sits down or rises by its tilt alone."""

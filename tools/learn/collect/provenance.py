@@ -50,7 +50,20 @@ def provenance(
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
     skills = skills_of(robot)
-    names = ("frames", "worlds", "seconds", "randomise", "plain_odometry", "skills", "crouched", "style", "parts")
+    names = (
+        "frames",
+        "worlds",
+        "seconds",
+        "randomise",
+        "plain_odometry",
+        "skills",
+        "crouched",
+        "style",
+        "only",
+        "carry",
+        "velocity",
+        "parts",
+    )
     options = {name: vars(args)[name] for name in names}
     content = {
         "licence": LICENCE,

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
+from servoid.hw.contracts.control import Instruction, State
+from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import Robot, Walking
 from servoid.sim.truth import SimulatedTruth
 
@@ -102,8 +105,12 @@ def drawn(skills: tuple[Drill, ...], rng: np.random.Generator) -> Drill:
 class Commands:
     """The present command of each of `n` worlds, changed every few seconds, drawn from the worlds' own streams."""
 
-    def __init__(self, robot: Robot, n: int, crouched: float = 0.0) -> None:
-        """A share `crouched` of the commands is for a base that is lower than it walks upright."""
+    def __init__(
+        self, robot: Robot, n: int, crouched: float = 0.0, always: tuple[float, float, float] | None = None
+    ) -> None:
+        """A share `crouched` of the commands is for a base that is lower than it walks upright. After it stood, one
+        velocity is asked `always`, where it is given."""
+        self._always = always
         self._rate, self._skills = robot.rate, skills_of(robot)
         self._low, self._crouched = crouched_of(robot), crouched
         self.velocity = np.zeros((n, 3))  # what is asked: m/s forward, m/s left, rad/s
@@ -116,6 +123,14 @@ class Commands:
     def columns(self) -> dict[str, Array]:
         """What a recording holds beside what is asked, `(n, size)`: nothing."""
         return {}
+
+    def start(self, rngs: Sequence[np.random.Generator], where: Array) -> Start | None:
+        """How the next episodes of the worlds `where` begin: standing."""
+        return None
+
+    def instruction(self, state: State, truth: SimulatedTruth) -> Instruction:
+        """What whoever drives the worlds is told."""
+        return Instruction(self.velocity, lower=self.lower)
 
     def fallen(self, truth: SimulatedTruth) -> Array:
         """Which worlds have fallen `(n,)`."""
@@ -137,6 +152,8 @@ class Commands:
                 self.skill[i] = 0 if self._first[i] else int(np.searchsorted(_SHARES, rng.random(), side="right"))
                 skill, self.lower[i] = self._skills[self.skill[i]], 0.0
             self.velocity[i] = skill.draw(rng)
+            if self._always is not None and not self._first[i]:
+                self.velocity[i] = self._always
             self._left[i] = round(rng.uniform(*(FIRST_SECONDS if self._first[i] else skill.seconds)) * self._rate)
             self._first[i] = False
         self._left -= 1

@@ -43,6 +43,7 @@ class Manner(StatefulTerm[State]):
         """`stride`: ticks between decisions; `reach` `(n_joints,)`: rad of joint target for an action of one."""
         self.stride, self.reach = stride, reach
         self.prior: Prior | None = None
+        self.box: Array | None = None  # (n, 7) as `Instruction.box`, now: of a task about one
         self.ratio = np.ones(n)  # of the error to that of held-out data, running average by world
 
     @property
@@ -156,7 +157,7 @@ class ScoreTerm(Manner):
 
         from servoid.policy.priors.features import seen_from_last
 
-        frame, yaw = self.prior.features.of(raw_row(state))
+        frame, yaw = self.prior.features.of(raw_row(state), self.box)
         self._frames = np.concatenate([self._frames[:, 1:], frame[:, None]], 1)
         self._yaw = np.concatenate([self._yaw[:, 1:], yaw[:, None]], 1)
         if self._fresh.any():
@@ -175,11 +176,27 @@ class AdversarialTerm(ScoreTerm):
 
     def _reward(self, windows: Tensor, errors: Array) -> Array:
         if self._adversary is not None:
-            self._adversary.see(windows)
+            self._adversary.memory.see(windows)
         return self.discriminator.reward(windows)
 
     def learn(self) -> dict[str, float]:
         return {} if self._adversary is None else self._adversary.learn()
+
+
+class SmilingTerm(ScoreTerm):
+    """SMILING's reward instead, which has no bound: see `OwnScore`; the prior measures the manner all the same."""
+
+    def __init__(self, prior: Prior, style: Style, n: int, settings: ScoreSettings, seed: int) -> None:
+        from servoid.policy.priors.adversarial.smiling import OwnScore
+
+        super().__init__(prior, style, n, settings, seed)
+        self.own = OwnScore(prior, seed, settings.random_level)
+
+    def _reward(self, windows: Tensor, errors: Array) -> Array:
+        return self.own.reward(windows, errors, self.data_error)
+
+    def learn(self) -> Mapping[str, float]:
+        return self.own.learn()
 
 
 class GeneratedStarts:

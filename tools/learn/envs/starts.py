@@ -7,10 +7,12 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array, Command, Mode
 from servoid.hw.contracts.world import Start
 from servoid.hw.geometry import turned, up_vector
 from servoid.hw.robot.description import Robot
+from servoid.hw.robot.legs import Legs
 from servoid.policy.motion.clip import Clip
 from servoid.policy.references.clip import ClipReference
 from servoid.sim.truth import SimulatedTruth
@@ -24,6 +26,9 @@ _TIPPED = 0.7  # rad from where it counts as falling
 _EVERY = 5  # ticks between states that are kept of a rollout
 _DEVIATION = 0.5  # squared error of gravity, seen from the base, that a rollout may have come to
 _HEIGHT_DEVIATION = 0.3  # of the standing height, likewise
+
+
+_ROLLED_OUT = 16  # bodies that follow a clip that is imitated
 
 
 @dataclass(frozen=True)
@@ -138,3 +143,47 @@ def falling(robot: Robot, n: int, seed: int) -> States:
         rows = np.flatnonzero(worlds.truth.tilt > _TIPPED) if tick % _EVERY == 0 else ids[:0]
         kept.append(States.of(worlds.truth, rows, np.full(len(rows), -1), 0.0))
     return States.joined(kept)
+
+
+class AlongClip:
+    """Draws the states that episodes begin in: a `share` of them along the clip, as it really goes; the others in its
+    first pose or, of a loop, standing at home."""
+
+    def __init__(self, robot: Robot, clip: Clip, share: float, seed: int) -> None:
+        """Rolls out bodies first. Raises ConfigError where a share is to begin along a clip that fails open loop."""
+        self._share, self._states = share, None
+        joints, orientation = np.clip(clip.joints[:1], robot.lower, robot.upper), clip.root_orientation[:1]
+        if clip.about.loop:
+            joints, orientation = robot.home[None], Legs(robot).stand(robot.home[None])[1]
+        self._first = joints, orientation
+        if share > 0.0:
+            self._states = along(robot, [clip], _ROLLED_OUT, seed)
+            if not len(self._states.joints):
+                raise ConfigError(
+                    f"clip '{clip.name}': none of {_ROLLED_OUT} robots comes to its end open loop, so no episode can "
+                    "begin along it: use --generated 0"
+                )
+
+    def draw(self, rngs: Sequence[np.random.Generator], where: Array) -> Start:
+        """Starts of the worlds `where` `(n,)` bool; a row for each world."""
+        n = len(where)
+        joints, orientation = (np.tile(part, (n, 1)) for part in self._first)
+        still = np.zeros((n, 3))
+        begin = Start(
+            joints=joints, position=np.tile([0.0, 0.0, np.nan], (n, 1)), orientation=orientation, velocity=still,
+            angular_velocity=still.copy(), joint_velocity=np.zeros_like(joints),
+        )  # fmt: skip
+        if self._states is None:
+            return begin
+        picked = np.full(n, -1)
+        for i in np.flatnonzero(where).tolist():
+            if rngs[i].random() < self._share:
+                picked[i] = rngs[i].integers(len(self._states.joints))
+        return _either(picked >= 0, self._states.only(np.maximum(picked, 0)), begin)
+
+
+def _either(moves: Array, moving: States, begin: Start) -> Start:
+    """The states of `moving` in the worlds `moves` `(n,)` bool, those of `begin` elsewhere."""
+    parts = ("joints", "position", "orientation", "velocity", "angular_velocity", "joint_velocity")
+    chosen = {name: np.where(moves[:, None], vars(moving)[name], getattr(begin, name)) for name in parts}
+    return Start(**chosen)

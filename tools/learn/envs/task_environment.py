@@ -15,11 +15,16 @@ from servoid.hw.robot.mirror import Mirror
 from servoid.policy.mlp import Mlp
 from servoid.policy.priors.observation import TaskObservation
 from servoid.policy.references.gait import gait_of
+from servoid.sim.model import build
+from servoid.sim.truth import FALL_TILT
+from servoid.sim.worlds import Worlds
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.safety.limits import clamp
 from servoid.stack.tasks.learned import LearnedTask, TaskState
+from servoid.tools.learn.collect.carrying import box_seen
 from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.score_term import GeneratedStarts, Manner
+from servoid.tools.learn.envs.starts import AlongClip
 from servoid.tools.learn.prior_settings import EpisodeSettings
 from servoid.tools.learn.terms import Terms
 
@@ -62,7 +67,7 @@ class TaskEnvironment:
     """`n` worlds: see `servoid.tools.learn.trainers.ppo.Environment`. A tick of that is a decision here."""
 
     def __init__(
-        self, task: LearnedTask, score: Manner, starts: GeneratedStarts | Down | None, odometry: Mlp | None,
+        self, task: LearnedTask, score: Manner, starts: GeneratedStarts | Down | AlongClip | None, odometry: Mlp | None,
         s: EpisodeSettings, n: int, seed: int,
     ) -> None:  # fmt: skip
         """Call `reset` first. Episodes begin as `starts` has them, or without them standing."""
@@ -70,7 +75,10 @@ class TaskEnvironment:
         self.task, self.score, self.settings, self.robot, self.n = task, score, s, robot, n
         self.generated = starts if isinstance(starts, GeneratedStarts) else None
         self.down = starts if isinstance(starts, Down) else None
-        self.fleet = Fleet(robot, n, odometry if task.seen.odometry else None, randomise=s.randomised, seed=seed)
+        self.along = starts if isinstance(starts, AlongClip) else None
+        scene, known = task.scene, odometry if task.seen.odometry else None
+        worlds = n if scene is None else Worlds(robot, n, randomise=s.randomised, model=build(robot, scene))
+        self.fleet = Fleet(robot, worlds, known, randomise=s.randomised, seed=seed)
         self.lead = task.lead(n)
         self.observation = TaskObservation(robot, task.seen if self.lead is None else self.lead.goal, (n,))
         self.stride, self.reach = score.stride, score.reach
@@ -132,6 +140,11 @@ class TaskEnvironment:
         fleet, windows = self.fleet, None
         if self.down is not None:
             start = self.down.draw(fleet.rngs, where)
+        elif self.task.scene is not None:
+            things = np.stack([self.task.place(rng) for rng in fleet.rngs])  # a row for each world; those `where` count
+            start = Start(velocity=np.zeros((self.n, 3)), objects=things)
+        elif self.along is not None:
+            start = self.along.draw(fleet.rngs, where)
         elif self.generated is not None:
             windows, start = self.generated.draw(fleet.rngs, where)
         else:
@@ -153,6 +166,7 @@ class TaskEnvironment:
 
     def _observe(self) -> None:
         state, truth = self._sense(), self.fleet.truth
+        box = self.score.box = None if self.task.scene is None else box_seen(truth)
         for i in np.flatnonzero(self.ticks >= self._next):
             rng = self.fleet.rngs[i]
             self.asked[i] = self.task.draw(rng, truth.position[i, :2])
@@ -160,7 +174,8 @@ class TaskEnvironment:
         if self.lead is not None:
             goal = self.lead.seen
         else:
-            goal = self.task.seen.observe(self.task.instruct(self.asked, state), self.robot.walking)
+            told = replace(self.task.instruct(self.asked, state), box=box)
+            goal = self.task.seen.observe(told, self.robot.walking)
         actor = self.observation(state, self.fleet.applied, goal)
         forward = self.robot.walking.forward
         known = [
@@ -233,8 +248,11 @@ class TaskEnvironment:
             position=truth.position[:, :2], yaw=truth.yaw, velocity=self.velocity, height=truth.position[:, 2],
             gravity=truth.gravity, angular_velocity=truth.angular_velocity, joints=truth.joints,
             joint_velocity=truth.joint_velocity,
+            objects=None if self.task.scene is None else truth.objects,
         )  # fmt: skip
         self.task_reward = self.task.reward(self.asked, known)
+        if self.task.grounded:  # who is low has not fallen
+            fallen = -truth.gravity[:, 2] < np.cos(FALL_TILT)
         change = action - self._action
         step = TaskStep(
             task=self.task.guided(self.asked, known), manner=manner, change=change, jerk=change - self._change,

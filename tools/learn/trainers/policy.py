@@ -1,11 +1,12 @@
 """Train a policy for a task with PPO, under a motion prior that rewards what is like its data (SMP), or without one.
 
---task is speed, steering, location, dodgeball, get-up, or your own FILE.py:Class. The policy sees the estimate and its
-goal; it decides joint targets around the home pose as often as its prior has frames. --rewards weighs the task, the
-prior (manner) and their product (both); the paper adds the first two. With --prior none manner is 1 everywhere, and
---decide-every and --reach say what the prior would. With --demonstrations it begins as a network that
-does what a dataset shows, instead of at random: that is kept as imitation.safetensors, and others can begin with it by
---init.
+--task is speed, steering, location, dodgeball, carry, get-up, clip:NAME for a clip of the library, or your own
+FILE.py:Class.
+The policy sees the estimate and its goal; it decides joint targets around the home pose as often as its prior has
+frames. --rewards weighs the task, the prior (manner) and their product (both); the paper adds the first two. With
+--prior none manner is 1 everywhere, and --decide-every and --reach say what the prior would. With --demonstrations it
+begins as a network that does what a dataset shows, instead of at random: that is kept as imitation.safetensors, and
+others can begin with it by --init.
 
 Ctrl-C saves, and the same command continues. The newest network is policy.safetensors.
 """
@@ -17,7 +18,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 _JUDGED, _JUDGED_STARTS = 32, 256  # worlds; states that they begin in, where a task has its own
 _LED_SHARE = 0.05  # of what initial weights give, where a lead knows a way already
 NO_PRIOR = "none"
+SMILING: Final = "smiling"  # what rewards in the prior's place
 _LICENCE = "Apache-2.0"  # of what learns from nothing but its own experience
 _IMITATION = "imitation.safetensors"  # what a policy began as, where it imitated
 _DISCRIMINATOR = "discriminator.safetensors"  # beside the policy
@@ -64,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument(
         "--style-weight", type=float, default=1.0, metavar="X", help="weight of classifier-free guidance (default: 1)"
     )
-    run.add_argument("--init", type=Path, metavar="CHECKPOINT", help="start from this task policy")
+    run.add_argument("--init", metavar="NAME|FILE", help="start from this task policy")
     run.add_argument(
         "--demonstrations", type=Path, metavar="DIR", help="start from a network that imitates this dataset"
     )
@@ -79,6 +81,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     run.add_argument(
         "--discriminator", type=Path, metavar="CHECKPOINT", help="reward by this discriminator, which stays as it is"
+    )
+    run.add_argument(
+        "--smiling",
+        action="store_true",
+        help="reward by how much better a second denoiser, which learns from the policy's own motion, predicts noise "
+        "than the prior (SMILING)",
     )
 
 
@@ -109,7 +117,7 @@ def main(args: argparse.Namespace) -> int:
     env = environment(task, prior, style, settings, settings.worlds, settings.seed, rival)
     trainer = PolicyTrainer(env, style, settings, args.out, found)
     trainer.rival = rival
-    trainer.start(args.resume, args.init)
+    trainer.start(args.resume, None if args.init is None else checkpoint.resolve(args.init, robot))
     if args.demonstrations is not None and not trainer.begun_with:
         trainer.imitate(args.demonstrations)
     if args.measure:
@@ -122,27 +130,33 @@ def main(args: argparse.Namespace) -> int:
 
 def _refuse_what_needs_a_prior(args: argparse.Namespace) -> None:
     given = {
-        "--style": args.style, "--adversarial": args.adversarial, "--discriminator": args.discriminator
+        "--style": args.style, "--adversarial": args.adversarial, "--discriminator": args.discriminator,
+        "--smiling": args.smiling or None,
     }  # fmt: skip
     for flag, value in given.items():
         if value is not None:
             raise ConfigError(f"{flag} needs a prior: name one with --prior, or leave {flag} out")
 
 
-def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> Rival | None:
+def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> Rival | Literal["smiling"] | None:
     """What rewards in the prior's place, where that was asked for. Raises ConfigError."""
     from servoid.policy.priors.adversarial.discriminator import load_discriminator
     from servoid.tools.learn.envs.score_term import Rival
     from servoid.tools.learn.trainers.prior import learning_rival
 
+    if sum((args.discriminator is not None, args.adversarial is not None, args.smiling)) > 1:
+        raise ConfigError(
+            "give one of --adversarial, --discriminator and --smiling: one reward takes the prior's place"
+        )
     if args.discriminator is not None:
-        if args.adversarial is not None:
-            raise ConfigError("give --adversarial or --discriminator, not both: one that learns, or one that stays")
         return Rival(load_discriminator(args.discriminator, prior), None)
-    if args.adversarial is None:
+    if args.adversarial is None and not args.smiling:
         return None
     if args.resume and (args.out / "resume.pt").exists():
-        raise ConfigError(f"{args.out}: a discriminator does not go on where it stopped: use --no-resume")
+        what = "a second denoiser" if args.smiling else "a discriminator"
+        raise ConfigError(f"{args.out}: {what} does not go on where it stopped: use --no-resume")
+    if args.smiling:
+        return SMILING
     return learning_rival(args.adversarial, prior, settings.seed)
 
 
@@ -153,21 +167,41 @@ def environment(
     settings: PolicyTraining,
     worlds: int,
     seed: int,
-    rival: Rival | None = None,
+    rival: Rival | Literal["smiling"] | None = None,
 ) -> TaskEnvironment:
     """Worlds of a task under a prior, under a rival of it, or without one. Raises ConfigError."""
     from servoid.stack.estimation.odometry import load_odometry
     from servoid.tools.learn.envs.down import Down
-    from servoid.tools.learn.envs.score_term import AdversarialTerm, GeneratedStarts, Manner, ScoreTerm
+    from servoid.tools.learn.envs.score_term import (
+        AdversarialTerm,
+        GeneratedStarts,
+        Manner,
+        ScoreTerm,
+        SmilingTerm,
+    )
+    from servoid.tools.learn.envs.starts import AlongClip
 
     robot = task.robot
+    if prior is not None and prior.features.box != (task.scene is not None):
+        knows = "knows a box" if prior.features.box else "knows no box"
+        raise ConfigError(
+            f"task {task.name} has {'no ' if task.scene is None else 'a '}box, and this prior {knows}: train one on "
+            f"data that {'show none' if task.scene is None else 'show one (servoid collect --carry)'}"
+        )
     score = Manner(worlds, settings.decide_every, np.full(len(robot.joints), settings.reach))
-    starts: GeneratedStarts | Down | None = None
+    starts: GeneratedStarts | Down | AlongClip | None = None
     if prior is not None:
         given = prior, style, worlds, settings, seed
-        score = ScoreTerm(*given) if rival is None else AdversarialTerm(*given, rival)
+        if rival is None:
+            score = ScoreTerm(*given)
+        else:
+            score = SmilingTerm(*given) if rival == SMILING else AdversarialTerm(*given, rival)
     if task.lies:
         starts = Down(robot, settings.eased, settings.starts, seed)
+    elif task.scene is not None:
+        pass  # standing: a box that is held takes hands that touch it, which a sample does not come close enough to
+    elif task.motion is not None:
+        starts = AlongClip(robot, task.motion, settings.generated, seed)
     elif prior is not None:
         starts = GeneratedStarts(prior, style, settings, seed)
     return TaskEnvironment(task, score, starts, load_odometry(robot), settings, worlds, seed)
@@ -179,7 +213,7 @@ class PolicyTrainer(PpoTrainer):
     BEST = LAST = "policy.safetensors"
     env: TaskEnvironment
     settings: PolicyTraining
-    rival: Rival | None = None
+    rival: Rival | Literal["smiling"] | None = None
 
     def __init__(
         self, env: TaskEnvironment, style: Style, settings: PolicyTraining, out: Path, prior: Path | None
@@ -266,9 +300,10 @@ class PolicyTrainer(PpoTrainer):
         env, seed = self.env, self.settings.seed
         recording = read_recording(folder, env.robot)
         rng = np.random.default_rng(seed)
-        seen, targets = demonstrated(recording, env.robot, env.task.seen, env.stride, rng)
+        both = self.settings.mirror > 0.0  # sides: where a mirror image counts as little, the task has one
+        seen, targets = demonstrated(recording, env.robot, env.task.seen, env.stride, rng, both)
         actions = (targets - env.robot.home) / env.reach
-        mirrors = Mirrors(env.mirrors["actor"], env.mirrors["action"])
+        mirrors = Mirrors(env.mirrors["actor"], env.mirrors["action"]) if both else None
         self.begin_with(cloned(seen, actions, mirrors, self.settings.hidden, self.settings.imitation_steps, seed))
         self.begun_with = {"demonstrations": source_of(folder, recording)}
         self.ship(self.out / _IMITATION, self.progress)
@@ -298,7 +333,9 @@ class PolicyTrainer(PpoTrainer):
             "results": results,
             "training": plain(self.settings),
         }
-        if env.score.prior is not None and self.rival is not None and self.rival.adversary is not None:
+        from servoid.tools.learn.envs.score_term import Rival
+
+        if env.score.prior is not None and isinstance(self.rival, Rival) and self.rival.adversary is not None:
             from servoid.policy.priors.adversarial.discriminator import save_discriminator
 
             save_discriminator(path.with_name(_DISCRIMINATOR), self.rival.discriminator, env.score.prior, about)

@@ -62,10 +62,13 @@ def main(args: argparse.Namespace) -> int:
     torch.set_num_threads(args.threads)
     robot = load_robot(args.robot)
     recordings = read_by_style(args.data, robot)
-    features = PriorFeatures(robot, limbs_of(robot))
+    boxes = [recording.box is not None for recording in recordings.values()]
+    if any(boxes) != all(boxes):
+        raise ConfigError(f"{args.data}: only some of its datasets show a box: a prior is of all of them, or of none")
+    features = PriorFeatures(robot, limbs_of(robot), all(boxes))
     shape = {f.name: getattr(settings, f.name) for f in fields(PriorShape)}
     config = PriorConfig(features.layout.size, **shape, styles=tuple(style for style in recordings if style))
-    windows = PriorWindows(recordings, features, config, settings.standing, settings.seconds)
+    windows = PriorWindows(recordings, features, config, settings.standing, settings.seconds, settings.mirrored)
     sources = [source_of(args.data / style, recording) for style, recording in recordings.items()]
     trainer = PriorTrainer(windows, features, settings, args.out, "; ".join(sources))
     trainer.manner = manner_by_speed(list(recordings.values()), robot)
@@ -95,7 +98,9 @@ def learning_rival(folder: Path, prior: Prior, seed: int) -> Rival:
     from servoid.tools.learn.envs.score_term import Rival
 
     discriminator = Discriminator(prior)
-    data = PriorWindows(read_by_style(folder, prior.features.robot), prior.features, prior.config)
+    how = prior.header.get("training", {})  # the same windows as the prior learned from
+    shown = {"standing": how.get("standing", False), "mirrored": how.get("mirrored", True)}
+    data = PriorWindows(read_by_style(folder, prior.features.robot), prior.features, prior.config, **shown)
     return Rival(discriminator, Adversary(discriminator, data, seed))
 
 
@@ -161,7 +166,8 @@ class PriorTrainer(Trainer):
 
     @property
     def following(self) -> str:
-        return f"servoid train policy --task speed --prior {self.best_path} --out runs/speed"
+        task = "carry" if self.features.box else "speed"
+        return f"servoid train policy --task {task} --prior {self.best_path} --out runs/{task}"
 
     def learn(self) -> dict[str, float]:
         import torch
