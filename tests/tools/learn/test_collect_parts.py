@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from servoid.hw.robot.description import load_robot
 from servoid.hw.seeds import episode_seed
+from servoid.policy.recording import read_recording
 from servoid.tools import cli
 from servoid.tools.learn.collect.parts import FleetRecipe, KeptParts, Part, record, what_records
 from servoid.tools.learn.dataset.reader import read_dataset
@@ -53,3 +55,14 @@ def test_another_seed_is_appended_and_the_same_is_refused(tmp_path: Path, capsys
     for seed in ("0", "1"):
         assert cli.main([*words, "--append", "--seed", seed]) == 2
         assert f"seed {seed} is in {out} already" in capsys.readouterr().out
+
+
+def test_what_a_task_policy_does_is_data_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = "collect --worlds 3 --frames 500 --seconds 4 --noise 0 0 --threads 1 --json --out"
+    assert cli.main([*command.split(), str(tmp_path / "walks"), "--policy", "speed"]) == 0
+    recording = read_recording(tmp_path / "walks", load_robot())
+    assert len(recording.action) >= 500
+    assert recording.command.any()
+    capsys.readouterr()
+    assert cli.main([*command.split(), str(tmp_path / "none"), "--policy", "dodgeball"]) == 2
+    assert "is asked for a ball, and what is collected asks for velocity" in capsys.readouterr().out
