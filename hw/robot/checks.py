@@ -106,9 +106,8 @@ def _check_imu(robot: Robot, marks: Marks) -> None:
         raise marks.error("imu.kind", "the board's IMU, but bus.board is none: name another kind, or none")
     if imu.kind in ("opencr", "none"):
         if imu.port is not None:
-            raise marks.error(
-                "imu.port", "the board's IMU is on the servo bus: drop the port, or name another imu.kind"
-            )
+            where = "the board's IMU is on the servo bus" if imu.kind == "opencr" else "imu.kind is none"
+            raise marks.error("imu.port", f"{where}: drop the port, or name another imu.kind")
         return
     if not imu.port:
         raise marks.error("imu.kind", f"a {imu.kind} has a serial port of its own: name it as imu.port")

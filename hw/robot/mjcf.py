@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from servoid.hw.robot.description import Robot
 
+_NAMED = 8  # of the names that there are, where none is near
 _MESHES = (".stl", ".obj", ".msh")  # that MuJoCo reads
 # MuJoCo warns that such a model cannot be saved, which nobody does, and that options differ, which are left out.
 EXPECTED = "Attaching a spec with an empty prefix|Attach conflict"
@@ -93,8 +94,9 @@ def read_spec(path: Path, base: str | None = None) -> mujoco.MjSpec:
         warnings.warn(f"{path}: {text}", stacklevel=2)
     for count, body in enumerate(spec.bodies):
         body.name = body.name or f"body{count}"  # sensors need the names of feet
-        for number, geom in enumerate(body.geoms):
-            if not geom.name and (geom.contype or geom.conaffinity):  # so that a foot can be said to have it
+        # So that a foot can be said to have it. Shapes that only show the robot do not count: some may not be at hand.
+        for number, geom in enumerate(geom for geom in body.geoms if geom.contype or geom.conaffinity):
+            if not geom.name:
                 geom.name = f"{body.name}.{number}"
     return spec
 
@@ -171,7 +173,8 @@ def _check(model: mujoco.MjSpec, robot: Robot, path: Path) -> None:
 def _need(robot: Robot, path: Path, kind: str, wanted: str, present: list[str]) -> None:
     if wanted not in present:
         near = get_close_matches(wanted, present, 1)
-        hint = f"; nearest: {near[0]}" if near else ""
+        some = sorted(name for name in present if name)[:_NAMED]
+        hint = f"; nearest: {near[0]}" if near else f"; there are {', '.join(some)}" if some else ""
         raise ConfigError(f"{path}: no {kind} named {wanted!r}, which robot {robot.name!r} needs{hint}")
 
 
@@ -181,7 +184,10 @@ def _is_urdf(path: Path) -> bool:
 
 def _adapted(path: Path) -> str:
     """A URDF as MuJoCo reads it best. A mesh that only shows the robot and that MuJoCo cannot read is left out."""
-    root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
+    text = path.read_text(encoding="utf-8")
+    if "<xacro:" in text or "${" in text:
+        raise ConfigError(f"{path}: is xacro, of which a URDF is made first: xacro {path.name} > robot.urdf")
+    root = ElementTree.fromstring(text)
     for old in root.findall("mujoco"):
         root.remove(old)
     extension = ElementTree.SubElement(root, "mujoco")

@@ -46,6 +46,11 @@ class TaskPolicy:
         self._target = np.zeros((*shape, len(robot.joints)))
 
     @property
+    def goal(self) -> str:
+        """What it sees of what it is asked: see `GOALS`."""
+        return self._goal.name
+
+    @property
     def adopted(self) -> Adopted | None:
         return None
 

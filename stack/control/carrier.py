@@ -17,6 +17,7 @@ from servoid.hw.geometry import rotate
 from servoid.hw.robot.description import Robot
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.control.tracker import ExpertPolicy
+from servoid.stack.safety.balance import Balance, Feedback
 
 LIFTED = 0.1  # m above the ground: the middle of a box that is higher is held
 APPROACHES, STOPS, PICKS, CARRIES = range(4)  # what it does
@@ -28,17 +29,20 @@ _THERE = 0.03  # m from the place that the box shall come to
 _SPEED, _TURN, _FIRST = 0.22, 0.7, 0.9  # m/s, rad/s, and rad of bearing from which it turns on the spot
 _TAKEN_IN = 0.5  # s in which the arms come home where it lost the box
 # Seconds, knee, lean of the trunk, shoulder pitch and roll, and elbow of the left side [rad]; no knee: as at home.
-_OPEN, _CLOSED = (1.3, 0.0), (1.53, -0.22)
+# Servos that are weak sag forward: with a lean of 0.55 a third of randomised robots fell, with this one none. The arms
+# press with nearly what a servo may push with for long.
+_OPEN, _CLOSED = (1.3, 0.0), (1.53, -0.27)
 _HELD = (-1.05, *_CLOSED)
 _PICKING = (
     (0.5, 0.85, 0.05, -0.9, *_OPEN),
-    (1.2, 2.3, 0.55, -1.2, *_OPEN),
-    (0.3, 2.3, 0.55, -1.2, *_OPEN),
-    (0.5, 2.3, 0.55, -1.2, *_CLOSED),
-    (0.2, 2.3, 0.55, -1.2, *_CLOSED),
+    (1.2, 2.35, 0.4, -1.05, *_OPEN),
+    (0.3, 2.35, 0.4, -1.05, *_OPEN),
+    (0.5, 2.35, 0.4, -1.05, *_CLOSED),
+    (0.2, 2.35, 0.4, -1.05, *_CLOSED),
     (1.2, 0.85, 0.05, *_HELD),
     (0.4, None, 0.0, *_HELD),
 )  # fmt: skip
+_BALANCE = Balance(ankle_pitch=(0.08, 0.0), hip_pitch=(0.04, 0.0))  # meanwhile; its tilt is meant
 _LOOKING_DOWN = 0.4  # rad of the head
 
 
@@ -55,6 +59,7 @@ class Carrier(BasePolicy):
         self._begins = self._ends - seconds
         self._poses = np.stack([_pose(robot, *key[1:]) for key in _PICKING])
         held = _pose(robot, None, 0.0, *_HELD)
+        self._feedback, self._gains = Feedback(robot), _BALANCE.gains
         self._arms = np.ones(len(robot.joints), bool)
         self._arms[robot.leg_index.ravel()] = False
         self._held = np.where(self._arms, held, robot.home)
@@ -102,7 +107,8 @@ class Carrier(BasePolicy):
         carries = (self.stage == CARRIES) & (self._since > _STILL) & ~there
         velocity = np.where(carries[..., None], bring, velocity)
         walked = self._walk(state, applied, Instruction(velocity))
-        return np.where((self.stage == PICKS)[..., None], self._picked(), walked)
+        picked = self._feedback(self._picked(), state.gravity, state.angular_velocity, self._gains)
+        return np.where((self.stage == PICKS)[..., None], picked, walked)
 
     def _walk(self, state: State, applied: Array, told: Instruction) -> Array:
         """By the expert, who sees the arms where it would have them."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -16,6 +16,7 @@ from servoid.hw.robot.mjcf import compiled, read_spec
 from servoid.policy.references.gait import Gait
 from servoid.sim.model import build
 from servoid.tools.robots.couplings import couplings
+from servoid.tools.robots.facts import Comparison, file_findings
 
 _POSES = 50
 _EXACT = 1e-6  # m
@@ -27,19 +28,8 @@ _LOADED = 0.6  # share of its stall torque that a servo may need to hold the rob
 _LEVEL = 0.05  # rad that soles may lean against each other at home
 _UPRIGHT = 0.15  # rad that the base may lean at home
 _STIFF = 1.5  # times the stiffness at which a robot topples at home by its weight alone
+_RAISED = 3.0  # times that a servo's P gain can be raised by: beyond, only a stronger one holds the robot
 _WHIP = 4.0  # times the speed that a goal may have, that the gait's joints may ask for: servos lag behind
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Something that was compared, and whether it is as it should be. Where it is not: at these joints, and at these
-    places [m] at home, in the base's frame."""
-
-    good: bool
-    what: str
-    found: str
-    joints: tuple[str, ...] = ()
-    places: tuple[tuple[float, float, float], ...] = ()
 
 
 def findings(robot: Robot) -> list[Comparison]:
@@ -52,8 +42,7 @@ def findings(robot: Robot) -> list[Comparison]:
         Comparison(
             True, "weight and height", f"{mass:.2f} kg, base {robot.standing_height:.3f} m above the ground at home"
         ),
-        Comparison(True, "walking", _asked(robot)),
-        _supply(robot),
+        *file_findings(robot),
         _kinematics(robot, model, data, joints),
         *_gears(robot),
         _apart(robot, model),
@@ -93,30 +82,6 @@ def _kinematics(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints
             worst = max(worst, float(np.abs(data.sensor(f"servoid/{foot}_position").data - sole).max()))
     text, at_home = f"soles {worst:.1e} m from MuJoCo's at {_POSES} random poses", legs.soles(legs.pick(robot.home))[0]
     return Comparison(worst < _EXACT, "kinematics", text, places=_places(*at_home) if worst >= _EXACT else ())
-
-
-def _asked(robot: Robot) -> str:
-    """What a controller may ask of the robot."""
-    walks = robot.walking
-    return (
-        f"at most {walks.forward:.2f} m/s ahead, {walks.backward:.2f} back, {walks.sideways:.2f} aside and "
-        f"{walks.turning:.2f} rad/s: give less as `walking` if its servos are too slow or too weak for it"
-    )
-
-
-def _supply(robot: Robot) -> Comparison:
-    """One voltage suits all servos, as they hang on one bus and one supply."""
-    lowest = max(robot.servos, key=lambda servo: servo.voltage_range[0])
-    highest = min(robot.servos, key=lambda servo: servo.voltage_range[1])
-    low, high, given = lowest.voltage_range[0], highest.voltage_range[1], robot.bus.supply_voltage
-    if low > high:
-        text = f"a {lowest.name} needs {low:g} V, and a {highest.name} bears {high:g} V at most"
-    elif given is not None and not low <= given <= high:
-        text = f"bus.supply_voltage, {given:g} V, is outside the {low:g} to {high:g} V that all servos work at"
-    else:
-        return Comparison(True, "supply", f"all servos work at {low:g} to {high:g} V")
-    wrong = [j.name for j, servo in zip(robot.joints, robot.servos, strict=True) if servo.name == highest.name]
-    return Comparison(False, "supply", text, tuple(wrong) if low > high else ())
 
 
 def _gears(robot: Robot) -> list[Comparison]:
@@ -238,7 +203,8 @@ def _load(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints: Arra
     leg, joint = np.unravel_index(int((torque / stall).argmax()), torque.shape)
     share = float((torque / stall)[leg, joint])
     name = robot.names[legs.index[leg, joint]]
-    text, good = f"{name} needs most: {100 * share:.0f} % of its stall torque", share < _LOADED
+    good = share < _LOADED
+    text = f"{name} needs most: {100 * share:.0f} % of its stall torque{'' if good else ': give it a stronger servo'}"
     return Comparison(good, "servos at home", text, () if good else (name,))
 
 
@@ -271,7 +237,10 @@ def _stiffness(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, joints:
     times = 1.0 / max(float(share), 1e-3)
     good = times > _STIFF
     more = np.ceil(10.0 * _STIFF / times) / 10.0
-    hint = "" if good else f": it sinks and topples; raise the servos' P gain {more:.1f} times, and their stiffness too"
+    remedy = (
+        f"raise the servos' P gain {more:.1f} times, and their stiffness too" if more < _RAISED else "stronger servos"
+    )
+    hint = "" if good else f": it sinks and topples; {remedy}"
     return Comparison(good, "stiffness at home", f"{times:.1f} times what it takes to stand{hint}")
 
 
@@ -285,8 +254,13 @@ def steps(robot: Robot) -> Comparison:
     legs = set(Legs(robot).index.ravel().tolist())  # others may rest at an end, and are held off it
     wrong = [name for i, name in enumerate(robot.names) if np.asarray(beyond)[i] and i in legs]
     speed = float(np.abs(np.diff(pose, axis=0, append=pose[:1])).max() * 24 / gait.settings.cycle)
-    fast = speed > _WHIP * robot.limits.joint_speed
-    text = f"beyond the ranges of {', '.join(wrong)}" if wrong else f"within the ranges, joints up to {speed:.1f} rad/s"
+    most = _WHIP * robot.limits.joint_speed
+    fast = speed > most
+    text = (
+        f"beyond the ranges of {', '.join(wrong)}"
+        if wrong
+        else f"within the ranges, joints up to {speed:.1f} of {most:.1f} rad/s"
+    )
     hint = (
         ": no servo follows; bend the knees at home, or search for other steps with servoid tune gait" if fast else ""
     )

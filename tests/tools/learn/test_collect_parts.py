@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
+from servoid.hw.robot.description import load_robot
 from servoid.hw.seeds import episode_seed
+from servoid.policy.recording import read_recording
 from servoid.tools import cli
 from servoid.tools.learn.collect.parts import FleetRecipe, KeptParts, Part, record, what_records
+from servoid.tools.learn.collect.skills import Commands
 from servoid.tools.learn.dataset.reader import read_dataset
 
 COMMAND = "collect --policy gait --plain-odometry --worlds 8 --frames 1500 --seconds 5 --threads 1 --json --out"
@@ -53,3 +57,26 @@ def test_another_seed_is_appended_and_the_same_is_refused(tmp_path: Path, capsys
     for seed in ("0", "1"):
         assert cli.main([*words, "--append", "--seed", seed]) == 2
         assert f"seed {seed} is in {out} already" in capsys.readouterr().out
+
+
+def test_what_a_task_policy_does_is_data_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = "collect --worlds 3 --frames 500 --seconds 4 --noise 0 0 --threads 1 --json --out"
+    assert cli.main([*command.split(), str(tmp_path / "walks"), "--policy", "speed"]) == 0
+    recording = read_recording(tmp_path / "walks", load_robot())
+    assert len(recording.action) >= 500
+    assert recording.command.any()
+    capsys.readouterr()
+    assert cli.main([*command.split(), str(tmp_path / "none"), "--policy", "dodgeball"]) == 2
+    assert "is asked for a ball, and what is collected asks for velocity" in capsys.readouterr().out
+
+
+def test_one_velocity_is_asked_after_it_stood() -> None:
+    commands = Commands(load_robot(), 4, always=(0.3, 0.0, 0.0))
+    commands.begin(np.arange(4))
+    rngs = [np.random.default_rng(i) for i in range(4)]
+    commands.advance(rngs)
+    assert not commands.velocity.any()
+    for _ in range(400):
+        commands.advance(rngs)
+        assert {tuple(row) for row in commands.velocity} <= {(0.0, 0.0, 0.0), (0.3, 0.0, 0.0)}
+    assert commands.velocity == pytest.approx(np.tile([0.3, 0.0, 0.0], (4, 1)))

@@ -18,6 +18,7 @@ from servoid.stack.control.fleet import Fleet
 from servoid.stack.estimation.odometry import odometry_of
 from servoid.tools.cli import main
 from servoid.tools.robots.compare import findings
+from servoid.tools.robots.facts import file_findings
 from servoid.tools.robots.home import bent_home
 
 ROBOTS = CONFIGS / "robots"
@@ -138,6 +139,35 @@ def test_a_mesh_that_collides_and_is_missing_is_named_with_where_it_is_looked_fo
     (tmp_path / "own.urdf").write_text(f'<robot name="own"><link name="foot">{shape}</link></robot>')
     assert main(["robot", "import", str(tmp_path / "own.urdf"), "--no-picture"]) == 2
     assert "'foot': collision mesh package://own/foot.stl: no such file beside the URDF" in capsys.readouterr().err
+
+
+def test_a_xacro_file_is_named_as_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "own.urdf").write_text('<robot name="own"><link name="${side}_foot"/></robot>')
+    assert main(["robot", "import", str(tmp_path / "own.urdf"), "--no-picture"]) == 2
+    assert "is xacro, of which a URDF is made first: xacro own.urdf > robot.urdf" in capsys.readouterr().err
+
+
+def test_a_shapes_number_does_not_depend_on_meshes_that_only_show_the_robot(tmp_path: Path) -> None:
+    """Drafted where they were not at hand, a robot's file named other geoms where they were."""
+    text = (ROBOTS / "wren.xml").read_text()
+    sole = '<geom name="l_sole"'
+    assert text.count(sole) == 1
+    text = text.replace(sole, '<geom size="0.01" contype="0" conaffinity="0" mass="0"/><geom')
+    (tmp_path / "wren.xml").write_text(text)
+    own = (ROBOTS / "wren.yaml").read_text()
+    assert own.count("l_sole") == 1
+    (tmp_path / "wren.yaml").write_text(own.replace("l_sole", "l_ank_roll_link.1"))
+    assert load_robot(tmp_path / "wren.yaml").feet["left"].half_size == load_robot("wren").feet["left"].half_size
+
+
+def test_a_foot_too_few_and_a_rate_that_physics_does_not_have_are_shown() -> None:
+    wren = load_robot("wren")
+    one = replace(wren, rate=60, feet={"left": wren.feet["left"]})
+    wrong = {found.what: found.found for found in file_findings(one) if not found.good}
+    assert wrong == {
+        "feet": "1: left: a humanoid has two",
+        "rate": "60 Hz, of the physics' 250 steps a second: one that divides them is needed in simulation",
+    }
 
 
 def test_servos_that_no_one_supply_feeds_are_shown() -> None:

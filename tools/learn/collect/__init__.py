@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--policy",
         default="expert",
         metavar="NAME|FILE",
-        help="expert, gait or a tracker's checkpoint (default: expert)",
+        help="expert, gait, or a checkpoint of a tracker or of a task policy (default: expert)",
     )
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
     parser.add_argument("--skills", action="store_true", help="perform skills, too, by their tracker")

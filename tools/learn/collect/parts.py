@@ -18,7 +18,7 @@ import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.control import Policy
-from servoid.hw.robot.description import load_robot
+from servoid.hw.robot.description import Robot, load_robot
 from servoid.tools.learn.collect.disturbances import DisturbanceSettings
 from servoid.tools.learn.collect.episode_cutter import Drilled, EpisodeCutter, RecordedEpisode
 from servoid.tools.learn.collect.performances import Performances
@@ -90,9 +90,7 @@ class FleetRecipe:
         from servoid.sim.worlds import Worlds
         from servoid.stack.control.carrier import Carrier
         from servoid.stack.control.fleet import Fleet
-        from servoid.stack.control.gait import GaitPolicy
         from servoid.stack.control.styled import StyledExpert
-        from servoid.stack.control.tracker import ExpertPolicy
         from servoid.stack.estimation.odometry import load_odometry
         from servoid.stack.tasks.learned.carry import Carry
         from servoid.tools.learn.collect.carrying import Carrying
@@ -104,13 +102,14 @@ class FleetRecipe:
         if told is not None:
             policy = told
         elif self.carry:
-            policy, script = Carrier(robot, shape, self.policy), Carrying(robot, self.worlds)
+            learned = _task_policy(self.policy, robot, shape, ("box",))
+            policy, script = learned or Carrier(robot, shape, self.policy), Carrying(robot, self.worlds)
             model = build(robot, Carry(robot).scene)
             count = Worlds(robot, self.worlds, threads=self.threads, randomise=self.randomise, model=model)
         elif self.style is not None:
             policy = StyledExpert(robot, load_style(self.style, robot), self.policy, shape)
         else:
-            policy = GaitPolicy(robot, shape) if self.policy == "gait" else ExpertPolicy(robot, self.policy, shape)
+            policy = _walker(self.policy, robot, shape)
         odometry = None if self.plain_odometry else load_odometry(robot)
         fleet = Fleet(robot, count, odometry, randomise=self.randomise, seed=seed, threads=self.threads)
         script = script or Commands(robot, self.worlds, self.crouched, self.velocity)
@@ -229,6 +228,31 @@ def recorded(
 
     yield from cutter.episodes(part.frames, told)
     tally.add(cutter.begun, cutter.fell, cutter.walked)
+
+
+def _walker(name: str, robot: Robot, shape: tuple[int, ...]) -> Policy:
+    """The gait, a tracker of it, or a task policy that is asked a velocity. Raises ConfigError."""
+    from servoid.stack.control.gait import GaitPolicy
+    from servoid.stack.control.tracker import ExpertPolicy
+
+    if name == "gait":
+        return GaitPolicy(robot, shape)
+    return _task_policy(name, robot, shape, ("velocity", "steering")) or ExpertPolicy(robot, name, shape)
+
+
+def _task_policy(name: str, robot: Robot, shape: tuple[int, ...], goals: tuple[str, ...]) -> Policy | None:
+    """A task policy that sees one of these goals; None for a checkpoint of another kind. Raises ConfigError for one
+    that sees something else."""
+    from servoid.policy.checkpoint import read_header, resolve
+    from servoid.policy.priors.task_policy import KIND, TaskPolicy
+
+    path = resolve(name, robot)
+    if read_header(path)["kind"] != KIND:
+        return None
+    policy = TaskPolicy(robot, path, shape)
+    if policy.goal not in goals:
+        raise ConfigError(f"--policy {name}: is asked for a {policy.goal}, and what is collected asks for {goals[0]}")
+    return policy
 
 
 def _style_source(name: str) -> dict[str, str]:

@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument(
         "--style-weight", type=float, default=1.0, metavar="X", help="weight of classifier-free guidance (default: 1)"
     )
-    run.add_argument("--init", type=Path, metavar="CHECKPOINT", help="start from this task policy")
+    run.add_argument("--init", metavar="NAME|FILE", help="start from this task policy")
     run.add_argument(
         "--demonstrations", type=Path, metavar="DIR", help="start from a network that imitates this dataset"
     )
@@ -117,7 +117,7 @@ def main(args: argparse.Namespace) -> int:
     env = environment(task, prior, style, settings, settings.worlds, settings.seed, rival)
     trainer = PolicyTrainer(env, style, settings, args.out, found)
     trainer.rival = rival
-    trainer.start(args.resume, args.init)
+    trainer.start(args.resume, None if args.init is None else checkpoint.resolve(args.init, robot))
     if args.demonstrations is not None and not trainer.begun_with:
         trainer.imitate(args.demonstrations)
     if args.measure:

@@ -166,7 +166,8 @@ class PriorTrainer(Trainer):
 
     @property
     def following(self) -> str:
-        return f"servoid train policy --task speed --prior {self.best_path} --out runs/speed"
+        task = "carry" if self.features.box else "speed"
+        return f"servoid train policy --task {task} --prior {self.best_path} --out runs/{task}"
 
     def learn(self) -> dict[str, float]:
         import torch
