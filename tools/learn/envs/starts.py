@@ -202,7 +202,10 @@ class AlongCarrying:
     def __init__(self, robot: Robot, share: float, seed: int) -> None:
         """Rolls out the script first. Raises ConfigError where a share is to begin along it and it holds no box."""
         self._task, self._share = Carry(robot), share
-        self._states, self._boxes = _carried(robot, seed) if share > 0.0 else (None, np.zeros((0, 1, 7)))
+        self._states: States | None = None
+        self._boxes = np.zeros((0, 1, 7))
+        if share > 0.0:
+            self._states, self._boxes = _carried(robot, seed)
 
     def draw(self, rngs: Sequence[np.random.Generator], where: Array) -> Start:
         """Starts of the worlds `where` `(n,)` bool; a row for each world."""
