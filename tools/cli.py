@@ -59,9 +59,8 @@ VERBS: dict[str, Verb] = {
             "play": Verb("play a clip open loop in physics", "servoid.tools.motions.verbs.play"),
             "film": Verb("film clips, or draw strips of them", "servoid.tools.motions.verbs.film"),
             "check": Verb("check joint ranges, speeds and feet of clips", "servoid.tools.motions.verbs.check"),
-            "mirror": Verb("swap left and right", "servoid.tools.motions.verbs.derive.mirror"),
-            "gait": Verb("make a clip of the gait", "servoid.tools.motions.verbs.derive.gait"),
-            "blend": Verb("join two clips", "servoid.tools.motions.verbs.derive.blend"),
+            "mirror": Verb("swap left and right", "servoid.tools.motions.verbs.mirror"),
+            "blend": Verb("join two clips", "servoid.tools.motions.verbs.blend"),
         },
     ),
     "dataset": Verb(

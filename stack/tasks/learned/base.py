@@ -66,12 +66,8 @@ class LearnedTask(ABC):
 
     @property
     def scene(self) -> Scene | None:
-        """What is there beside the robot, at places that `place` draws; None: nothing."""
+        """What is there beside the robot; None: nothing."""
         return None
-
-    def place(self, rng: np.random.Generator) -> Array:
-        """Where the things of the scene are as an episode begins `(things, 7)`, in the frame that it begins in."""
-        return np.zeros((0, 7))
 
     @property
     def grounded(self) -> bool:

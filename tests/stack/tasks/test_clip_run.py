@@ -63,6 +63,8 @@ def test_episodes_begin_in_the_first_pose_of_the_clip_or_along_it() -> None:
     rngs = [np.random.default_rng(i) for i in range(6)]
     first = AlongClip(ROBOT, clip, 0.0, 0).draw(rngs, where)
     assert first.joints == pytest.approx(np.tile(clip.joints[0], (6, 1)))
+    loop = replace(clip, about=replace(clip.about, loop=True))
+    assert AlongClip(ROBOT, loop, 0.0, 0).draw(rngs, where).joints == pytest.approx(np.tile(ROBOT.home, (6, 1)))
     along = AlongClip(ROBOT, clip, 1.0, 0).draw(rngs, where)
     assert along.joints is not None
     assert np.ptp(along.joints, axis=0).max() > 0.5  # some stand, some sit

@@ -45,7 +45,6 @@ NEEDED = {
     "motions retarget": "a.bvh --licence MIT --out o",
     "motions film": "k --library lib --out o",
     "motions mirror": "k --library lib --out o",
-    "motions gait": "--name k --velocity 0.2 0 0 --library lib --out o",
     "motions blend": "k l --name n --library lib --out o",
     "bringup setup": "l_knee --port virtual", "bringup jog": "l_knee --port virtual",
 }  # fmt: skip

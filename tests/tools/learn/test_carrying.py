@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from servoid.hw.config import ConfigError
+from servoid.hw.geometry import yaw_of
 from servoid.hw.robot.description import load_robot
 from servoid.policy.priors.features import PriorFeatures
 from servoid.policy.priors.goals import GOALS
@@ -20,6 +21,7 @@ from servoid.stack.tasks.learned import load_learned_task
 from servoid.stack.tasks.learned.carry import STANDS
 from servoid.tools import cli
 from servoid.tools.learn.demonstrations import demonstrated
+from servoid.tools.learn.envs.starts import AlongCarrying
 from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.policy import environment
 
@@ -92,3 +94,17 @@ def test_demonstrations_are_of_what_was_told(recording: Recording) -> None:
 def test_carrying_is_not_mixed_with_other_drills() -> None:
     assert cli.main(["collect", "--carry", "--skills", "--out", "x"]) == 2
     assert cli.main(["collect", "--only", "bow", "--out", "x"]) == 2
+
+
+@pytest.mark.slow
+def test_episodes_begin_before_a_box_or_with_one_in_the_arms() -> None:
+    where, rngs = np.ones(8, bool), [np.random.default_rng(i) for i in range(8)]
+    stands = AlongCarrying(ROBOT, 0.0, 0).draw(rngs, where)
+    assert stands.objects is not None
+    assert stands.objects[:, 0, 2] == pytest.approx(STANDS)
+    begun = AlongCarrying(ROBOT, 1.0, 0).draw(rngs, where)
+    assert begun.objects is not None
+    boxes = begun.objects[:, 0]
+    assert np.linalg.norm(boxes[:, :2], axis=-1) == pytest.approx([0.17] * 8, abs=0.06)  # m: at hand
+    assert (boxes[:, 2] > 0.15).any(), "none is held"
+    assert yaw_of(begun.orientation) == pytest.approx(0.0, abs=1e-6)  # an episode's frame is that of its first heading

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -12,6 +13,7 @@ from servoid.hw.seeds import episode_seed
 from servoid.policy.recording import read_recording
 from servoid.tools import cli
 from servoid.tools.learn.collect.parts import FleetRecipe, KeptParts, Part, record, what_records
+from servoid.tools.learn.collect.skills import Commands
 from servoid.tools.learn.dataset.reader import read_dataset
 
 COMMAND = "collect --policy gait --plain-odometry --worlds 8 --frames 1500 --seconds 5 --threads 1 --json --out"
@@ -66,3 +68,15 @@ def test_what_a_task_policy_does_is_data_too(tmp_path: Path, capsys: pytest.Capt
     capsys.readouterr()
     assert cli.main([*command.split(), str(tmp_path / "none"), "--policy", "dodgeball"]) == 2
     assert "is asked for a ball, and what is collected asks for velocity" in capsys.readouterr().out
+
+
+def test_one_velocity_is_asked_after_it_stood() -> None:
+    commands = Commands(load_robot(), 4, always=(0.3, 0.0, 0.0))
+    commands.begin(np.arange(4))
+    rngs = [np.random.default_rng(i) for i in range(4)]
+    commands.advance(rngs)
+    assert not commands.velocity.any()
+    for _ in range(400):
+        commands.advance(rngs)
+        assert {tuple(row) for row in commands.velocity} <= {(0.0, 0.0, 0.0), (0.3, 0.0, 0.0)}
+    assert commands.velocity == pytest.approx(np.tile([0.3, 0.0, 0.0], (4, 1)))

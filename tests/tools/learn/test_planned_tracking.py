@@ -15,6 +15,8 @@ from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import resolve
 from servoid.policy.motion.library import Library
 from servoid.policy.tracker.network import load_tracker
+from servoid.policy.tracker.observation import RESIDUAL
+from servoid.stack.control.tracker import Followers
 from servoid.tools.learn.envs.acts import NEAR, PLANS, WORDS
 from servoid.tools.learn.envs.planned import PlannedTracking
 from servoid.tools.learn.envs.score_term import AdversarialTerm
@@ -104,6 +106,22 @@ def test_what_is_trained_so_is_a_tracker_of_any_reference(planner: str, tmp_path
     assert {"upright/reach", "upright/sit-rise", "walking"} <= row.keys()
     trainer.ship(tmp_path / "tracker.safetensors", {})
     assert load_tracker(tmp_path / "tracker.safetensors", ROBOT)[1].clips
+
+
+def test_a_pupil_of_key_points_walks_itself_and_is_taught_on_plans(planner: str, tmp_path: Path) -> None:
+    walks = tmp_path / "walks.yaml"
+    walks.write_text(
+        Path(planner).read_text(encoding="utf-8").replace("walker: ''", "walker: expert"), encoding="utf-8"
+    )
+    assert _environment(str(walks), n=2).motions._walker is not None
+    env = _environment(str(walks), n=2, points=True, teacher="tracker")
+    assert env.motions._walker is None
+    teacher = Followers(ROBOT, "tracker", "expert", (2,))
+    for _ in range(4):
+        expected = teacher(env.fleet.state, env.fleet.applied, env.reference)
+        np.testing.assert_allclose(ROBOT.home + RESIDUAL * env.taught, expected, atol=1e-9)
+        _, done, _ = env.step(env.taught)
+        assert not done.any()
 
 
 @pytest.mark.slow

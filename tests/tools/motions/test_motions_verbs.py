@@ -112,6 +112,15 @@ def test_a_run_becomes_a_clip(tmp_path: Path, motions: Motions, monkeypatch: pyt
     clip = Library(ROBOT, tmp_path / "clips")["walk"]
     assert answer["clips"][0]["ticks"] == clip.ticks == pytest.approx(100, abs=2)
     assert clip.root_position[-1, 0] > 0.1
+    cut = ("import", log, "--name", "cycle", "--measured", "--part", 1, 1.5, "--loop", *told)
+    assert motions(*cut)[0] == 0
+    cycle = Library(ROBOT, tmp_path / "clips")["cycle"]
+    assert (cycle.ticks, cycle.about.loop) == (25, True)
+    off = np.abs(cycle.joints - clip.joints[50:75])
+    assert 0.01 < off.max() < 0.5, "joints are not quite where their goals are"
+    code, answer, _ = motions("import", log, "--name", "late", "--part", 1, 5, *told)
+    assert code == 2
+    assert "--part 1 5: the task of" in answer["error"]
 
 
 @pytest.mark.parametrize(

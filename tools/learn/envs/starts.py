@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array, Command, Mode
 from servoid.hw.contracts.world import Start
-from servoid.hw.geometry import turned, up_vector
+from servoid.hw.geometry import headed, turned, up_vector
 from servoid.hw.robot.description import Robot
 from servoid.hw.robot.legs import Legs
 from servoid.policy.motion.clip import Clip
 from servoid.policy.references.clip import ClipReference
+from servoid.sim.model import build
 from servoid.sim.truth import SimulatedTruth
 from servoid.sim.worlds import Worlds
+from servoid.stack.control.carrier import PICKS, Carrier
 from servoid.stack.control.fleet import Fleet
+from servoid.stack.estimation.odometry import load_odometry
+from servoid.stack.tasks.learned.carry import LIFTED, Carry
+from servoid.tools.learn.collect.carrying import Carrying, box_seen
 
 _SETTLE_SECONDS = 2.0
 _FALL_SECONDS = 1.2
@@ -29,6 +34,7 @@ _HEIGHT_DEVIATION = 0.3  # of the standing height, likewise
 
 
 _ROLLED_OUT = 16  # bodies that follow a clip that is imitated
+_CARRIERS, _CARRYING_SECONDS = 24, 14.0  # bodies that carry by a script, and how long it takes to be on the way
 
 
 @dataclass(frozen=True)
@@ -187,3 +193,60 @@ def _either(moves: Array, moving: States, begin: Start) -> Start:
     parts = ("joints", "position", "orientation", "velocity", "angular_velocity", "joint_velocity")
     chosen = {name: np.where(moves[:, None], vars(moving)[name], getattr(begin, name)) for name in parts}
     return Start(**chosen)
+
+
+class AlongCarrying:
+    """Draws how episodes of carrying begin: standing before a box, or a `share` of them as a script picks one up or
+    walks with it."""
+
+    def __init__(self, robot: Robot, share: float, seed: int) -> None:
+        """Rolls out the script first. Raises ConfigError where a share is to begin along it and it holds no box."""
+        self._task, self._share = Carry(robot), share
+        self._states: States | None = None
+        self._boxes = np.zeros((0, 1, 7))
+        if share > 0.0:
+            self._states, self._boxes = _carried(robot, seed)
+
+    def draw(self, rngs: Sequence[np.random.Generator], where: Array) -> Start:
+        """Starts of the worlds `where` `(n,)` bool; a row for each world."""
+        robot, n = self._task.robot, len(where)
+        boxes, picked = np.tile(self._task.place(np.random.default_rng(0)), (n, 1, 1)), np.full(n, -1)
+        for i in np.flatnonzero(where).tolist():
+            boxes[i] = self._task.place(rngs[i])
+            if self._states is not None and rngs[i].random() < self._share:
+                picked[i] = rngs[i].integers(len(self._boxes))
+        joints = np.tile(robot.home, (n, 1))
+        still = np.zeros((n, 3))
+        begin = Start(
+            joints=joints, position=np.tile([0.0, 0.0, np.nan], (n, 1)),
+            orientation=np.tile(Legs(robot).stand(robot.home[None])[1], (n, 1)), velocity=still,
+            angular_velocity=still.copy(), joint_velocity=np.zeros_like(joints), objects=boxes,
+        )  # fmt: skip
+        if self._states is None:
+            return begin
+        rows = np.maximum(picked, 0)
+        found = _either(picked >= 0, self._states.only(rows), begin)
+        return replace(found, objects=np.where((picked >= 0)[:, None, None], self._boxes[rows], boxes))
+
+
+def _carried(robot: Robot, seed: int) -> tuple[States, Array]:
+    """States of a nominal robot that picks up and carries, seen from where it is and faces, and of the boxes then
+    `(k, 1, 7)`. Raises ConfigError where none is held in the end."""
+    worlds = Worlds(robot, _CARRIERS, model=build(robot, Carry(robot).scene))
+    fleet, script = Fleet(robot, worlds, load_odometry(robot), seed=seed), Carrying(robot, _CARRIERS)
+    carrier, everywhere, kept = Carrier(robot, (_CARRIERS,)), np.ones(_CARRIERS, bool), []
+    fleet.draw(everywhere)
+    fleet.reset(everywhere, script.start(fleet.rngs, everywhere))
+    carrier.reset(None, fleet.seeds)
+    for tick in range(round(_CARRYING_SECONDS * robot.rate)):
+        state = fleet.observe()
+        fleet.step(carrier.act(state, fleet.applied, script.instruction(state, fleet.truth)))
+        rows = np.flatnonzero(carrier.stage >= PICKS) if tick % _EVERY == 0 else np.zeros(0, int)
+        found, yaw = States.of(fleet.truth, rows, np.full(len(rows), -1), 0.0), fleet.truth.yaw[rows]
+        ahead = replace(found, orientation=headed(found.orientation, -yaw), velocity=fleet.truth.velocity[rows].copy())
+        kept.append((rows, ahead, box_seen(fleet.truth)[rows][:, None]))
+    good = (fleet.truth.objects[:, 0, 2] > LIFTED) & ~script.fallen(fleet.truth)
+    states = States.joined([part.only(good[rows]) for rows, part, _ in kept])
+    if not len(states.joints):
+        raise ConfigError(f"none of {_CARRIERS} robots holds its box in the end: use --generated 0")
+    return states, np.concatenate([boxes[good[rows]] for rows, _, boxes in kept])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -24,10 +25,11 @@ from servoid.stack.tasks.learned import LearnedTask, TaskState
 from servoid.tools.learn.collect.carrying import box_seen
 from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.score_term import GeneratedStarts, Manner
-from servoid.tools.learn.envs.starts import AlongClip
+from servoid.tools.learn.envs.starts import AlongCarrying, AlongClip
 from servoid.tools.learn.prior_settings import EpisodeSettings
 from servoid.tools.learn.terms import Terms
 
+Starts: TypeAlias = GeneratedStarts | Down | AlongClip | AlongCarrying  # how episodes begin
 _FULL_PUSH, _FULL_PACE = 0.5, 0.6  # of the training, over which pushes, and the pace of a lead, grow
 _FULL, _STILL = 0.25, 0.2  # rad of error and rad/s at which a servo pushes with nearly all it has, and does not move
 _HARD = 40.0  # m/s2 of a knock that counts: four times gravity
@@ -67,7 +69,7 @@ class TaskEnvironment:
     """`n` worlds: see `servoid.tools.learn.trainers.ppo.Environment`. A tick of that is a decision here."""
 
     def __init__(
-        self, task: LearnedTask, score: Manner, starts: GeneratedStarts | Down | AlongClip | None, odometry: Mlp | None,
+        self, task: LearnedTask, score: Manner, starts: Starts | None, odometry: Mlp | None,
         s: EpisodeSettings, n: int, seed: int,
     ) -> None:  # fmt: skip
         """Call `reset` first. Episodes begin as `starts` has them, or without them standing."""
@@ -75,7 +77,7 @@ class TaskEnvironment:
         self.task, self.score, self.settings, self.robot, self.n = task, score, s, robot, n
         self.generated = starts if isinstance(starts, GeneratedStarts) else None
         self.down = starts if isinstance(starts, Down) else None
-        self.along = starts if isinstance(starts, AlongClip) else None
+        self.along = starts if isinstance(starts, AlongClip | AlongCarrying) else None
         scene, known = task.scene, odometry if task.seen.odometry else None
         worlds = n if scene is None else Worlds(robot, n, randomise=s.randomised, model=build(robot, scene))
         self.fleet = Fleet(robot, worlds, known, randomise=s.randomised, seed=seed)
@@ -140,9 +142,6 @@ class TaskEnvironment:
         fleet, windows = self.fleet, None
         if self.down is not None:
             start = self.down.draw(fleet.rngs, where)
-        elif self.task.scene is not None:
-            things = np.stack([self.task.place(rng) for rng in fleet.rngs])  # a row for each world; those `where` count
-            start = Start(velocity=np.zeros((self.n, 3)), objects=things)
         elif self.along is not None:
             start = self.along.draw(fleet.rngs, where)
         elif self.generated is not None:

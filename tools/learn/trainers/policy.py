@@ -28,7 +28,7 @@ from servoid.policy.priors.task_policy import KIND, save_task_policy
 from servoid.policy.rising.policy import KIND as RISING
 from servoid.policy.rising.policy import save_rising_policy
 from servoid.stack.tasks.learned import LearnedTask, load_learned_task
-from servoid.tools.learn.envs.task_environment import TaskEnvironment
+from servoid.tools.learn.envs.task_environment import Starts, TaskEnvironment
 from servoid.tools.learn.envs.task_judge import measure
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.prior_settings import PolicyTraining
@@ -179,7 +179,7 @@ def environment(
         ScoreTerm,
         SmilingTerm,
     )
-    from servoid.tools.learn.envs.starts import AlongClip
+    from servoid.tools.learn.envs.starts import AlongCarrying, AlongClip
 
     robot = task.robot
     if prior is not None and prior.features.box != (task.scene is not None):
@@ -189,7 +189,7 @@ def environment(
             f"data that {'show none' if task.scene is None else 'show one (servoid collect --carry)'}"
         )
     score = Manner(worlds, settings.decide_every, np.full(len(robot.joints), settings.reach))
-    starts: GeneratedStarts | Down | AlongClip | None = None
+    starts: Starts | None = None
     if prior is not None:
         given = prior, style, worlds, settings, seed
         if rival is None:
@@ -199,7 +199,8 @@ def environment(
     if task.lies:
         starts = Down(robot, settings.eased, settings.starts, seed)
     elif task.scene is not None:
-        pass  # standing: a box that is held takes hands that touch it, which a sample does not come close enough to
+        # Not from samples of the prior: a box that is held takes hands that touch it to a fraction of a millimetre.
+        starts = AlongCarrying(robot, settings.generated, seed)
     elif task.motion is not None:
         starts = AlongClip(robot, task.motion, settings.generated, seed)
     elif prior is not None:

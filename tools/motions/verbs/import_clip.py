@@ -2,7 +2,8 @@
 
 From an action file it plays the chain of pages that starts with --page, as the firmware does, in physics, which gives
 the motion of the base; or it makes all clips of a --recipe, a YAML file that lists pages, names and captions. From a
-flight log it takes the goals that were sent and the motion of the base that the robot estimated. From a dataset it
+flight log it takes the goals that were sent, or with --measured where the joints were, and the motion of the base that
+the robot estimated. From a dataset it
 takes the actions of an --episode, and the motion of the base, or where there is none that of physics.
 """
 
@@ -43,6 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for end in ("begins", "ends"):
         about = f"how the clip {end}: {', '.join(POSES)} (default: upright)"
         one.add_argument(f"--{end}", choices=POSES, default="upright", metavar="POSE", help=about)
+    one.add_argument("--measured", action="store_true", help="of a flight log: where joints were, not their goals")
+    one.add_argument(
+        "--part", type=float, nargs=2, metavar=("FROM", "UNTIL"), help="of a flight log: these seconds of its task"
+    )
     one.add_argument("--loop", action="store_true", help="the last frame leads back to the first")
     add_out_arguments(parser)
     parser.add_argument("--robot", default="op3", metavar="NAME|FILE", help="robot (default: op3)")
@@ -58,6 +63,8 @@ def main(args: argparse.Namespace) -> int:
         for option, fits in (("page", args.file.suffix == ".bin"), ("episode", args.file.is_dir())):
             if vars(args)[option] is not None and not fits:
                 raise ConfigError(f"--{option} {vars(args)[option]}: {args.file} has none: drop it")
+        if args.file.suffix != ".mcap" and (args.measured or args.part is not None):
+            raise ConfigError(f"--measured and --part are of flight logs, and {args.file} is none: drop them")
         recipe = _recipe(args)
         library = out_library(args, robot)
         clips: Iterable[Clip]
@@ -71,7 +78,7 @@ def main(args: argparse.Namespace) -> int:
             about = wanted.about(source, recipe.licence)
             clips = [clip_of_episode(args.file, args.episode, robot, wanted.name, about)]
         else:
-            clips = [_from_log(args.file, recipe.clips[0], recipe.licence, robot)]
+            clips = [_from_log(args, recipe.clips[0], recipe.licence, robot)]
         made = []
         for clip in clips:
             path = library.add(clip, replace=args.replace)
@@ -102,11 +109,19 @@ def _recipe(args: argparse.Namespace) -> Recipe:
     return Recipe(args.licence, (page,))
 
 
-def _from_log(file: Path, wanted: PageClip, licence: str, robot: Robot) -> Clip:
+def _from_log(args: argparse.Namespace, wanted: PageClip, licence: str, robot: Robot) -> Clip:
     from servoid.stack.log.flightlog import read_log
 
-    log = read_log(file)
+    file, log = args.file, read_log(args.file)
     ticks = log.ticks("/instruction")
+    if args.part is not None:
+        first, end = (round(seconds * robot.rate) for seconds in args.part)
+        if not 0 <= first < end <= len(ticks):
+            raise ConfigError(
+                f"--part {args.part[0]:g} {args.part[1]:g}: the task of {file} lasts from 0 to "
+                f"{len(ticks) * robot.dt:g} s"
+            )
+        ticks = ticks[first:end]
     if len(ticks) < 2:
         raise ConfigError(f"{file}: holds no motion, because its task never started")
     states, commands = (np.isin(log.ticks(channel), ticks) for channel in ("/state", "/command"))
@@ -115,8 +130,10 @@ def _from_log(file: Path, wanted: PageClip, licence: str, robot: Robot) -> Clip:
         raise ConfigError(f"{file}: is of another robot than {robot.name}: {difference(theirs, robot.names)}")
     if (rate := log.header["robot"]["rate"]) != robot.rate:
         raise ConfigError(f"{file}: was recorded at {rate} ticks a second, and {robot.name} runs at {robot.rate}")
-    goals = log.column("/command", "position")[commands]
+    joints = log.column("/command", "position")[commands]
+    if args.measured:
+        joints = log.column("/state", "position")[states].astype(float)
     place, turn, contact = (
         log.column("/state", field)[states].astype(float) for field in ("displacement", "orientation", "contact")
     )
-    return Clip(wanted.name, goals, place, turn, contact, wanted.about(f"flight log {file.name}", licence)).placed()
+    return Clip(wanted.name, joints, place, turn, contact, wanted.about(f"flight log {file.name}", licence)).placed()
