@@ -68,6 +68,17 @@ def test_the_same_request_and_seed_give_the_same_plan() -> None:
     assert not np.array_equal(first.actions, runtime.plan(seeded_with(request(tick=41), 7)).actions)
 
 
+def test_settings_have_actions_guided_and_leave_states_as_they_are() -> None:
+    """States see no action, so that theirs is the same plan."""
+    guidance = GuidanceSettings(weight=50.0, clip=100.0, gradient="network", scaled=True)
+    plans = [
+        Runtime(model(), replace(SETTINGS, guidance=replace(guidance, actions=on)), ROBOT, speed_cost).plan(request())
+        for on in (False, True)
+    ]
+    np.testing.assert_array_equal(plans[0].states, plans[1].states)
+    assert np.abs(plans[0].actions - plans[1].actions).max() > 1e-4
+
+
 def test_an_empty_sentence_leaves_the_velocity_untold() -> None:
     pytest.importorskip("wordllama")
     runtime = Runtime(model(text="words", text_size=load_encoder("words").size), SETTINGS, ROBOT)

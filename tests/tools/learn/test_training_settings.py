@@ -133,7 +133,7 @@ def test_what_makes_no_sense_is_refused_by_its_flag(words: list[str], message: s
         (TrackerTraining(), {"minutes": 180.0, "samples": 8.5e6, "clips": CLIPS}),
         (DiffusionTraining(), {"minutes": 60.0, "width": 128, "horizon": 24}),
         (LatentTraining(), {}),
-        (OdometryTraining(), {"worlds": 240, "seconds": 45.0, "steps": 4000}),
+        (OdometryTraining(), {"worlds": 300, "seconds": 45.0, "steps": 5000, "floor": 0.5}),
     ],
     ids=lambda value: type(value).__name__,
 )

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 MEASURED = ("validation_loss", "shuffled_loss", "target_error_m", "plan_ms")
 _EXECUTED = 2**30  # sets the worlds in which takes are executed apart from others of the same seed
-WALKER = "expert"  # follows takes that walk, as in configs/policies/closd.yaml
+WALKER = "expert"  # follows takes that walk, as in configs/policies/closd-joints.yaml
 _PLANS = 64  # that the missing of targets is measured on
 
 
