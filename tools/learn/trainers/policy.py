@@ -28,6 +28,7 @@ from servoid.policy.priors.task_policy import KIND, save_task_policy
 from servoid.policy.rising.policy import KIND as RISING
 from servoid.policy.rising.policy import save_rising_policy
 from servoid.stack.tasks.learned import LearnedTask, load_learned_task
+from servoid.stack.tasks.learned.clip import PREFIX
 from servoid.tools.learn.envs.task_environment import Starts, TaskEnvironment
 from servoid.tools.learn.envs.task_judge import measure
 from servoid.tools.learn.flags import plain, read_settings
@@ -284,7 +285,9 @@ class PolicyTrainer(PpoTrainer):
 
     @property
     def following(self) -> str:
-        return f"servoid rollout {self.env.task.run} --policy {self.best_path} --episodes 50"
+        task = self.env.task
+        clip = "" if task.motion is None else f" --set clip={task.name.removeprefix(PREFIX)}"
+        return f"servoid rollout {task.run}{clip} --policy {self.best_path} --episodes 50"
 
     def adopt(self, path: Path) -> None:
         """Begin as the policy in `path`: see `adopted`. Raises ConfigError, or CheckpointError."""
