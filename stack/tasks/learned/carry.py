@@ -12,7 +12,6 @@ from servoid.stack.tasks.learned.base import LearnedTask, TaskState
 
 SIZE, MASS = (0.08, 0.15, 0.10), 0.1  # m along its x, y and z, and kg: 0.15 m fit between the forearms of an OP3
 STANDS = SIZE[2] / 2  # m: height of its middle on the ground
-LIFTED = 0.1  # m above the ground: the middle of a box that is higher is held
 _NEAREST, _FARTHEST, _ASIDE = 0.3, 0.6, 0.5  # m from the start to the box, and rad of its bearing, either way
 _TURNED = 0.2  # rad by which the side that it is taken by may be turned away, either way
 _BROUGHT = (0.4, 1.0)  # m from there to its place

@@ -14,8 +14,9 @@ from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.task import Criterion, Trace
 from servoid.hw.contracts.world import Percept, Scene
 from servoid.hw.setting import Setting
+from servoid.stack.control.carrier import LIFTED
 from servoid.stack.tasks.base import BaseBehaviour
-from servoid.stack.tasks.learned.carry import LIFTED, Carry, seen_box
+from servoid.stack.tasks.learned.carry import Carry, seen_box
 from servoid.stack.tasks.learned.run import Draws, LearnedRun, LearnedSettings
 
 
