@@ -18,7 +18,6 @@ from servoid.hw.robot.description import Robot, shipped_robot
 from servoid.hw.setting import Setting
 from servoid.policy.motion.library import find
 from servoid.policy.motion.warping import seen_upright, warped_error
-from servoid.sim.kinematics import joint_places, limbs_of
 from servoid.stack.tasks.base import BaseBehaviour, BaseTask, Settings
 from servoid.stack.tasks.learned.clip import ImitatedClip
 
@@ -86,6 +85,8 @@ class RunClip(BaseTask):
 
     def _places(self, joints: Array, orientation: Array) -> Array:
         """Of joints and of the ends of limbs `(ticks, points, 3)` m."""
+        from servoid.sim.kinematics import joint_places, limbs_of
+
         ends = limbs_of(self._robot).ends(joints).reshape(len(joints), -1, 3)
         return seen_upright(np.concatenate([joint_places(self._robot, joints), ends], 1), orientation)
 

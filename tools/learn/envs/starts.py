@@ -18,10 +18,10 @@ from servoid.policy.references.clip import ClipReference
 from servoid.sim.model import build
 from servoid.sim.truth import SimulatedTruth
 from servoid.sim.worlds import Worlds
-from servoid.stack.control.carrier import PICKS, Carrier
+from servoid.stack.control.carrier import LIFTED, PICKS, Carrier
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.estimation.odometry import load_odometry
-from servoid.stack.tasks.learned.carry import LIFTED, Carry
+from servoid.stack.tasks.learned.carry import Carry
 from servoid.tools.learn.collect.carrying import Carrying, box_seen
 
 _SETTLE_SECONDS = 2.0
