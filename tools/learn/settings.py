@@ -166,12 +166,16 @@ class PlannerTakes:
     clip_takes: Annotated[int, "takes of three clips each"] = 500
     walk_takes: Annotated[int, "walks of the gait"] = 200
     walk_seconds: Annotated[float, "seconds of each of these walks"] = 30.0
+    aimed: Annotated[
+        str, "motions toward random places (configs/motions), kept where --tracker brings robots there; none: none"
+    ] = ""
+    aimed_takes: Annotated[int, "takes of these"] = 200
     untold: Annotated[float, "share of windows over which what is asked changes, which are told nothing"] = 0.1
     licence: Annotated[str, "licence of the data beside the clips, kept in the checkpoint"] = "Apache-2.0"
 
     def __post_init__(self) -> None:
-        if min(self.clip_takes, self.walk_takes) < 1 or self.walk_seconds <= 0:
-            raise ValueError("clip_takes, walk_takes and walk_seconds must be positive")
+        if min(self.clip_takes, self.walk_takes, self.aimed_takes) < 1 or self.walk_seconds <= 0:
+            raise ValueError("clip_takes, walk_takes, aimed_takes and walk_seconds must be positive")
         if not 0.0 <= self.untold <= 1.0:
             raise ValueError(f"untold must be a share of 0 to 1, not {self.untold:g}")
 
