@@ -49,7 +49,7 @@ class Falls:
 
 
 @dataclass(frozen=True)
-class Down:
+class FirstFall:
     """How a robot was when it had just fallen."""
 
     position: Array  # (3,) m, of the base in the world
@@ -94,7 +94,7 @@ class GroundTruth:
         self._orientation: list[Array] = []
         self._fallen = self._touched = self.fell_ending = False
         self._ever = False  # whether it has fallen
-        self.down: Down | None = None  # as it was when it first fell, if it did
+        self.down: FirstFall | None = None  # as it was when it first fell, if it did
         self.falls = Falls(dt) if recover else None
         self.upright = 0  # ticks of the task before the robot had fallen
 
@@ -131,7 +131,7 @@ class GroundTruth:
         """Keep how the robot is, or the first of several that is down, if it fell and had not fallen before."""
         if fell and self.down is None:
             truth, i = self._truth, int(np.argmax(self._down))
-            self.down = Down(truth.position[i].copy(), truth.orientation[i].copy(), truth.joints[i].copy())
+            self.down = FirstFall(truth.position[i].copy(), truth.orientation[i].copy(), truth.joints[i].copy())
 
     @property
     def _down(self) -> Array:

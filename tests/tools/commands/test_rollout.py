@@ -27,7 +27,7 @@ from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.safety.phase import Phase
 from servoid.tools.commands import rollout
 from servoid.tools.common.compare import summarise
-from servoid.tools.common.ground_truth import Down, GroundTruth
+from servoid.tools.common.ground_truth import FirstFall, GroundTruth
 from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult
 from servoid.tools.evaluate.judge import judge
 
@@ -251,7 +251,7 @@ def test_a_fall_is_told_by_what_made_it_one(knee: float, tilt: float, cause: str
     qpos[3:7] = np.cos(half), 0, np.sin(half), 0
     qpos[[int(model.joint(name).qposadr[0]) for name in robot.names]] = joints
     qpos[2] = Ground(model).height(qpos)
-    assert Down(qpos[:3], qpos[3:7], joints).cause(robot) == cause
+    assert FirstFall(qpos[:3], qpos[3:7], joints).cause(robot) == cause
 
 
 @pytest.mark.parametrize(
