@@ -22,7 +22,7 @@ from servoid.stack.skills.skill import Skill
 from servoid.stack.tasks.base import BaseBehaviour
 from servoid.stack.tasks.stories.act import PELVIS, Act
 from servoid.stack.tasks.stories.condition import REST_SECONDS, Conditions, Moment, held_ticks, rests
-from servoid.stack.tasks.stories.stop import Stop, farther
+from servoid.stack.tasks.stories.standstill import Standstill, farther
 from servoid.stack.tasks.stories.told import StoryEpisode, StorySettings
 
 AGAIN_SECONDS = 2.0  # after a skill that did not do it, before another try
@@ -56,7 +56,7 @@ class Machine(BaseBehaviour):
         self._number = self._began = 0
         self._acting: int | None = None  # tick at which the act itself was asked for
         self._facing: float | None = None  # rad, toward the thing, as its approach began
-        self._stop = Stop(dt)
+        self._stop = Standstill(dt)
         self._near = False  # whether it has come near to where the act is performed
         self._aside = False  # whether it has turned its back to the seat, away from it
         self._done = False  # the act, though the robot may be in the middle of it
@@ -221,7 +221,7 @@ class Machine(BaseBehaviour):
 
     def _come_anew(self) -> None:
         self._acting = self._facing = None
-        self._stop = Stop(self._dt)
+        self._stop = Standstill(self._dt)
 
     def _come(self, act: Act, state: State, thing: Array) -> Instruction | None:
         """To where the act is performed and, where a planner strikes, to a stand there; None where the robot is."""

@@ -22,7 +22,7 @@ from servoid.stack.tasks import load_task
 from servoid.stack.tasks.stories.condition import Moment, moments
 from servoid.stack.tasks.stories.layout import CLEAR
 from servoid.stack.tasks.stories.machine import Machine
-from servoid.stack.tasks.stories.stop import STAND_SECONDS
+from servoid.stack.tasks.stories.standstill import STAND_SECONDS
 from servoid.stack.tasks.stories.story import Story
 from servoid.stack.tasks.stories.told import StoryEpisode
 from servoid.tools.evaluate.judge import judge

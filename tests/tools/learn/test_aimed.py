@@ -14,7 +14,7 @@ from servoid.policy.diffusion.prefix.frames import Frames
 from servoid.policy.features import raw_layout
 from servoid.policy.motion.library import Library
 from servoid.policy.text.encoder import load_encoder
-from servoid.tools.learn.settings import PlannerTraining
+from servoid.tools.learn.planner_settings import PlannerTraining
 from servoid.tools.learn.takes.aimed import Aim, AimedMotion, AimedRecipe, AimedTake, Move, load_aimed, moved
 from servoid.tools.learn.takes.executed import Executed
 from servoid.tools.learn.takes.learned import came_to, learned_from

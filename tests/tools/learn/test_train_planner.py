@@ -25,7 +25,7 @@ from servoid.policy.motion.library import Library
 from servoid.policy.text.captions import MOTIONS, NAMES
 from servoid.policy.text.encoder import load_encoder
 from servoid.stack.control.fleet import Fleet
-from servoid.tools.learn.settings import PlannerTraining
+from servoid.tools.learn.planner_settings import PlannerTraining
 from servoid.tools.learn.takes.executed import execute
 from servoid.tools.learn.takes.learned import learned_from
 from servoid.tools.learn.takes.maker import TakeMaker, labels, told

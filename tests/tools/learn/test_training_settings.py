@@ -15,12 +15,12 @@ from servoid.policy.checkpoint import read_header, resolve
 from servoid.policy.motion.library import Library
 from servoid.tools.common.parser import Parser
 from servoid.tools.learn.flags import add_setting_flags, plain, read_settings
+from servoid.tools.learn.planner_settings import PlannerTraining
 from servoid.tools.learn.settings import (
     TITLES,
     DiffusionTraining,
     LatentTraining,
     OdometryTraining,
-    PlannerTraining,
     TrackerTraining,
     TrainingRun,
 )

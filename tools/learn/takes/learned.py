@@ -21,7 +21,7 @@ from servoid.policy.text.encoder import TextEncoder
 from servoid.stack.control.fleet import Fleet
 from servoid.stack.control.tracker import Followers
 from servoid.stack.estimation.odometry import load_odometry
-from servoid.tools.learn.settings import PlannerTraining
+from servoid.tools.learn.planner_settings import PlannerTraining
 from servoid.tools.learn.takes.aimed import Aim, AimedTake, load_aimed
 from servoid.tools.learn.takes.executed import Executed, execute
 from servoid.tools.learn.takes.maker import Take, TakeMaker, labels, sequences

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
 from servoid.tools.learn.flags import plain, read_settings
-from servoid.tools.learn.settings import PlannerTraining
+from servoid.tools.learn.planner_settings import PlannerTraining
 from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments, require_same
 
 if TYPE_CHECKING:

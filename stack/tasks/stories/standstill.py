@@ -22,7 +22,7 @@ ASIDE, TURNED, MOST = 0.7, 0.1, 0.1
 
 
 @dataclass
-class Stop:
+class Standstill:
     dt: float
     since: int | None = None  # tick from which on it is asked to stand
     _times: int = 0
