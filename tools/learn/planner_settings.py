@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -51,3 +52,6 @@ class PlannerTraining(DecayedOptimiser, PlannerTakes, PlannerShape, StepRun):
             part.__post_init__(self)
         if self.target_weight < 0 or self.root <= 0 or self.warmup_steps < 1:
             raise ValueError("target_weight must not be negative, root positive, and warmup_steps at least 1")
+
+
+PLANNER_TITLES: Mapping[type, str] = {PlannerTakes: "takes", PlannerShape: "network", PlannerTraining: "optimiser"}

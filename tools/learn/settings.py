@@ -351,7 +351,6 @@ class OdometryTraining(DecayedOptimiser, Layers, OdometryWalks, StepRun):
 TITLES: Mapping[type, str] = {  # of the help, in its order
     TrainingRun: "run", StepRun: "run", DataRun: "run", SampleRun: "run",
     OdometryWalks: "walks",
-    PlannerTakes: "takes", PlannerShape: "network", PlannerTraining: "optimiser",
     DenoiserShape: "network", DiffusionNetwork: "network", LatentConfig: "network", Layers: "network",
     TrainingObjective: "objective", LatentTraining: "objective", OdometryTraining: "objective", Ppo: "objective (PPO)",
     Optimiser: "optimiser", DecayedOptimiser: "optimiser", DiffusionTraining: "optimiser",
