@@ -23,8 +23,10 @@ LIFTED = 0.1  # m above the ground: the middle of a box that is higher is held
 APPROACHES, STOPS, PICKS, CARRIES = range(4)  # what it does
 _GRIP = 0.165  # m from the base to the middle of a box that it takes
 _ALIGNED = (0.02, 0.015, 0.12)  # m ahead, m aside and rad that it may be off where it takes one
+_AWAY = 3.0  # times as far off, it goes there again before it rests
 _NEAR = 0.15  # m from there within which steps go in any direction
-_STILL = 0.6  # s of standing before it squats
+_REST = (0.35, 0.6)  # rad that targets are off home, and rad/s, of every joint of the legs: what stands before it squats
+_BENT = 1.3  # rad of both knees: no walk bends them so
 _THERE = 0.03  # m from the place that the box shall come to
 _SPEED, _TURN, _FIRST = 0.22, 0.7, 0.9  # m/s, rad/s, and rad of bearing from which it turns on the spot
 _TAKEN_IN = 0.5  # s in which the arms come home where it lost the box
@@ -35,12 +37,9 @@ _OPEN, _CLOSED = (1.3, 0.0), (1.53, -0.27)
 _HELD = (-1.05, *_CLOSED)
 _PICKING = (
     (0.5, 0.85, 0.05, -0.9, *_OPEN),
-    (1.2, 2.35, 0.4, -1.05, *_OPEN),
-    (0.3, 2.35, 0.4, -1.05, *_OPEN),
-    (0.5, 2.35, 0.4, -1.05, *_CLOSED),
-    (0.2, 2.35, 0.4, -1.05, *_CLOSED),
-    (1.2, 0.85, 0.05, *_HELD),
-    (0.4, None, 0.0, *_HELD),
+    (1.5, 2.35, 0.4, -1.05, *_OPEN),
+    (0.7, 2.35, 0.4, -1.05, *_CLOSED),
+    (1.5, 0.85, 0.05, *_HELD),
 )  # fmt: skip
 _BALANCE = Balance(ankle_pitch=(0.08, 0.0), hip_pitch=(0.04, 0.0))  # meanwhile; its tilt is meant
 _LOOKING_DOWN = 0.4  # rad of the head
@@ -48,26 +47,25 @@ _LOOKING_DOWN = 0.4  # rad of the head
 
 class Carrier(BasePolicy):
     """Of one robot, or worlds of any leading `shape`. It goes by where the box is seen, and takes it anew where it lost
-    it."""
+    it.
+
+    It picks up from whatever pose it finds, without a clock: who learns from it sees none, and may be slower.
+    """
 
     def __init__(self, robot: Robot, shape: tuple[int, ...] = (), checkpoint: str = "expert") -> None:
         """Raises ConfigError for a robot without the joints, or CheckpointError where the expert does not fit."""
         self._expert = ExpertPolicy(robot, checkpoint, shape)
         self._robot, self._dt, self._home = robot, robot.dt, robot.home
-        seconds = np.array([key[0] for key in _PICKING])
-        self._ends = np.cumsum(seconds)
-        self._begins = self._ends - seconds
-        self._poses = np.stack([_pose(robot, *key[1:]) for key in _PICKING])
+        self._picking, self._placed = _picking(robot)
+        self._knees = np.array([robot.names.index(name) for name in ("l_knee", "r_knee")])
         held = _pose(robot, None, 0.0, *_HELD)
         self._feedback, self._gains = Feedback(robot), _BALANCE.gains
         self._arms = np.ones(len(robot.joints), bool)
         self._arms[robot.leg_index.ravel()] = False
         self._held = np.where(self._arms, held, robot.home)
         self.stage = np.zeros(shape, int)
-        self._since = np.zeros(shape)  # s in that stage
-        self._from = np.broadcast_to(robot.home, (*shape, len(robot.joints))).copy()  # where picking began
-        self._plain = self._from.copy()  # the expert's targets, with the arms where it would have them
-        self._share = np.zeros(shape)  # of the arms' way from there to where they hold a box
+        self._plain = np.broadcast_to(robot.home, (*shape, len(robot.joints))).copy()  # the expert's targets, with the
+        self._share = np.zeros(shape)  # arms where it would have them; of their way from there to where they hold a box
 
     def reset(self, where: Array | None, seeds: Array) -> None:
         fresh = np.ones_like(self.stage, bool) if where is None else where
@@ -78,7 +76,6 @@ class Carrier(BasePolicy):
 
     def _enter(self, stage: int, where: Array) -> None:
         self.stage = np.where(where, stage, self.stage)
-        self._since = np.where(where, 0.0, self._since)
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         if instruction.stand:  # where nobody says any more where the box is
@@ -86,28 +83,29 @@ class Carrier(BasePolicy):
         if instruction.box is None or instruction.goal is None:
             raise ConfigError("the carrier needs a box and a place for it, and the task gives none: run carry")
         box, goal = np.asarray(instruction.box, float), np.asarray(instruction.goal, float)
-        self._since = self._since + self._dt
-        approach, aligned = self._to_box(box)
+        approach, off = self._to_box(box)
+        aligned = off < 1.0
         bring, there = _to_place(box, goal)
-        stands = self._since > _STILL
         holds = box[..., 2] > LIFTED
+        pose = self._next(applied)
         now = self.stage
+        bent = (np.abs(applied[..., self._knees]) > _BENT).all(-1)
         self._enter(STOPS, (now == APPROACHES) & aligned)
-        self._enter(PICKS, begins := (now == STOPS) & stands & aligned)
-        self._from = np.where(begins[..., None], applied, self._from)
-        self._enter(APPROACHES, (now == STOPS) & stands & ~aligned)
-        self._enter(CARRIES, rises := (now == PICKS) & (self._since >= self._ends[-1]))
-        self._enter(APPROACHES, (now == CARRIES) & ~holds & (self._since > _STILL))
+        rests = self._rests(state, applied)
+        self._enter(APPROACHES, (now == STOPS) & (off > np.where(rests, 1.0, _AWAY)))
+        self._enter(PICKS, (now == STOPS) & aligned & rests)
+        self._enter(PICKS, (now != PICKS) & bent)
+        self._enter(CARRIES, rises := (now == PICKS) & (pose == len(self._picking) - 1))
+        self._enter(APPROACHES, (now == CARRIES) & ~holds & ~bent)
         if rises.any():
             self._expert.reset(rises, np.zeros_like(self.stage))
             self._plain = np.where(rises[..., None], self._home, self._plain)
         opened = np.maximum(self._share - self._dt / _TAKEN_IN, 0.0)
         self._share = np.where(rises, 1.0, np.where(self.stage == CARRIES, self._share, opened))
         velocity = np.where((self.stage == APPROACHES)[..., None], approach, 0.0)
-        carries = (self.stage == CARRIES) & (self._since > _STILL) & ~there
-        velocity = np.where(carries[..., None], bring, velocity)
+        velocity = np.where(((self.stage == CARRIES) & ~there)[..., None], bring, velocity)
         walked = self._walk(state, applied, Instruction(velocity))
-        picked = self._feedback(self._picked(), state.gravity, state.angular_velocity, self._gains)
+        picked = self._feedback(self._picking[pose], state.gravity, state.angular_velocity, self._gains)
         return np.where((self.stage == PICKS)[..., None], picked, walked)
 
     def _walk(self, state: State, applied: Array, told: Instruction) -> Array:
@@ -121,16 +119,20 @@ class Carrier(BasePolicy):
         upper = self._plain + self._share[..., None] * (self._held - self._plain)
         return np.where(self._arms, upper, self._plain)
 
-    def _picked(self) -> Array:
-        """Where the poses of picking up are now `(..., n_joints)`."""
-        key = np.minimum((self._since[..., None] >= self._ends).sum(-1), len(self._ends) - 1)
-        share = np.clip((self._since - self._begins[key]) / (self._ends - self._begins)[key], 0.0, 1.0)
-        share = (share * share * (3.0 - 2.0 * share))[..., None]
-        before = np.where((key == 0)[..., None], self._from, self._poses[np.maximum(key - 1, 0)])
-        return np.asarray(before + share * (self._poses[key] - before))
+    def _next(self, applied: Array) -> Array:
+        """Which pose of picking up follows the one that is nearest to what is commanded `(...)` int."""
+        off = applied[..., None, self._placed] - self._picking[:, self._placed]
+        return np.minimum(np.argmin((off**2).sum(-1), -1) + 1, len(self._picking) - 1)
+
+    def _rests(self, state: State, applied: Array) -> Array:
+        off, speed = _REST
+        legs = ~self._arms
+        there = np.abs(applied - self._home)[..., legs].max(-1) < off
+        return there & (np.abs(state.joint_velocity[..., legs]).max(-1) < speed)
 
     def _to_box(self, box: Array) -> tuple[Array, Array]:
-        """The velocity `(..., 3)` to where the box can be taken, and whether it is there `(...)`."""
+        """The velocity `(..., 3)` to where the box can be taken, and how far from there it is, in what it may be off
+        `(...)`."""
         angle = facing(box)
         ahead, aside = np.cos(angle), np.sin(angle)
         place = box[..., :2] - _GRIP * np.stack([ahead, aside], -1)
@@ -140,7 +142,7 @@ class Carrier(BasePolicy):
         before = place - np.minimum(far, _NEAR)[..., None] * np.stack([ahead, aside], -1) * 0.7
         velocity = np.where((far < _NEAR)[..., None], near, _towards(before))
         off = np.abs(np.concatenate([place, angle[..., None]], -1))
-        return velocity, (off < np.array(_ALIGNED)).all(-1)
+        return velocity, (off / _ALIGNED).max(-1)
 
 
 def facing(box: Array) -> Array:
@@ -176,6 +178,18 @@ def _towards(point: Array) -> Array:
     speed = np.clip(0.8 * distance, 0.08, _SPEED)
     turn = np.clip(1.5 * bearing, -_TURN, _TURN)
     return np.stack([speed * ahead, np.zeros_like(speed), turn], -1)
+
+
+def _picking(robot: Robot) -> tuple[Array, Array]:
+    """Poses of picking up, a tick apart `(ticks, n_joints)` rad, and the joints that tell them apart."""
+    poses, before = [], robot.home
+    for seconds, *key in _PICKING:
+        after = _pose(robot, *key)
+        share = (np.arange(round(seconds * robot.rate)) + 1.0)[:, None] / round(seconds * robot.rate)
+        poses.append(before + share * (after - before))
+        before = after
+    telling = [name for name in robot.names if name.endswith(("_knee", "_sho_pitch", "_sho_roll", "_el"))]
+    return np.concatenate(poses), np.array([robot.names.index(name) for name in telling])
 
 
 def _pose(robot: Robot, knee: float | None, lean: float, shoulder: float, roll: float, elbow: float) -> Array:
