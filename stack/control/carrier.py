@@ -23,7 +23,8 @@ LIFTED = 0.1  # m above the ground: the middle of a box that is higher is held
 APPROACHES, STOPS, PICKS, CARRIES = range(4)  # what it does
 _GRIP = 0.165  # m from the base to the middle of a box that it takes
 _ALIGNED = (0.02, 0.015, 0.12)  # m ahead, m aside and rad that it may be off where it takes one
-_AWAY = 3.0  # times as far off, it goes there again before it rests
+_SETTING_OFF = 0.4  # s in which a first step begins
+_ENOUGH, _AWAY = 1.6, 3.0  # times as far off, it goes there again: once it rests, and before
 _NEAR = 0.15  # m from there within which steps go in any direction
 _REST = (0.35, 0.6)  # rad that targets are off home, and rad/s, of every joint of the legs: what stands before it squats
 _BENT = 1.3  # rad of both knees: no walk bends them so
@@ -65,6 +66,7 @@ class Carrier(BasePolicy):
         self._held = np.where(self._arms, held, robot.home)
         self.stage = np.zeros(shape, int)
         self._plain = np.broadcast_to(robot.home, (*shape, len(robot.joints))).copy()  # the expert's targets, with the
+        self._waits = np.zeros(shape)  # s for which it rests where it should walk
         self._share = np.zeros(shape)  # arms where it would have them; of their way from there to where they hold a box
 
     def reset(self, where: Array | None, seeds: Array) -> None:
@@ -92,10 +94,12 @@ class Carrier(BasePolicy):
         bent = (np.abs(applied[..., self._knees]) > _BENT).all(-1)
         self._enter(STOPS, (now == APPROACHES) & aligned)
         rests = self._rests(state, applied)
-        self._enter(APPROACHES, (now == STOPS) & (off > np.where(rests, 1.0, _AWAY)))
-        self._enter(PICKS, (now == STOPS) & aligned & rests)
+        self._enter(APPROACHES, (now == STOPS) & (off > np.where(rests, _ENOUGH, _AWAY)))
+        self._enter(PICKS, (now == STOPS) & (off <= _ENOUGH) & rests)
         self._enter(PICKS, (now != PICKS) & bent)
         self._enter(CARRIES, rises := (now == PICKS) & (pose == len(self._picking) - 1))
+        self._enter(CARRIES, given := (now < PICKS) & holds & ~bent)
+        rises = rises | given
         self._enter(APPROACHES, (now == CARRIES) & ~holds & ~bent)
         if rises.any():
             self._expert.reset(rises, np.zeros_like(self.stage))
@@ -104,6 +108,10 @@ class Carrier(BasePolicy):
         self._share = np.where(rises, 1.0, np.where(self.stage == CARRIES, self._share, opened))
         velocity = np.where((self.stage == APPROACHES)[..., None], approach, 0.0)
         velocity = np.where(((self.stage == CARRIES) & ~there)[..., None], bring, velocity)
+        self._waits = np.where(rests & velocity.any(-1), self._waits + self._dt, 0.0)
+        if (late := self._waits > _SETTING_OFF).any():  # a pupil did not take the first step: it is the next again
+            self._expert.reset(late, np.zeros_like(self.stage))
+            self._waits = np.where(late, 0.0, self._waits)
         walked = self._walk(state, applied, Instruction(velocity))
         picked = self._feedback(self._picking[pose], state.gravity, state.angular_velocity, self._gains)
         return np.where((self.stage == PICKS)[..., None], picked, walked)

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.contracts.control import State
+from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.world import Start
 from servoid.hw.geometry import turned
 from servoid.hw.robot.mirror import Mirror
@@ -26,6 +26,7 @@ from servoid.tools.learn.collect.carrying import box_seen
 from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.score_term import GeneratedStarts, Manner
 from servoid.tools.learn.envs.starts import AlongCarrying, AlongClip
+from servoid.tools.learn.envs.teacher import Teacher
 from servoid.tools.learn.prior_settings import EpisodeSettings
 from servoid.tools.learn.terms import Terms
 
@@ -82,6 +83,7 @@ class TaskEnvironment:
         worlds = n if scene is None else Worlds(robot, n, randomise=s.randomised, model=build(robot, scene))
         self.fleet = Fleet(robot, worlds, known, randomise=s.randomised, seed=seed)
         self.lead = task.lead(n)
+        self.teacher: Teacher | None = None  # who drives worlds, too
         self.observation = TaskObservation(robot, task.seen if self.lead is None else self.lead.goal, (n,))
         self.stride, self.reach = score.stride, score.reach
         self.dt = self.stride * robot.dt  # s between decisions
@@ -152,6 +154,8 @@ class TaskEnvironment:
         if self.lead is not None and self.down is not None:
             self.lead.begin(where, fleet.truth.gravity, self.down.clip, self.down.time)
         self.observation.reset(where)
+        if self.teacher is not None:
+            self.teacher.reset(where, fleet.seeds)
         self.score.reset(where)
         if windows is not None:
             self.score.fill(where, windows)
@@ -165,7 +169,6 @@ class TaskEnvironment:
 
     def _observe(self) -> None:
         state, truth = self._sense(), self.fleet.truth
-        box = self.score.box = None if self.task.scene is None else box_seen(truth)
         for i in np.flatnonzero(self.ticks >= self._next):
             rng = self.fleet.rngs[i]
             self.asked[i] = self.task.draw(rng, truth.position[i, :2])
@@ -173,8 +176,7 @@ class TaskEnvironment:
         if self.lead is not None:
             goal = self.lead.seen
         else:
-            told = replace(self.task.instruct(self.asked, state), box=box)
-            goal = self.task.seen.observe(told, self.robot.walking)
+            goal = self.task.seen.observe(self._told(state), self.robot.walking)
         actor = self.observation(state, self.fleet.applied, goal)
         forward = self.robot.walking.forward
         known = [
@@ -186,6 +188,11 @@ class TaskEnvironment:
             truth.gravity,
         ]
         self.observations = {"actor": actor, "critic": np.concatenate([actor, *known], -1).astype(np.float32)}
+
+    def _told(self, state: State) -> Instruction:
+        """What is asked, and where the box is, now."""
+        box = self.score.box = None if self.task.scene is None else box_seen(self.fleet.truth)
+        return replace(self.task.instruct(self.asked, state), box=box)
 
     def _sense(self) -> State:
         state = self.fleet.observe()
@@ -232,6 +239,9 @@ class TaskEnvironment:
             target = self.reach * act[:, : len(self.robot.joints)] + (
                 self.robot.home if self.lead is None else self.lead.target
             )
+            if self.teacher is not None:
+                state = self.fleet.state
+                target = self.teacher(state, self.fleet.applied, self._told(state), target)
             self.fleet.step(target)
             if self.lead is not None:
                 self.lead.advance(action[:, -1], self.fleet.state.gravity, target, self.fleet.applied)

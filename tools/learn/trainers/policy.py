@@ -116,7 +116,7 @@ def main(args: argparse.Namespace) -> int:
         rival = _rival(args, prior, settings)
     task = load_learned_task(args.task, robot)
     env = environment(task, prior, style, settings, settings.worlds, settings.seed, rival)
-    trainer = PolicyTrainer(env, style, settings, args.out, found)
+    trainer = trainer_of(env, style, settings, args.out, found)
     trainer.rival = rival
     trainer.start(args.resume, None if args.init is None else checkpoint.resolve(args.init, robot))
     if args.demonstrations is not None and not trainer.begun_with:
@@ -207,6 +207,22 @@ def environment(
     elif prior is not None:
         starts = GeneratedStarts(prior, style, settings, seed)
     return TaskEnvironment(task, score, starts, load_odometry(robot), settings, worlds, seed)
+
+
+def trainer_of(
+    env: TaskEnvironment, style: Style, settings: PolicyTraining, out: Path, prior: Path | None
+) -> PolicyTrainer:
+    """By reward, or by a teacher where the settings name one. Raises ConfigError."""
+    from servoid.stack.control.policies import make_policy
+    from servoid.stack.tasks import load_task
+    from servoid.tools.learn.envs.teacher import Teacher
+    from servoid.tools.learn.trainers.taught_policy import TaughtPolicyTrainer
+
+    if not settings.teacher:
+        return PolicyTrainer(env, style, settings, out, prior)
+    task = load_task(env.task.run, {}, env.robot.dt, env.robot)
+    env.teacher = Teacher(make_policy(settings.teacher, env.robot, task, realtime=False, shape=(env.n,)), env.n)
+    return TaughtPolicyTrainer(env, style, settings, out, prior)
 
 
 class PolicyTrainer(PpoTrainer):

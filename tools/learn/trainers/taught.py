@@ -1,4 +1,4 @@
-"""A tracker learns what its teacher would do wherever it comes itself (DAgger), by regression instead of by reward.
+"""What learns does what its teacher would do wherever it comes itself (DAgger), by regression instead of by reward.
 
 S. Ross et al., "A Reduction of Imitation Learning and Structured Prediction to No-Regret Online Learning" (2011).
 """
@@ -6,37 +6,44 @@ S. Ross et al., "A Reduction of Imitation Learning and Structured Prediction to 
 from __future__ import annotations
 
 import time
+from abc import abstractmethod
 from pathlib import Path
 
 import numpy as np
 
+from servoid.hw.contracts.body import Array
 from servoid.tools.learn.envs.tracking import Tracking
-from servoid.tools.learn.settings import TrackerTraining
-from servoid.tools.learn.trainers.ppo import tensors
+from servoid.tools.learn.settings import Ppo, TrackerTraining
+from servoid.tools.learn.trainers.ppo import Environment, PpoTrainer, tensors
 from servoid.tools.learn.trainers.tracker import TrackerTrainer
 
-_KEPT = 120_000  # samples that are learned from, the newest
-_LED = 0.15  # of the training over which the teacher acts, too, less and less often
 _BATCH = 1024  # samples a step, and as many mirror images
 
 
-class TaughtTrainer(TrackerTrainer):
-    """As `TrackerTrainer`, of an environment with a teacher."""
+class Taught(PpoTrainer):
+    """The trainer of a pupil; a subclass says who teaches it, and for how long."""
 
-    def __init__(self, env: Tracking, settings: TrackerTraining, out: Path) -> None:
+    kept = 120_000  # samples that are learned from, the newest
+    led = 0.15  # of the training over which the teacher acts, too, less and less often
+    led_last = 0.0  # share of the time that it acts from then on
+
+    def begin_lessons(self, env: Environment, settings: Ppo) -> None:
+        """Once all else is there."""
         import torch
 
-        super().__init__(env, settings, out)
         self.critic_alone = 0.0  # no critic is asked
-        terms = [f"term/{name}" for name in env.term_names]
-        measured = ("episode_ticks", "reward", "std", "learning_rate", "samples_per_s", "collect_share", "loss/taught")
-        self.columns = (*measured, *terms, *env.measures)
-        self.panels = (("episode_ticks",), ("reward",), ("loss/taught",), terms, tuple(env.measures))
+        self.columns = (*(name for name in self.columns if not name.startswith("loss/")), "loss/taught")
+        self.panels = (*(panel for panel in self.panels if "std" not in panel), ("loss/taught",))
         self._rng = np.random.default_rng(settings.seed)
-        count = min(_KEPT, 100 * settings.horizon * env.n)
-        self._seen = torch.zeros(count, env.observation.size)
+        count = min(self.kept, 100 * settings.horizon * env.n)
+        self._seen = torch.zeros(count, env.observations["actor"].shape[1])
         self._taught = torch.zeros(count, env.action_size)
         self._added = 0
+
+    @abstractmethod
+    def lesson(self, action: Array, led: float) -> tuple[Array, Array]:
+        """Take a step, in which the teacher acts instead with probability `led`. Returns the reward `(n,)`, and what the
+        teacher would have done `(n, action_size)`."""
 
     def learn(self) -> dict[str, float]:
         """Collect `horizon` ticks in every world, and learn from what was collected of late."""
@@ -45,17 +52,18 @@ class TaughtTrainer(TrackerTrainer):
         env, s = self.env, self.settings
         self._schedule()
         begun, rewards, terms = time.monotonic(), [], []
-        led = 0.0 if self.begun_with else max(0.0, 1.0 - self.step / (_LED * s.samples))
+        passed = 1.0 if self.begun_with else min(1.0, self.step / (self.led * s.samples))
+        led = 1.0 + passed * (self.led_last - 1.0)
         noise = float(self.ppo.actor.distribution.log_std_param.exp().mean())
         self.ppo.train_mode()
         with torch.inference_mode():
             for _ in range(s.horizon):
-                self._keep()
+                seen = env.observations["actor"]
+                self.ppo.actor.update_normalization(tensors(env))
                 action = self.ppo.actor(tensors(env)).numpy()
-                leads = self._rng.random(env.n) < led
-                action = np.where(leads[:, None], env.taught, action) + noise * self._rng.standard_normal(action.shape)
                 ticks = env.ticks + 1
-                reward, _, _ = env.step(action)
+                reward, taught = self.lesson(action + noise * self._rng.standard_normal(action.shape), led)
+                self._keep(seen, taught)
                 self.lengths.extend(ticks[env.ticks == 0].tolist())
                 rewards.append(float(reward.mean()))
                 terms.append(env.terms)
@@ -73,25 +81,25 @@ class TaughtTrainer(TrackerTrainer):
             **env.measures,
         }
 
-    def _keep(self) -> None:
-        """Remember what is seen now, and what the teacher would do; the oldest is forgotten."""
+    def _keep(self, seen: Array, taught: Array) -> None:
+        """Remember what was seen, and what the teacher would do; the oldest is forgotten."""
         import torch
 
-        at = (self._added + torch.arange(self.env.n)) % len(self._seen)
-        self._seen[at] = torch.from_numpy(self.env.observations["actor"])
-        self._taught[at] = torch.from_numpy(self.env.taught.astype(np.float32))
-        self._added += self.env.n
-        self.ppo.actor.update_normalization(tensors(self.env))
+        at = (self._added + torch.arange(len(seen))) % len(self._seen)
+        self._seen[at] = torch.from_numpy(seen)
+        self._taught[at] = torch.from_numpy(taught.astype(np.float32))
+        self._added += len(seen)
 
     def _improve(self) -> float:
-        """A step on samples and their mirror images; returns the mean squared error of actions."""
+        """A step on samples and, unless a side counts, their mirror images; returns the mean squared error of actions."""
         import torch
         from tensordict import TensorDict
 
         rows = torch.from_numpy(self._rng.integers(min(self._added, len(self._seen)), size=_BATCH))
         seen, taught = self._seen[rows], self._taught[rows]
-        seen = torch.cat([seen, self.env.mirrors["actor"](seen)])
-        taught = torch.cat([taught, self.env.mirrors["action"](taught)])
+        if self.settings.mirror > 0.0:
+            seen = torch.cat([seen, self.env.mirrors["actor"](seen)])
+            taught = torch.cat([taught, self.env.mirrors["action"](taught)])
         acted = self.ppo.actor(TensorDict({"actor": seen}, batch_size=[len(seen)]))
         loss = ((acted - taught) ** 2).mean()
         self.ppo.optimizer.zero_grad()
@@ -99,3 +107,17 @@ class TaughtTrainer(TrackerTrainer):
         torch.nn.utils.clip_grad_norm_(self.ppo.actor.mlp.parameters(), 1.0)
         self.ppo.optimizer.step()
         return float(loss.detach())
+
+
+class TaughtTrainer(Taught, TrackerTrainer):
+    """As `TrackerTrainer`, of an environment with a teacher."""
+
+    def __init__(self, env: Tracking, settings: TrackerTraining, out: Path) -> None:
+        super().__init__(env, settings, out)
+        self.begin_lessons(env, settings)
+
+    def lesson(self, action: Array, led: float) -> tuple[Array, Array]:
+        taught = self.env.taught
+        leads = self._rng.random(self.env.n) < led
+        reward, _, _ = self.env.step(np.where(leads[:, None], taught, action))
+        return reward, taught
