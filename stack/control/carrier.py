@@ -26,7 +26,10 @@ _ALIGNED = (0.02, 0.015, 0.12)  # m ahead, m aside and rad that it may be off wh
 _SETTING_OFF = 0.4  # s in which a first step begins
 _ENOUGH, _AWAY = 1.6, 3.0  # times as far off, it goes there again: once it rests, and before
 _NEAR = 0.15  # m from there within which steps go in any direction
-_REST = (0.35, 0.6)  # rad that targets are off home, and rad/s, of every joint of the legs: what stands before it squats
+_REST = (
+    0.35,
+    0.6,
+)  # rad that targets are off home, and rad/s, of every joint of the legs: what stands before it squats
 _BENT = 1.3  # rad of both knees: no walk bends them so
 _THERE = 0.03  # m from the place that the box shall come to
 _SPEED, _TURN, _FIRST = 0.22, 0.7, 0.9  # m/s, rad/s, and rad of bearing from which it turns on the spot

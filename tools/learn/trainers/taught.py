@@ -42,8 +42,8 @@ class Taught(PpoTrainer):
 
     @abstractmethod
     def lesson(self, action: Array, led: float) -> tuple[Array, Array]:
-        """Take a step, in which the teacher acts instead with probability `led`. Returns the reward `(n,)`, and what the
-        teacher would have done `(n, action_size)`."""
+        """Take a step, in which the teacher acts instead for a share `led` of the time. Returns the reward `(n,)`, and
+        what the teacher would have done `(n, action_size)`."""
 
     def learn(self) -> dict[str, float]:
         """Collect `horizon` ticks in every world, and learn from what was collected of late."""
@@ -91,7 +91,7 @@ class Taught(PpoTrainer):
         self._added += len(seen)
 
     def _improve(self) -> float:
-        """A step on samples and, unless a side counts, their mirror images; returns the mean squared error of actions."""
+        """A step on samples and, unless a side counts, their mirror images; returns the mean squared error."""
         import torch
         from tensordict import TensorDict
 
