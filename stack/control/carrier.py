@@ -24,7 +24,7 @@ APPROACHES, STOPS, PICKS, CARRIES = range(4)  # what it does
 _GRIP = 0.165  # m from the base to the middle of a box that it takes
 _ALIGNED = (0.02, 0.015, 0.12)  # m ahead, m aside and rad that it may be off where it takes one
 _SETTING_OFF = 0.4  # s in which a first step begins
-_ENOUGH, _AWAY = 1.6, 3.0  # times as far off, it goes there again: once it rests, and before
+_ENOUGH, _AWAY = 2.5, 4.0  # times as far off, it goes there again: once it rests, and before
 _NEAR = 0.15  # m from there within which steps go in any direction
 _REST = (
     0.35,
@@ -37,7 +37,7 @@ _TAKEN_IN = 0.5  # s in which the arms come home where it lost the box
 # Seconds, knee, lean of the trunk, shoulder pitch and roll, and elbow of the left side [rad]; no knee: as at home.
 # Servos that are weak sag forward: with a lean of 0.55 a third of randomised robots fell, with this one none. The arms
 # press with nearly what a servo may push with for long.
-_OPEN, _CLOSED = (1.3, 0.0), (1.53, -0.27)
+_OPEN, _CLOSED = (1.3, 0.0), (1.53, -0.37)
 _HELD = (-1.05, *_CLOSED)
 _PICKING = (
     (0.5, 0.85, 0.05, -0.9, *_OPEN),

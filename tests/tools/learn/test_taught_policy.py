@@ -56,7 +56,7 @@ def test_the_teacher_acts_for_its_share_and_after_every_turn_of_its_pupil(tmp_pa
         assert np.isfinite(told).all()
     assert 0.35 < np.mean(led) < 0.65
     longest = np.diff(np.flatnonzero(np.diff(np.array(led, int), axis=0)[:, 0])).max()
-    assert longest <= 50  # 2 s
+    assert longest <= 63  # 2.5 s
 
 
 def test_an_unknown_teacher_is_refused(tmp_path: Path) -> None:

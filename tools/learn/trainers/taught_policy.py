@@ -17,7 +17,7 @@ from servoid.tools.learn.trainers.taught import Taught
 if TYPE_CHECKING:
     from servoid.policy.priors.score_matching.model import Style
 
-_TURNS = 0.4, 2.0  # s for which one of them acts
+_TURNS = 0.4, 2.5  # s for which one of them acts
 
 
 class TaughtPolicyTrainer(Taught, PolicyTrainer):
