@@ -95,8 +95,8 @@ class Carrier(BasePolicy):
         pose = self._next(applied)
         now = self.stage
         bent = (np.abs(applied[..., self._knees]) > _BENT).all(-1)
-        self._enter(STOPS, (now == APPROACHES) & aligned)
         rests = self._rests(state, applied)
+        self._enter(STOPS, (now == APPROACHES) & (aligned | (rests & (off <= _ENOUGH))))
         self._enter(APPROACHES, (now == STOPS) & (off > np.where(rests, _ENOUGH, _AWAY)))
         self._enter(PICKS, (now == STOPS) & (off <= _ENOUGH) & rests)
         self._enter(PICKS, (now != PICKS) & bent)
