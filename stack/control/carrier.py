@@ -23,7 +23,9 @@ LIFTED = 0.1  # m above the ground: the middle of a box that is higher is held
 APPROACHES, STOPS, PICKS, CARRIES = range(4)  # what it does
 _GRIP = 0.165  # m from the base to the middle of a box that it takes
 _ALIGNED = (0.02, 0.015, 0.12)  # m ahead, m aside and rad that it may be off where it takes one
-_SETTING_OFF = 0.4  # s in which a first step begins
+# Who rests and should walk is told, after so many seconds, to be so many ticks into the first step. The first of them are
+# no more than a shift of weight, of which the mean, all that a pupil without a clock can learn, is to stand.
+_WAITED, _SET_OFF = 0.1, 4
 _ENOUGH, _AWAY = 2.5, 4.0  # times as far off, it goes there again: once it rests, and before
 _NEAR = 0.15  # m from there within which steps go in any direction
 _REST = (
@@ -112,9 +114,9 @@ class Carrier(BasePolicy):
         velocity = np.where((self.stage == APPROACHES)[..., None], approach, 0.0)
         velocity = np.where(((self.stage == CARRIES) & ~there)[..., None], bring, velocity)
         self._waits = np.where(rests & velocity.any(-1), self._waits + self._dt, 0.0)
-        if (late := self._waits > _SETTING_OFF).any():  # a pupil did not take the first step: it is the next again
-            self._expert.reset(late, np.zeros_like(self.stage))
-            self._waits = np.where(late, 0.0, self._waits)
+        late = self._waits > _WAITED
+        self._expert.set_off(late, _SET_OFF)
+        self._waits = np.where(late, 0.0, self._waits)
         walked = self._walk(state, applied, Instruction(velocity))
         picked = self._feedback(self._picking[pose], state.gravity, state.angular_velocity, self._gains)
         return np.where((self.stage == PICKS)[..., None], picked, walked)
