@@ -150,24 +150,12 @@ class Gait(Reference):
         self.lowered = self.lowered + np.clip(self.lower_by - self.lowered, -step, step)
         # Steps fade in over half a cycle and out over a whole one.
         rate = np.where(moving, 2.0, -1.0) * self._phase_step
-        self.phase = np.where(self.activity > 0, (self.phase + self._phase_step) % 1.0, self._begun)
-        self.activity = np.clip(self.activity + rate, 0.0, 1.0)
-
-    @property
-    def _begun(self) -> Array:
-        """The phase that walking begins at `(...)`.
-
-        The first step says where it goes: the left foot takes it, but for a walk to the right. Were it drawn, who
-        learns from this could not know what comes, and the mean of a step of either foot is none.
-        """
+        # The first step says where it goes: the left foot takes it, but for a walk to the right. Were it drawn, who
+        # learns from this could not know what comes, and the mean of a step of either foot is none.
         rightward = _ACROSS * self.target[..., 1] + self.target[..., 2] < 0
-        return np.where(rightward, 0.5, 0.0)
-
-    def set_off(self, where: Array, ticks: int) -> None:
-        """Be `ticks` into the first step in the worlds `where` `(...)` bool."""
-        share = ticks * self._phase_step
-        self.phase = np.where(where, (self._begun + share) % 1.0, self.phase)
-        self.activity = np.where(where, min(2.0 * share, 1.0), self.activity)
+        begun = np.where(rightward, 0.5, 0.0)
+        self.phase = np.where(self.activity > 0, (self.phase + self._phase_step) % 1.0, begun)
+        self.activity = np.clip(self.activity + rate, 0.0, 1.0)
 
     def led(self, target: Array) -> Array:
         """Joint targets `(..., n_joints)` rad for the gait as it is now, those that turn feet ahead by `yaw_lead`."""

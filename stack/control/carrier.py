@@ -15,6 +15,8 @@ from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.geometry import rotate
 from servoid.hw.robot.description import Robot
+from servoid.policy.checkpoint import resolve
+from servoid.policy.priors.task_policy import TaskPolicy
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.control.tracker import ExpertPolicy
 from servoid.stack.safety.balance import Balance, Feedback
@@ -23,15 +25,16 @@ LIFTED = 0.1  # m above the ground: the middle of a box that is higher is held
 APPROACHES, STOPS, PICKS, CARRIES = range(4)  # what it does
 _GRIP = 0.165  # m from the base to the middle of a box that it takes
 _ALIGNED = (0.02, 0.015, 0.12)  # m ahead, m aside and rad that it may be off where it takes one
-# Who rests and should walk is told, after so many seconds, to be so many ticks into the first step. The first of them are
-# no more than a shift of weight, of which the mean, all that a pupil without a clock can learn, is to stand.
-_WAITED, _SET_OFF = 0.1, 4
+_WAITED = 0.1  # s: who rests longer, and should walk, is set going
 _ENOUGH, _AWAY = 2.5, 4.0  # times as far off, it goes there again: once it rests, and before
 _NEAR = 0.15  # m from there within which steps go in any direction
 _REST = (
     0.35,
     0.6,
 )  # rad that targets are off home, and rad/s, of every joint of the legs: what stands before it squats
+# Who rests and should walk is set going by this policy, which sees no clock either: of the first step of a gait that goes
+# by one, a pupil learns the mean, and that is to stand.
+_FIRST_STEPS = "location"
 _BENT = 1.3  # rad of both knees: no walk bends them so
 _THERE = 0.03  # m from the place that the box shall come to
 _SPEED, _TURN, _FIRST = 0.22, 0.7, 0.9  # m/s, rad/s, and rad of bearing from which it turns on the spot
@@ -61,6 +64,7 @@ class Carrier(BasePolicy):
     def __init__(self, robot: Robot, shape: tuple[int, ...] = (), checkpoint: str = "expert") -> None:
         """Raises ConfigError for a robot without the joints, or CheckpointError where the expert does not fit."""
         self._expert = ExpertPolicy(robot, checkpoint, shape)
+        self._first = TaskPolicy(robot, resolve(_FIRST_STEPS, robot), shape)
         self._robot, self._dt, self._home = robot, robot.dt, robot.home
         self._picking, self._placed = _picking(robot)
         self._knees = np.array([robot.names.index(name) for name in ("l_knee", "r_knee")])
@@ -77,6 +81,7 @@ class Carrier(BasePolicy):
     def reset(self, where: Array | None, seeds: Array) -> None:
         fresh = np.ones_like(self.stage, bool) if where is None else where
         self._expert.reset(where, seeds)
+        self._first.reset(where, seeds)
         self._enter(APPROACHES, fresh)
         self._plain = np.where(fresh[..., None], self._home, self._plain)
         self._share = np.where(fresh, 0.0, self._share)
@@ -86,11 +91,12 @@ class Carrier(BasePolicy):
 
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         if instruction.stand:  # where nobody says any more where the box is
-            return self._walk(state, applied, Instruction(np.zeros_like(instruction.velocity)))
+            still = np.zeros_like(instruction.velocity)
+            return self._walk(state, applied, Instruction(still, goal=still[..., :2], stand=True))
         if instruction.box is None or instruction.goal is None:
             raise ConfigError("the carrier needs a box and a place for it, and the task gives none: run carry")
         box, goal = np.asarray(instruction.box, float), np.asarray(instruction.goal, float)
-        approach, off = self._to_box(box)
+        approach, off, place = self._to_box(box)
         aligned = off < 1.0
         bring, there = _to_place(box, goal)
         holds = box[..., 2] > LIFTED
@@ -114,10 +120,8 @@ class Carrier(BasePolicy):
         velocity = np.where((self.stage == APPROACHES)[..., None], approach, 0.0)
         velocity = np.where(((self.stage == CARRIES) & ~there)[..., None], bring, velocity)
         self._waits = np.where(rests & velocity.any(-1), self._waits + self._dt, 0.0)
-        late = self._waits > _WAITED
-        self._expert.set_off(late, _SET_OFF)
-        self._waits = np.where(late, 0.0, self._waits)
-        walked = self._walk(state, applied, Instruction(velocity))
+        way = np.where(holds[..., None], goal - box[..., :2], place)
+        walked = self._walk(state, applied, Instruction(velocity, goal=way))
         picked = self._feedback(self._picking[pose], state.gravity, state.angular_velocity, self._gains)
         return np.where((self.stage == PICKS)[..., None], picked, walked)
 
@@ -128,7 +132,11 @@ class Carrier(BasePolicy):
             position=np.where(self._arms, self._plain, state.position),
             joint_velocity=np.where(self._arms, 0.0, state.joint_velocity),
         )
-        self._plain = self._expert.act(hidden, np.where(self._arms, self._plain, applied), told)
+        seen = np.where(self._arms, self._plain, applied)
+        first = self._first.act(hidden, seen, told)
+        self._plain = self._expert.act(hidden, seen, told)
+        rests = (self._waits > _WAITED)[..., None] & ~self._arms
+        self._plain = np.where(rests, first, self._plain)
         upper = self._plain + self._share[..., None] * (self._held - self._plain)
         return np.where(self._arms, upper, self._plain)
 
@@ -143,9 +151,9 @@ class Carrier(BasePolicy):
         there = np.abs(applied - self._home)[..., legs].max(-1) < off
         return there & (np.abs(state.joint_velocity[..., legs]).max(-1) < speed)
 
-    def _to_box(self, box: Array) -> tuple[Array, Array]:
-        """The velocity `(..., 3)` to where the box can be taken, and how far from there it is, in what it may be off
-        `(...)`."""
+    def _to_box(self, box: Array) -> tuple[Array, Array, Array]:
+        """The velocity `(..., 3)` to where the box can be taken, how far from there it is, in what it may be off `(...)`,
+        and that place `(..., 2)`."""
         angle = facing(box)
         ahead, aside = np.cos(angle), np.sin(angle)
         place = box[..., :2] - _GRIP * np.stack([ahead, aside], -1)
@@ -155,7 +163,7 @@ class Carrier(BasePolicy):
         before = place - np.minimum(far, _NEAR)[..., None] * np.stack([ahead, aside], -1) * 0.7
         velocity = np.where((far < _NEAR)[..., None], near, _towards(before))
         off = np.abs(np.concatenate([place, angle[..., None]], -1))
-        return velocity, (off / _ALIGNED).max(-1)
+        return velocity, (off / _ALIGNED).max(-1), place
 
 
 def facing(box: Array) -> Array:

@@ -124,10 +124,6 @@ class ExpertPolicy(BasePolicy):
         self._gait.reset(slice(None) if where is None else where)
         self._tracker.reset(where)
 
-    def set_off(self, where: Array, ticks: int) -> None:
-        """Be `ticks` into the first step in the worlds `where` `(...)` bool, whatever the robot did meanwhile."""
-        self._gait.set_off(where, ticks)
-
     def act(self, state: State, applied: Array, instruction: Instruction) -> Array:
         self._gait.command(instruction.velocity, instruction.lower)
         if self._gait.lowered.any():  # it has only seen walks upright, and would push itself up

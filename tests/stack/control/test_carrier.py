@@ -70,3 +70,12 @@ def test_a_box_that_is_given_to_it_is_carried_and_one_that_was_lost_is_taken_ane
     assert carrier.stage == CARRIES
     carrier.act(SEEN, ROBOT.home, AT_HAND)
     assert carrier.stage == APPROACHES
+
+
+def test_who_rests_is_told_a_step_and_not_only_a_shift_of_weight(carrier: Carrier) -> None:
+    """The mean of what it is told is what a pupil learns that sees no clock: it must not be to stand."""
+    far = replace(AT_HAND, box=np.array([0.5, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0]))
+    told = np.array([carrier.act(SEEN, ROBOT.home, far) for _ in range(60)])
+    off = (told[20:].mean(0) - ROBOT.home)[ROBOT.leg_index.ravel()]
+    assert np.abs(off).max() > 0.2
+    assert told[20:].std(0).max() < 0.15
