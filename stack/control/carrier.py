@@ -28,12 +28,9 @@ _ALIGNED = (0.02, 0.015, 0.12)  # m ahead, m aside and rad that it may be off wh
 _WAITED = 0.1  # s: who rests longer, and should walk, is set going
 _ENOUGH, _AWAY = 2.5, 4.0  # times as far off, it goes there again: once it rests, and before
 _NEAR = 0.15  # m from there within which steps go in any direction
-_REST = (
-    0.35,
-    0.6,
-)  # rad that targets are off home, and rad/s, of every joint of the legs: what stands before it squats
-# Who rests and should walk is set going by this policy, which sees no clock either: of the first step of a gait that goes
-# by one, a pupil learns the mean, and that is to stand.
+_REST = (0.5, 0.6)  # rad that targets of legs are off home, and rad/s of their joints: who stands so may squat
+# Who rests and should walk is set going by this policy, which sees no clock either: of the first step of a gait that
+# goes by one, a pupil learns the mean, and that is to stand.
 _FIRST_STEPS = "location"
 _BENT = 1.3  # rad of both knees: no walk bends them so
 _THERE = 0.03  # m from the place that the box shall come to
@@ -152,8 +149,8 @@ class Carrier(BasePolicy):
         return there & (np.abs(state.joint_velocity[..., legs]).max(-1) < speed)
 
     def _to_box(self, box: Array) -> tuple[Array, Array, Array]:
-        """The velocity `(..., 3)` to where the box can be taken, how far from there it is, in what it may be off `(...)`,
-        and that place `(..., 2)`."""
+        """The velocity `(..., 3)` to where the box can be taken, how far from there it is, in what it may be off
+        `(...)`, and that place `(..., 2)`."""
         angle = facing(box)
         ahead, aside = np.cos(angle), np.sin(angle)
         place = box[..., :2] - _GRIP * np.stack([ahead, aside], -1)
