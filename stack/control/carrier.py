@@ -47,6 +47,7 @@ _PICKING = (
     (0.7, 2.35, 0.4, -1.05, *_CLOSED),
     (1.5, 0.85, 0.05, *_HELD),
 )  # fmt: skip
+_RISEN = 15  # ticks before the end of the last it walks on: who errs by more than poses change by, stays
 _BALANCE = Balance(ankle_pitch=(0.08, 0.0), hip_pitch=(0.04, 0.0))  # meanwhile; its tilt is meant
 _LOOKING_DOWN = 0.4  # rad of the head
 
@@ -105,7 +106,7 @@ class Carrier(BasePolicy):
         self._enter(APPROACHES, (now == STOPS) & (off > np.where(rests, _ENOUGH, _AWAY)))
         self._enter(PICKS, (now == STOPS) & (off <= _ENOUGH) & rests)
         self._enter(PICKS, (now != PICKS) & bent)
-        self._enter(CARRIES, rises := (now == PICKS) & (pose == len(self._picking) - 1))
+        self._enter(CARRIES, rises := (now == PICKS) & (pose >= len(self._picking) - _RISEN))
         self._enter(CARRIES, given := (now < PICKS) & holds & ~bent)
         rises = rises | given
         self._enter(APPROACHES, (now == CARRIES) & ~holds & ~bent)
