@@ -130,11 +130,15 @@ class Carrier(BasePolicy):
             position=np.where(self._arms, self._plain, state.position),
             joint_velocity=np.where(self._arms, 0.0, state.joint_velocity),
         )
-        seen = np.where(self._arms, self._plain, applied)
-        first = self._first.act(hidden, seen, told)
-        self._plain = self._expert.act(hidden, seen, told)
-        rests = (self._waits > _WAITED)[..., None] & ~self._arms
-        self._plain = np.where(rests, first, self._plain)
+        self._plain = self._expert.act(hidden, np.where(self._arms, self._plain, applied), told)
+        held = self._arms & (self._share > 0.0)[..., None]
+        bare = replace(
+            state,
+            position=np.where(held, self._home, state.position),
+            joint_velocity=np.where(held, 0.0, state.joint_velocity),
+        )
+        first = self._first.act(bare, np.where(held, self._home, applied), told)
+        self._plain = np.where((self._waits > _WAITED)[..., None], first, self._plain)
         upper = self._plain + self._share[..., None] * (self._held - self._plain)
         return np.where(self._arms, upper, self._plain)
 
