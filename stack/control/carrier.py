@@ -1,7 +1,7 @@
 """Picks up a box and brings it to a place, by a script over the expert: what carrying is learned from.
 
 The expert walks up to the box; there the robot squats by poses of its own, takes the box between its forearms, and
-rises; then the expert walks on, and does not see that the arms hold something.
+rises; then the expert walks on, and does not see that the arms hold something. Nothing else goes by a clock.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Carrier(BasePolicy):
     """Of one robot, or worlds of any leading `shape`. It goes by where the box is seen, and takes it anew where it lost
     it.
 
-    It picks up from whatever pose it finds, without a clock: who learns from it sees none, and may be slower.
+    It picks up from whatever pose it finds, so that who learns from it, and is slower, is told what leads on.
     """
 
     def __init__(self, robot: Robot, shape: tuple[int, ...] = (), checkpoint: str = "expert") -> None:
