@@ -132,3 +132,8 @@ def read_recording(folder: Path, robot: Robot) -> Recording:
         box=columns[BOX] if carries else None,
         place=columns[PLACE] if carries else None,
     )
+
+
+def source_of(folder: Path, recording: Recording) -> str:
+    """What a run and its checkpoints say that they were trained on."""
+    return f"{folder.resolve().name}: {len(recording.spans)} episodes, {len(recording.raw)} ticks"

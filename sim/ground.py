@@ -1,6 +1,8 @@
-"""How high a body's base must be for the body to touch the ground, in any pose: on its back as well as on its feet."""
+"""Where a body meets the ground, in any pose: on its back as well as on its feet."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
 
 import mujoco
 import numpy as np
@@ -10,6 +12,7 @@ from servoid.sim.model import FLOOR
 from servoid.sim.scene import robot_bodies
 
 _GEOM = mujoco.mjtGeom
+_NEAR = 0.002  # m: what is not higher touches the ground; what a body stands on sinks in a little
 
 
 class Ground:
@@ -31,6 +34,22 @@ class Ground:
         self._data.qpos[2] = 0.0
         mujoco.mj_kinematics(self._model, self._data)
         return -min(self._lowest(int(geom)) for geom in self._geoms)
+
+    def touched_by(self, qpos: Array, apart_from: Iterable[str] = ()) -> list[str]:
+        """Names of the bodies that touch the ground in a pose of generalised positions `(nq,)`, `apart_from` those
+        that carry these geoms, and what hangs on them."""
+        model = self._model
+        self._data.qpos[: len(qpos)] = qpos
+        mujoco.mj_kinematics(model, self._data)
+        parents = {int(model.body_weldid[model.geom(name).bodyid[0]]) for name in apart_from}
+        touching = {int(model.geom_bodyid[g]) for g in self._geoms if self._lowest(int(g)) < _NEAR}
+        return [model.body(body).name for body in sorted(touching) if parents.isdisjoint(self._line(body))]
+
+    def _line(self, body: int) -> Iterator[int]:
+        """A body and those that it hangs on, one after the other."""
+        while body:
+            yield body
+            body = int(self._model.body_parentid[body])
 
     def _lowest(self, geom: int) -> float:
         """Height of a geom's lowest point."""

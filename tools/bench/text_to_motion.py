@@ -57,8 +57,8 @@ def _run(args: argparse.Namespace, report: Report) -> None:
     from servoid.policy.diffusion.prefix.model import load
     from servoid.policy.text.encoder import load_encoder
     from servoid.tools.evaluate.retrieval import COLUMNS, POOL, measures
-    from servoid.tools.learn.settings import PlannerTraining
-    from servoid.tools.learn.trainers.planner import learned_from
+    from servoid.tools.learn.planner_settings import PlannerTraining
+    from servoid.tools.learn.takes.learned import learned_from
 
     torch.set_num_threads(1)
     robot = load_robot()

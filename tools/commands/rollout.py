@@ -250,6 +250,9 @@ def _tell(report: Report, args: argparse.Namespace, plan: Sequence[_Policy]) -> 
         if seeds := summary["failed_seeds"]:
             shown = " ".join(map(str, seeds[:10])) + (" ..." if len(seeds) > 10 else "")
             report.line(f"seeds that failed with {name}: {shown}")
+        if causes := summary["falls_by"]:
+            shown = "; ".join(f"{count} {cause}" for cause, count in list(causes.items())[:5])
+            report.line(f"falls with {name}, as they began: {shown}" + ("; ..." if len(causes) > 5 else ""))
     if len(plan) == 1:
         return chosen | {"policy": plan[0].settings.policy} | found[plan[0].settings.policy]
     return chosen | {"policies": found, "differences": _tell_differences(report, done)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -43,6 +44,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "metrics": metrics,
         "sd": {name: spread.get(name) for name in ("mean_seconds", *metrics)},
         "failed_seeds": [row["seed"] for row in rows if not row["success"]],
+        "falls_by": dict(Counter(row["fall"] for row in rows if row["fall"] is not None).most_common()),
     }
 
 

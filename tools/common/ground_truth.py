@@ -6,14 +6,19 @@ With other robots it is the frame of the scene, in which their goals are.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from servoid.hw.contracts.backend import Simulation
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.task import Trace
-from servoid.hw.geometry import headed, turned
-from servoid.sim.truth import FALL_TILT
+from servoid.hw.geometry import headed, turned, up_vector
+from servoid.hw.robot.description import Robot
+from servoid.sim.ground import Ground
+from servoid.sim.joints.loops import Loops
+from servoid.sim.model import build
+from servoid.sim.truth import FALL_HEIGHT, FALL_TILT
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.safety.phase import Phase
 from servoid.tools.common.motion_quality import Poses
@@ -43,6 +48,30 @@ class Falls:
             self._up = record.tick
 
 
+@dataclass(frozen=True)
+class FirstFall:
+    """How a robot was when it had just fallen."""
+
+    position: Array  # (3,) m, of the base in the world
+    orientation: Array  # (4,) w x y z
+    joints: Array  # (n_joints,) rad
+
+    def cause(self, robot: Robot) -> str:
+        """What makes it a fall: `tilted`, `on the ground with` bodies of the MJCF that are not of a foot, `low`, or
+        `as the guard saw it`, where the guard alone took it for one."""
+        if up_vector(self.orientation)[2] < math.cos(FALL_TILT):
+            return "tilted"
+        model = build(robot)
+        qpos = model.qpos0.copy()
+        qpos[:3], qpos[3:7] = self.position, self.orientation
+        qpos[[int(model.joint(name).qposadr[0]) for name in robot.names]] = self.joints
+        Loops(model, robot).close(qpos)
+        names = Ground(model).touched_by(qpos, [foot.geoms[0] for foot in robot.feet.values()])
+        if names:
+            return f"on the ground with {', '.join(names)}"
+        return "low" if self.position[2] < FALL_HEIGHT * robot.standing_height else "as the guard saw it"
+
+
 class GroundTruth:
     """An `on_tick` listener: one row for each tick of the task.
 
@@ -65,6 +94,7 @@ class GroundTruth:
         self._orientation: list[Array] = []
         self._fallen = self._touched = self.fell_ending = False
         self._ever = False  # whether it has fallen
+        self.down: FirstFall | None = None  # as it was when it first fell, if it did
         self.falls = Falls(dt) if recover else None
         self.upright = 0  # ticks of the task before the robot had fallen
 
@@ -77,8 +107,10 @@ class GroundTruth:
                 self.fell_ending |= record.phase in (Phase.STOPPING, Phase.LOWERING) and bool(self._down[0])
                 self.fell_ending |= self._seated and record.phase is Phase.DAMPED and bool(self._tilted[0])
                 self.fell_ending |= any(event.kind == "fall" for event in record.events)
+                self._keep_first(self.fell_ending)
             return
         fallen = bool(self._down.any())
+        self._keep_first(fallen)
         self._ever |= fallen
         self._fallen = self._ever if self.falls is None else fallen
         self.upright += not self._ever
@@ -94,6 +126,12 @@ class GroundTruth:
         self._rows.append(
             (truth.position[0].copy(), float(truth.yaw[0]), truth.velocity[0], rate, instruction.velocity)
         )
+
+    def _keep_first(self, fell: bool) -> None:
+        """Keep how the robot is, or the first of several that is down, if it fell and had not fallen before."""
+        if fell and self.down is None:
+            truth, i = self._truth, int(np.argmax(self._down))
+            self.down = FirstFall(truth.position[i].copy(), truth.orientation[i].copy(), truth.joints[i].copy())
 
     @property
     def _down(self) -> Array:

@@ -45,8 +45,10 @@ def judge(job: RunSettings) -> Judged:
     from servoid.tools.common.ground_truth import GroundTruth
 
     assignment, backend = prepare(job)
-    dt, episode = load_robot(job.robot).dt, assignment.episode
-    ground_truth = GroundTruth(simulation(backend), dt, recover=job.recover, low=episode.low, seated=episode.seated)
+    robot, episode = load_robot(job.robot), assignment.episode
+    ground_truth = GroundTruth(
+        simulation(backend), robot.dt, recover=job.recover, low=episode.low, seated=episode.seated
+    )
     estimates: list[Array] = []
 
     def watch(record: TickRecord) -> None:
@@ -69,6 +71,7 @@ def judge(job: RunSettings) -> Judged:
         "fell": fell,
         "aborted": not fell and result.outcome not in ENDED,
         "fell_ending": ground_truth.fell_ending,
+        "fall": None if ground_truth.down is None else ground_truth.down.cause(robot),
         "seconds": result.seconds,
         "metrics": {name: value for name, value in metrics.items() if began or name in undone},
         "odometry_error_m": ground_truth.odometry_error(result.trace),

@@ -10,12 +10,13 @@ from dataclasses import asdict, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 from servoid.hw.config import ConfigError, load_yaml, parse_number, resolve
+from servoid.tools.learn.planner_settings import PLANNER_TITLES
 from servoid.tools.learn.prior_settings import PRIOR_TITLES
 from servoid.tools.learn.settings import TITLES as COMMON_TITLES
 from servoid.tools.learn.settings import StepRun, TrainingRun
 
 T = TypeVar("T", bound=TrainingRun)
-TITLES = {**COMMON_TITLES, **PRIOR_TITLES}
+TITLES = {**COMMON_TITLES, **PLANNER_TITLES, **PRIOR_TITLES}
 
 
 def add_setting_flags(parser: argparse.ArgumentParser, base: TrainingRun, run: argparse._ArgumentGroup) -> None:

@@ -12,7 +12,6 @@ from typing import Annotated, ClassVar, Literal
 
 from servoid.hw.config import nearest
 from servoid.policy.diffusion.model.config import DenoiserShape, TrainingObjective
-from servoid.policy.diffusion.prefix.config import PlannerShape
 from servoid.policy.latent.actions import LatentConfig
 from servoid.policy.tracker.rewards import TERMS
 
@@ -156,46 +155,6 @@ class LatentTraining(Optimiser, LatentConfig, DataRun):
             part.__post_init__(self)
         if min(self.beta) <= 0 or self.change < 0:
             raise ValueError("beta must be positive, and change must not be negative")
-
-
-@dataclass(frozen=True)
-class PlannerTakes:
-    """What the planner learns from."""
-
-    clips: Annotated[tuple[str, ...], "clips of the library to learn; none: all that are of this robot"] = ()
-    clip_takes: Annotated[int, "takes of three clips each"] = 500
-    walk_takes: Annotated[int, "walks of the gait"] = 200
-    walk_seconds: Annotated[float, "seconds of each of these walks"] = 30.0
-    untold: Annotated[float, "share of windows over which what is asked changes, which are told nothing"] = 0.1
-    licence: Annotated[str, "licence of the data beside the clips, kept in the checkpoint"] = "Apache-2.0"
-
-    def __post_init__(self) -> None:
-        if min(self.clip_takes, self.walk_takes) < 1 or self.walk_seconds <= 0:
-            raise ValueError("clip_takes, walk_takes and walk_seconds must be positive")
-        if not 0.0 <= self.untold <= 1.0:
-            raise ValueError(f"untold must be a share of 0 to 1, not {self.untold:g}")
-
-
-@dataclass(frozen=True)
-class PlannerTraining(DecayedOptimiser, PlannerTakes, PlannerShape, StepRun):
-    """`servoid train planner`."""
-
-    minutes: float = 60.0
-    evaluate_every: float = 10.0
-    batch: int = 64
-    learning_rate: float = 4e-4
-    text: Annotated[str, "encoder of sentences"] = "words"
-    target_weight: Annotated[float, "weight of the target loss"] = 1.0
-    root: Annotated[float, "by how much deviations of the base's rates and height count more than others'"] = 5.0
-    warmup_steps: Annotated[int, "steps over which the learning rate rises"] = 200
-    average: Annotated[float, "decay of the averaged weights, which are the ones saved"] = 0.999
-    precision: Annotated[Literal["bf16", "fp32"], "arithmetic of the network"] = "bf16"
-
-    def __post_init__(self) -> None:
-        for part in (StepRun, PlannerShape, PlannerTakes, Optimiser):
-            part.__post_init__(self)
-        if self.target_weight < 0 or self.root <= 0 or self.warmup_steps < 1:
-            raise ValueError("target_weight must not be negative, root positive, and warmup_steps at least 1")
 
 
 @dataclass(frozen=True)
@@ -392,7 +351,6 @@ class OdometryTraining(DecayedOptimiser, Layers, OdometryWalks, StepRun):
 TITLES: Mapping[type, str] = {  # of the help, in its order
     TrainingRun: "run", StepRun: "run", DataRun: "run", SampleRun: "run",
     OdometryWalks: "walks",
-    PlannerTakes: "takes", PlannerShape: "network", PlannerTraining: "optimiser",
     DenoiserShape: "network", DiffusionNetwork: "network", LatentConfig: "network", Layers: "network",
     TrainingObjective: "objective", LatentTraining: "objective", OdometryTraining: "objective", Ppo: "objective (PPO)",
     Optimiser: "optimiser", DecayedOptimiser: "optimiser", DiffusionTraining: "optimiser",

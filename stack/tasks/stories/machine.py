@@ -22,6 +22,7 @@ from servoid.stack.skills.skill import Skill
 from servoid.stack.tasks.base import BaseBehaviour
 from servoid.stack.tasks.stories.act import PELVIS, Act
 from servoid.stack.tasks.stories.condition import REST_SECONDS, Conditions, Moment, held_ticks, rests
+from servoid.stack.tasks.stories.standstill import Standstill, farther
 from servoid.stack.tasks.stories.told import StoryEpisode, StorySettings
 
 AGAIN_SECONDS = 2.0  # after a skill that did not do it, before another try
@@ -55,6 +56,7 @@ class Machine(BaseBehaviour):
         self._number = self._began = 0
         self._acting: int | None = None  # tick at which the act itself was asked for
         self._facing: float | None = None  # rad, toward the thing, as its approach began
+        self._stop = Standstill(dt)
         self._near = False  # whether it has come near to where the act is performed
         self._aside = False  # whether it has turned its back to the seat, away from it
         self._done = False  # the act, though the robot may be in the middle of it
@@ -107,7 +109,7 @@ class Machine(BaseBehaviour):
         return act
 
     def _next(self, tick: int) -> None:
-        self._acting = self._facing = None
+        self._come_anew()
         self._near = self._aside = self._done = False
         self._held, self._began = 0, tick
         if self._number + 1 == len(self.episode.acts):
@@ -179,14 +181,14 @@ class Machine(BaseBehaviour):
     def _ask(self, act: Act, state: State, thing: Array) -> Instruction:
         if self._acting is not None and self._strayed(act, state, thing):
             self._events.append(f"'{act.name}': it came to a stand beside the place, and walks there again")
-            self._acting = self._facing = None
+            self._come_anew()
         if self._acting is not None and self._too_late(act):
             self._events.append(f"'{act.name}' is tried again")
-            self._acting = self._facing = None
+            self._come_anew()
         if self._acting is None:
-            walk = None if act.approach is None else self._walk(act, state, thing)
-            if walk is not None:
-                return walk
+            come = None if act.approach is None else self._come(act, state, thing)
+            if come is not None:
+                return come
             self._acting = self._tick
         if self._performs:
             return Instruction(np.zeros(3), skill=act.skill, stand=act.skill is None)
@@ -217,18 +219,34 @@ class Machine(BaseBehaviour):
         since = self._tick - self._acting
         return self._ticks(READY_SECONDS) <= since < self._ticks(self._lasts(act, act.skill))
 
+    def _come_anew(self) -> None:
+        self._acting = self._facing = None
+        self._stop = Standstill(self._dt)
+
+    def _come(self, act: Act, state: State, thing: Array) -> Instruction | None:
+        """To where the act is performed and, where a planner strikes, to a stand there; None where the robot is."""
+        if act.limb is None or self._performs:
+            return self._walk(act, state, thing)
+        walk = None if self._stop.stands(self._tick) else self._walk(act, state, thing)
+        if walk is not None:
+            self._stop.step(walk.velocity[:2])
+            return walk
+        if self._stop.stands(self._tick) or not self._stop.stand(self._tick):
+            return self._rest()
+        return None
+
     def _walk(self, act: Act, state: State, thing: Array) -> Instruction | None:
         """To where the act is performed; None where the robot is there."""
         assert act.approach is not None
         to = act.approach
         ahead, turn = self._place(act, state, thing)
-        away = float(np.linalg.norm(ahead))
+        away, slack = float(np.linalg.norm(self._stop.left(ahead))), self._stop.slack
         if to.back and self._aside:  # straight back, however far aside: heels feel their way to a seat
             away, ahead = max(-float(ahead[0]), 0.0), np.array([ahead[0], 0.0])
         if to.back and not self._aside:
             self._aside = away <= STAGE and abs(turn) <= to.turned
             away = math.inf
-        there = away <= to.within and abs(turn) <= to.turned
+        there = away <= slack * to.within and abs(turn) <= slack * to.turned
         if there:
             return None
         faces = to.turned < math.pi
@@ -260,6 +278,9 @@ class Machine(BaseBehaviour):
             facing = self._facing
             place = thing[:2] - turned(np.array([to.ahead, to.aside]), facing)
         turn = (facing - float(state.yaw) + math.pi) % (2 * math.pi) - math.pi
+        if act.limb is not None and self._near:
+            aside = float(turned(place - state.displacement[:2], -facing)[1])
+            place = place - turned(np.array([farther(aside, turn), 0.0]), facing)
         return to_heading(place[None], state)[0], turn
 
     def _told(self, act: Act, state: State, thing: Array) -> Instruction:

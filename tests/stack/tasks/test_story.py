@@ -22,11 +22,13 @@ from servoid.stack.tasks import load_task
 from servoid.stack.tasks.stories.condition import Moment, moments
 from servoid.stack.tasks.stories.layout import CLEAR
 from servoid.stack.tasks.stories.machine import Machine
+from servoid.stack.tasks.stories.standstill import STAND_SECONDS
 from servoid.stack.tasks.stories.story import Story
 from servoid.stack.tasks.stories.told import StoryEpisode
 from servoid.tools.evaluate.judge import judge
 
 ROBOT = load_robot()
+STANDS = round(STAND_SECONDS / ROBOT.dt)  # ticks before a planner strikes
 STANDING = StillEstimator(ROBOT).update(observation(ROBOT, 0, ROBOT.home), ROBOT.home)
 
 
@@ -167,11 +169,12 @@ def test_words_ask_for_the_same_acts_by_a_sentence_and_by_where_parts_shall_be()
     assert far.skill is None
     assert far.goal is not None
     away = np.arctan2(bag[1], bag[0])
-    spot = bag[:2] - 0.13 * np.array([np.cos(away), np.sin(away)]) + 0.03 * np.array([np.sin(away), -np.cos(away)])
-    near = machine.instruct(1, _at(spot, float(away)), seen)
+    spot = bag[:2] - 0.145 * np.array([np.cos(away), np.sin(away)]) + 0.045 * np.array([np.sin(away), -np.cos(away)])
+    assert machine.instruct(1, _at(spot, float(away)), seen).stand
+    near = machine.instruct(1 + STANDS, _at(spot, float(away)), seen)
     assert near.text == "punch with the left hand"
     assert near.targets is not None
-    np.testing.assert_allclose(near.targets["left hand"], [0.13, 0.03, 0.33], atol=0.02)
+    np.testing.assert_allclose(near.targets["left hand"], [0.145, 0.045, 0.33], atol=0.02)
     assert near.targets["left hand"][2] < HIGHEST * ROBOT.standing_height, "else nothing would be planned"
 
 
@@ -225,15 +228,17 @@ def test_words_ask_for_a_kick_to_its_end_though_the_bag_lies_before_that() -> No
     spot = standing[0, :2] - 0.13 * np.array([np.cos(away), np.sin(away)])
     there = _at(spot + 0.05 * np.array([np.sin(away), -np.cos(away)]), float(away))
     machine.instruct(0, STANDING, seen)  # where it is to face is seen from afar
-    assert machine.instruct(1, there, seen).text == "kick high with the left foot"
+    machine.instruct(1, there, seen)
+    assert machine.instruct(1 + STANDS, there, seen).text == "kick high with the left foot"
     assert machine.instruct(round(3.0 / ROBOT.dt), there, fallen).text == "kick high with the left foot"
     assert len(machine.take_events()) == 1
     assert machine.instruct(round(6.0 / ROBOT.dt), there, fallen).stand
     assert not machine.take_events(), "it is said once"
     _, _, early = _story(plan="kick-left", by="words")
     early.instruct(0, STANDING, seen)
-    assert early.instruct(1, there, seen).text == "kick high with the left foot"
-    assert early.instruct(round(0.3 / ROBOT.dt), there, fallen).stand, "it has not begun to kick"
+    early.instruct(1, there, seen)
+    assert early.instruct(1 + STANDS, there, seen).text == "kick high with the left foot"
+    assert early.instruct(STANDS + round(0.3 / ROBOT.dt), there, fallen).stand, "it has not begun to kick"
 
 
 def test_things_are_not_in_each_others_way() -> None:
@@ -347,6 +352,33 @@ def test_a_bag_is_struck_by_what_is_nearest_as_it_begins_to_fall() -> None:
     assert told("punch-right", "right toe") == 0.0
     assert told("kick-right", "right toe") == 1.0
     assert told("kick-right", "right toe", falls=False) == 0.0
+
+
+def test_before_it_strikes_a_robot_comes_to_a_stand_and_steps_again_where_it_went_on() -> None:
+    """It went on by some centimetres as it stopped, and its toes walked the bag over."""
+    _, episode, machine = _story(plan="punch-left", by="words")
+    seen, bag, act = Percept("scene", 0.0, objects=_poses(episode)), np.array(episode.objects[0].place), episode.acts[0]
+    assert act.approach is not None
+    facing = float(np.arctan2(bag[1], bag[0]))
+    ahead, left = np.array([np.cos(facing), np.sin(facing)]), np.array([-np.sin(facing), np.cos(facing)])
+
+    def asked(tick: int, away: float = 0.0, aside: float = 0.0, turn: float = 0.0) -> Instruction:
+        """So far farther off and to the left than where it strikes."""
+        place = bag - (act.approach.ahead + away) * ahead - (act.approach.aside - aside) * left  # type: ignore[union-attr]
+        return machine.instruct(tick, _at(place, facing + turn), seen)
+
+    assert asked(0, away=0.1, aside=0.05).velocity.any()
+    off = asked(1, aside=0.05)
+    assert off.targets is not None
+    assert off.targets["ground"][0] < -0.03, "aside of the bag it steps back first"
+    assert asked(2, turn=0.25).targets["ground"][0] < -0.02, "and so where it is turned"  # type: ignore[index]
+    for tick in range(3, 40):
+        assert asked(tick, away=0.06).velocity[0] > 0.05
+    assert asked(40, away=0.04).stand, "its steps go on: it stops before it is there"
+    assert asked(60, away=-0.03).stand, "it is coming to a stand"
+    assert asked(81, away=-0.03).velocity[0] < 0.0, "it came to a stand too near"
+    assert asked(82).stand
+    assert asked(123).text == act.sentence
 
 
 def test_a_robot_that_stops_beside_a_point_walks_there_again() -> None:

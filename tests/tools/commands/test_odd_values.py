@@ -24,7 +24,7 @@ from servoid.stack.log.recorder import Recorder
 from servoid.stack.runtime.run import Run
 from servoid.tools.cli import VERBS, main, parser_of
 from servoid.tools.common.worker_pool import Worker
-from servoid.tools.learn.takes import TakeMaker
+from servoid.tools.learn.takes.maker import TakeMaker
 
 ODD = (
     "", ".", "..", "/", "-1", "0", "1", "nan", "1e999", "1e-320", "folder", "folder/", "missing", "missing.yaml",

@@ -20,18 +20,20 @@ from servoid.hw.contracts.task import Trace
 from servoid.hw.robot.description import load_robot
 from servoid.hw.seeds import episode_seed
 from servoid.sim.backend import SimBackend
+from servoid.sim.ground import Ground
+from servoid.sim.model import build
 from servoid.stack.log.tick import TickRecord
 from servoid.stack.runtime.run import RunSettings, run
 from servoid.stack.safety.phase import Phase
 from servoid.tools.commands import rollout
 from servoid.tools.common.compare import summarise
-from servoid.tools.common.ground_truth import GroundTruth
+from servoid.tools.common.ground_truth import FirstFall, GroundTruth
 from servoid.tools.evaluate.episode import EpisodeJob, EpisodeResult
 from servoid.tools.evaluate.judge import judge
 
 WORDS = ["walk", "--policy", "gait", "--seconds", "3", "--episodes", "2", "--seed", "3"]
 KEYS = {
-    "fell_ending_rate",
+    "fell_ending_rate", "falls_by",
     "task", "policy", "backend", "robot", "randomised", "episodes", "seed", "success_rate", "success_ci95", "fall_rate",
     "mean_seconds", "metrics", "wall_seconds",
 }  # fmt: skip
@@ -103,6 +105,7 @@ class Episodes:
         self.done.append((job.settings.policy, job.episode))
         row = {
             "seed": job.settings.seed, "success": True, "fell": False, "aborted": False, "fell_ending": False,
+            "fall": None,
             "seconds": 3.0 + job.episode + job.experiment * (0.5 + self._gain * job.episode),
             "metrics": {}, "odometry_error_m": 0.01,
         }  # fmt: skip
@@ -229,6 +232,26 @@ def test_the_witness_sees_the_run_in_the_frame_it_started_in() -> None:
     truth.qpos[0, 2] = 0.1
     ground_truth(record)
     assert ground_truth.trace().fallen
+
+
+@pytest.mark.parametrize(
+    ("knee", "tilt", "cause"),
+    [
+        (0.0, 65.0, "tilted"),
+        (2.2, 0.0, "on the ground with l_hip_pitch_link, l_knee_link, r_hip_pitch_link, r_knee_link"),
+        (0.0, 0.0, "as the guard saw it"),
+    ],
+)
+def test_a_fall_is_told_by_what_made_it_one(knee: float, tilt: float, cause: str) -> None:
+    robot = load_robot()
+    model, joints, half = build(robot), np.zeros(len(robot.joints)), np.deg2rad(tilt) / 2
+    for side, sign in (("l", 1), ("r", -1)):
+        joints[robot.names.index(f"{side}_knee")] = sign * knee
+    qpos = model.qpos0.copy()
+    qpos[3:7] = np.cos(half), 0, np.sin(half), 0
+    qpos[[int(model.joint(name).qposadr[0]) for name in robot.names]] = joints
+    qpos[2] = Ground(model).height(qpos)
+    assert FirstFall(qpos[:3], qpos[3:7], joints).cause(robot) == cause
 
 
 @pytest.mark.parametrize(

@@ -25,9 +25,10 @@ from servoid.policy.motion.library import Library
 from servoid.policy.text.captions import MOTIONS, NAMES
 from servoid.policy.text.encoder import load_encoder
 from servoid.stack.control.fleet import Fleet
-from servoid.tools.learn.executed import execute
-from servoid.tools.learn.settings import PlannerTraining
-from servoid.tools.learn.takes import TakeMaker, labels, told
+from servoid.tools.learn.planner_settings import PlannerTraining
+from servoid.tools.learn.takes.executed import execute
+from servoid.tools.learn.takes.learned import learned_from
+from servoid.tools.learn.takes.maker import TakeMaker, labels, told
 from servoid.tools.learn.trainers import planner
 
 ROBOT = load_robot("op3")
@@ -114,8 +115,8 @@ def test_recorded_walks_are_learned_from_too(synthetic_dataset: Path) -> None:
     settings = PlannerTraining(
         clips=("wave",), clip_takes=10, walk_takes=10, walk_seconds=5.0, prefix=4, frames=6, licence="CC0-1.0"
     )
-    alone, _, licence = planner.learned_from(ROBOT, frames, encoder, settings)
-    both, source, _ = planner.learned_from(ROBOT, frames, encoder, settings, synthetic_dataset)
+    alone, _, licence = learned_from(ROBOT, frames, encoder, settings)
+    both, source, _ = learned_from(ROBOT, frames, encoder, settings, synthetic_dataset)
     assert both.count > alone.count
     assert "1 clips in 10 takes, 10 walks of the gait" in source
     assert f"{synthetic_dataset.name}:" in source

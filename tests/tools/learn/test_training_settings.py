@@ -14,13 +14,12 @@ from servoid.hw.robot.description import load_robot
 from servoid.policy.checkpoint import read_header, resolve
 from servoid.policy.motion.library import Library
 from servoid.tools.common.parser import Parser
-from servoid.tools.learn.flags import add_setting_flags, plain, read_settings
+from servoid.tools.learn.flags import TITLES, add_setting_flags, plain, read_settings
+from servoid.tools.learn.planner_settings import PlannerTraining
 from servoid.tools.learn.settings import (
-    TITLES,
     DiffusionTraining,
     LatentTraining,
     OdometryTraining,
-    PlannerTraining,
     TrackerTraining,
     TrainingRun,
 )

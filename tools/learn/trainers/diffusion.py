@@ -31,7 +31,6 @@ from servoid.tools.learn.trainers.trainer import (
     add_run_arguments,
     option_of,
     require_same,
-    source_of,
 )
 
 if TYPE_CHECKING:
@@ -71,7 +70,7 @@ def main(args: argparse.Namespace) -> int:
     from servoid.hw.robot.description import load_robot
     from servoid.policy.diffusion.dataset import Windows
     from servoid.policy.latent.actions import load_latents
-    from servoid.policy.recording import read_recording
+    from servoid.policy.recording import read_recording, source_of
     from servoid.tools.learn.collect.told import skills_in, told_of
 
     # What cannot be trained or measured is refused before the data is read.

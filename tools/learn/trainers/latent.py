@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from servoid.hw.config import ConfigError
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.settings import LatentTraining
-from servoid.tools.learn.trainers.trainer import Judge, Trainer, add_run_arguments, source_of
+from servoid.tools.learn.trainers.trainer import Judge, Trainer, add_run_arguments
 
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
@@ -41,7 +41,7 @@ def main(args: argparse.Namespace) -> int:
 
     from servoid.hw.robot.description import load_robot
     from servoid.policy.latent.dataset import Demonstrations
-    from servoid.policy.recording import read_recording
+    from servoid.policy.recording import read_recording, source_of
 
     settings = read_settings(args, LatentTraining())
     torch.set_num_threads(args.threads)

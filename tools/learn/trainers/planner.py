@@ -14,30 +14,24 @@ import argparse
 import math
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from servoid.hw.config import ConfigError
 from servoid.tools.learn.flags import plain, read_settings
-from servoid.tools.learn.settings import PlannerTraining
-from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments, require_same, source_of
+from servoid.tools.learn.planner_settings import PlannerTraining
+from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments, require_same
 
 if TYPE_CHECKING:
     import torch
 
-    from servoid.hw.robot.description import Robot
     from servoid.policy.diffusion.prefix.dataset import PlanWindows
-    from servoid.policy.diffusion.prefix.frames import Frames
     from servoid.policy.diffusion.prefix.planner import PrefixPlanner
     from servoid.policy.text.encoder import TextEncoder
-    from servoid.tools.learn.executed import Executed
-    from servoid.tools.learn.takes import Take
 
 MEASURED = ("validation_loss", "shuffled_loss", "target_error_m", "plan_ms")
-_EXECUTED = 2**30  # sets the worlds in which takes are executed apart from others of the same seed
-WALKER = "expert"  # follows takes that walk, as in configs/policies/closd-joints.yaml
 _PLANS = 64  # that the missing of targets is measured on
 
 
@@ -62,6 +56,7 @@ def main(args: argparse.Namespace) -> int:
     from servoid.hw.robot.description import load_robot
     from servoid.policy.diffusion.prefix.frames import Frames
     from servoid.policy.text.encoder import load_encoder
+    from servoid.tools.learn.takes.learned import learned_from
 
     settings = read_settings(args, PlannerTraining())
     torch.set_num_threads(args.threads)
@@ -72,50 +67,6 @@ def main(args: argparse.Namespace) -> int:
     trainer.start(args.resume, args.init)
     trainer.run()
     return 0
-
-
-def learned_from(
-    robot: Robot,
-    frames: Frames,
-    encoder: TextEncoder,
-    settings: PlannerTraining,
-    data: Path | None = None,
-    tracker: str | None = None,
-) -> tuple[PlanWindows, str, str]:
-    """Windows of takes, what they come from, and its licence. Raises ConfigError."""
-    import numpy as np
-
-    from servoid.policy.diffusion.prefix.dataset import PlanWindows, ToldSentences
-    from servoid.policy.motion.library import Library
-    from servoid.policy.recording import read_recording
-    from servoid.policy.text.captions import NAMES, motion_of
-    from servoid.tools.learn.takes import TakeMaker, labels, sequences
-
-    library = Library(robot)
-    clips = [library[name] for name in settings.clips or library.fitting]
-    told, maker = labels(clips), TakeMaker(robot, clips, np.random.default_rng(settings.seed))
-    takes = [*maker.walks(settings.walk_takes, settings.walk_seconds), *maker.clips(settings.clip_takes)]
-    made = sequences(takes, frames)
-    source = f"{len(clips)} clips in {settings.clip_takes} takes, {settings.walk_takes} walks of the gait"
-    licence = " and ".join(dict.fromkeys([settings.licence, *(clip.about.licence for clip in clips)]))
-    if tracker is not None:
-        followed = executed_by(tracker, takes, frames, settings.seed)
-        source += f", {len(followed)} of these takes as executed by {Path(tracker).name}"
-        for each in followed:
-            take = each.take
-            wanted = frames.motion(take.place, take.orientation, take.joints)
-            made.add(frames, frames.of_states(each.raw), take.label, wanted)
-    if data is not None:
-        recording = read_recording(data, robot)
-        source += f", {source_of(data, recording)}"
-        for first, last in recording.spans:
-            motion = frames.of_states(recording.raw[first:last])
-            label = motion_of(recording.command[first:last], robot.walking.scale)
-            made.add(frames, motion, label)
-    sentences = ToldSentences(told, encoder, settings.words)
-    stand = NAMES.index("stand")
-    windows = PlanWindows(made, frames, settings, sentences, settings.untold, stand, settings.root)
-    return windows, source, licence
 
 
 def _plan_ms(planner: PrefixPlanner, prefix: torch.Tensor, text: torch.Tensor, plans: int = 5) -> float:
@@ -131,24 +82,6 @@ def _plan_ms(planner: PrefixPlanner, prefix: torch.Tensor, text: torch.Tensor, p
         for number in range(plans):
             planner.plan(prefix, text, nothing, [seeded(number)])
         return 1000.0 * (time.process_time() - start) / plans
-
-
-def executed_by(tracker: str, takes: Sequence[Take], frames: Frames, seed: int, worlds: int = 256) -> list[Executed]:
-    """Takes as trackers execute them, so many at a time, as a closed loop does: the shipped expert where they walk.
-
-    Raises CheckpointError where the tracker knows no clips.
-    """
-    from servoid.stack.control.fleet import Fleet
-    from servoid.stack.control.tracker import Followers
-    from servoid.stack.estimation.odometry import load_odometry
-    from servoid.tools.learn.executed import execute
-
-    robot, found = frames.robot, list[Any]()
-    for first in range(0, len(takes), worlds):
-        part = takes[first : first + worlds]
-        fleet = Fleet(robot, len(part), load_odometry(robot), randomise=0.5, seed=seed, tag=_EXECUTED + first)
-        found += execute(part, fleet, Followers(robot, tracker, WALKER, (len(part),)), frames)
-    return found
 
 
 class PlannerTrainer(Trainer):

@@ -297,9 +297,8 @@ class PolicyTrainer(PpoTrainer):
 
     def imitate(self, folder: Path) -> None:
         """Begin with a network that does what the dataset in `folder` shows, and keep it. Raises DatasetError."""
-        from servoid.policy.recording import read_recording
+        from servoid.policy.recording import read_recording, source_of
         from servoid.tools.learn.demonstrations import Mirrors, cloned, demonstrated
-        from servoid.tools.learn.trainers.trainer import source_of
 
         env, seed = self.env, self.settings.seed
         recording = read_recording(folder, env.robot)

@@ -24,7 +24,7 @@ from servoid.hw.config import ConfigError
 from servoid.policy.checkpoint import Origin
 from servoid.tools.learn.flags import plain, read_settings
 from servoid.tools.learn.prior_settings import PriorShape, PriorTraining
-from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments, require_same, source_of
+from servoid.tools.learn.trainers.trainer import Trainer, add_run_arguments, require_same
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -56,6 +56,7 @@ def main(args: argparse.Namespace) -> int:
     from servoid.policy.priors.manner import manner_by_speed
     from servoid.policy.priors.score_matching.network import PriorConfig
     from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.policy.recording import source_of
     from servoid.sim.kinematics import limbs_of
 
     settings = read_settings(args, PriorTraining())

@@ -24,7 +24,6 @@ from servoid.tools.learn.settings import TrainingRun
 
 if TYPE_CHECKING:
     from servoid.hw.robot.description import Robot
-    from servoid.policy.recording import Recording
     from servoid.tools.learn.trainers.logger import Logger
 
 # From a checkpoint's path to what was measured of it where it runs; "survival" in it is the share of worlds that stayed
@@ -290,11 +289,6 @@ class Trainer(ABC):
         done = "; nothing is left to train" if self.share == 1.0 else ""
         print(f"resumed at step {self.step:,}, {self.seconds / 60:.1f} minutes{done}", file=sys.stderr)
         return True
-
-
-def source_of(folder: Path, recording: Recording) -> str:
-    """What a run and its checkpoints say that they were trained on."""
-    return f"{folder.resolve().name}: {len(recording.spans)} episodes, {len(recording.raw)} ticks"
 
 
 def require_same(path: Path, otherwise: str, ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> None:

@@ -14,7 +14,7 @@ from servoid.policy.features import raw_layout, raw_row
 from servoid.policy.references.plan import PlanReference
 from servoid.stack.control.fleet import Fleet
 from servoid.tools.learn.progress import counted
-from servoid.tools.learn.takes import Take
+from servoid.tools.learn.takes.maker import Take
 
 Follow = Callable[[State, Array, Reference], Array]  # joint targets, as a tracker has them
 
@@ -29,6 +29,7 @@ class Executed:
 
     raw: Array  # (ticks, raw size)
     take: Take
+    number: int  # of the take among those that were executed
 
 
 def execute(takes: Sequence[Take], fleet: Fleet, follow: Follow, frames: Frames) -> list[Executed]:
@@ -63,7 +64,7 @@ def execute(takes: Sequence[Take], fleet: Fleet, follow: Follow, frames: Frames)
         if ticks > 1:
             by = np.maximum(np.arange(ticks) - 1, 0)  # the frame that was to be reached by each tick
             goals = Take(take.place[by], take.orientation[by], take.joints[by], take.label[:ticks])
-            kept.append(Executed(seen[:ticks, i], goals))
+            kept.append(Executed(seen[:ticks, i], goals, i))
     return kept
 
 

@@ -42,33 +42,41 @@ class Take:
         return len(self.joints)
 
 
-def labels(clips: Sequence[Clip]) -> Mapping[str, tuple[str, ...]]:
-    """What can be told, with its phrasings: the motions of walking, then the clips. A label is a number in it.
+def labels(clips: Sequence[Clip], aimed: Mapping[str, tuple[str, ...]] | None = None) -> Mapping[str, tuple[str, ...]]:
+    """What can be told, with its phrasings: the motions of walking, then the clips, then `aimed` motions that have no
+    clip's name. A label is a number in it.
 
     Raises ConfigError for a name or a phrasing that two of them have.
     """
     told = {motion.name: motion.phrasings for motion in MOTIONS}
-    for clip in clips:
-        if clip.name in told:
-            raise ConfigError(f"clip '{clip.name}': a way of walking has that name: give it another one")
-        for text in clip.about.captions:
-            if other := next((name for name, texts in told.items() if text in texts), None):
+    named = {clip.name: clip.about.captions for clip in clips}
+    for name, texts in ({**named, **(aimed or {}), **named}).items():
+        if name in told:
+            raise ConfigError(f"clip '{name}': a way of walking has that name: give it another one")
+        for text in texts:
+            if other := next((other for other, said in told.items() if text in said), None):
                 raise ConfigError(
-                    f"clip '{clip.name}': '{text}' is what '{other}' is called, too, and a planner that is told so "
+                    f"clip '{name}': '{text}' is what '{other}' is called, too, and a planner that is told so "
                     "cannot tell which: give one of them another caption"
                 )
-        told[clip.name] = clip.about.captions
+        told[name] = texts
     return told
 
 
 class TakeMaker:
     """Draws takes of one robot."""
 
-    def __init__(self, robot: Robot, clips: Sequence[Clip], rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        clips: Sequence[Clip],
+        rng: np.random.Generator,
+        aimed: Mapping[str, tuple[str, ...]] | None = None,
+    ) -> None:
         """Raises ConfigError without a clip that begins upright, or where nothing leads on from how one ends."""
         self._robot, self._rng = robot, rng
         self._clips = {clip.name: clip for clip in clips}
-        self._number = {name: number for number, name in enumerate(labels(clips))}
+        self._number = {name: number for number, name in enumerate(labels(clips, aimed))}
         self._from = {
             pose: [clip.name for clip in clips if clip.about.begins == pose]
             for pose in {_UPRIGHT, *(clip.about.ends for clip in clips)}
@@ -110,13 +118,21 @@ class TakeMaker:
         while not parts or pose != _UPRIGHT:
             name = str(self._rng.choice(self._from[pose]))
             clip = self._clips[name]
-            played = clip.at_rate(self._rng.uniform(*rates))
-            label = np.full(played.ticks, self._number[name])
-            parts.append(Take(played.root_position, played.root_orientation, played.joints, label))
+            parts.append(self._played(clip.at_rate(self._rng.uniform(*rates))))
             if clip.about.ends != _UPRIGHT:  # stays there for a while, which is told as what led there
                 parts.append(_held(parts[-1], self._ticks(self._rng.uniform(0.5, 2.0))))
             pose = clip.about.ends
         return parts
+
+    def performed(self, clips: Sequence[Clip]) -> tuple[Take, int]:
+        """Clips one after the other, from standing to standing; and the tick at which the first one begins."""
+        lead = [self._stand(self._rng.uniform(0.9, 2.0)), self._played(clips[0])]
+        begun = self._joined(lead).ticks - clips[0].ticks
+        return self._joined([*lead, *(self._played(clip) for clip in clips[1:]), self._stand(2.0)]), begun
+
+    def _played(self, clip: Clip) -> Take:
+        label = np.full(clip.ticks, self._number[clip.name])
+        return Take(clip.root_position, clip.root_orientation, clip.joints, label)
 
     def _stand(self, seconds: float) -> Take:
         """Standing, whose last moments are told as what comes next: whoever is told needs a moment to begin."""
