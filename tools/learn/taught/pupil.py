@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
-from pathlib import Path
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.tools.learn.envs.tracking import Tracking
-from servoid.tools.learn.settings import Ppo, TrackerTraining
+from servoid.tools.learn.settings import Ppo
 from servoid.tools.learn.trainers.ppo import Environment, PpoTrainer, tensors
-from servoid.tools.learn.trainers.tracker import TrackerTrainer
 
 _BATCH = 1024  # samples a step, and as many mirror images
 
@@ -107,17 +104,3 @@ class Taught(PpoTrainer):
         torch.nn.utils.clip_grad_norm_(self.ppo.actor.mlp.parameters(), 1.0)
         self.ppo.optimizer.step()
         return float(loss.detach())
-
-
-class TaughtTrainer(Taught, TrackerTrainer):
-    """As `TrackerTrainer`, of an environment with a teacher."""
-
-    def __init__(self, env: Tracking, settings: TrackerTraining, out: Path) -> None:
-        super().__init__(env, settings, out)
-        self.begin_lessons(env, settings)
-
-    def lesson(self, action: Array, led: float) -> tuple[Array, Array]:
-        taught = self.env.taught
-        leads = self._rng.random(self.env.n) < led
-        reward, _, _ = self.env.step(np.where(leads[:, None], taught, action))
-        return reward, taught
