@@ -26,8 +26,8 @@ from servoid.tools.learn.collect.carrying import box_seen
 from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.score_term import GeneratedStarts, Manner
 from servoid.tools.learn.envs.starts import AlongCarrying, AlongClip
-from servoid.tools.learn.taught.teacher import Teacher
 from servoid.tools.learn.prior_settings import EpisodeSettings
+from servoid.tools.learn.taught.teacher import Teacher
 from servoid.tools.learn.terms import Terms
 
 Starts: TypeAlias = GeneratedStarts | Down | AlongClip | AlongCarrying  # how episodes begin

@@ -10,10 +10,10 @@ import numpy as np
 
 from servoid.hw.contracts.body import Array
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
-from servoid.tools.learn.taught.teacher import Teacher
 from servoid.tools.learn.prior_settings import PolicyTraining
-from servoid.tools.learn.trainers.policy import PolicyTrainer
 from servoid.tools.learn.taught.pupil import Taught
+from servoid.tools.learn.taught.teacher import Teacher
+from servoid.tools.learn.trainers.policy import PolicyTrainer
 
 if TYPE_CHECKING:
     from servoid.policy.priors.score_matching.model import Style

@@ -200,8 +200,8 @@ def trainer_of(
     """By reward, or by a teacher where the settings name one. Raises ConfigError."""
     from servoid.stack.control.policies import make_policy
     from servoid.stack.tasks import load_task
-    from servoid.tools.learn.taught.teacher import Teacher
     from servoid.tools.learn.taught.policy import TaughtPolicyTrainer
+    from servoid.tools.learn.taught.teacher import Teacher
 
     if not settings.teacher:
         return PolicyTrainer(env, style, settings, out, prior)
