@@ -14,8 +14,8 @@ from servoid.policy.priors.score_matching.model import Style
 from servoid.policy.priors.task_policy import TaskPolicy
 from servoid.stack.tasks.learned import load_learned_task
 from servoid.tools.learn.prior_settings import PolicyTraining
-from servoid.tools.learn.taught.policy import TaughtPolicyTrainer
 from servoid.tools.learn.trainers.policy import environment, trainer_of
+from servoid.tools.learn.trainers.taught import TaughtPolicyTrainer
 
 ROBOT = load_robot()
 SETTINGS = replace(

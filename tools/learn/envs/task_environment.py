@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -27,7 +27,6 @@ from servoid.tools.learn.envs.down import Down
 from servoid.tools.learn.envs.score_term import GeneratedStarts, Manner
 from servoid.tools.learn.envs.starts import AlongCarrying, AlongClip
 from servoid.tools.learn.prior_settings import EpisodeSettings
-from servoid.tools.learn.taught.teacher import Teacher
 from servoid.tools.learn.terms import Terms
 
 Starts: TypeAlias = GeneratedStarts | Down | AlongClip | AlongCarrying  # how episodes begin
@@ -66,6 +65,17 @@ REWARDS: Mapping[str, Callable[[TaskStep], Array]] = {
 }
 
 
+class Beside(Protocol):
+    """Who drives some of the worlds, too, a tick at a time."""
+
+    def reset(self, where: Array, seeds: Array) -> None:
+        """New episodes in the worlds `where` `(n,)` bool."""
+
+    def __call__(self, state: State, applied: Array, told: Instruction, target: Array) -> Array:
+        """Joint targets of a tick `(n, n_joints)` rad, `target` where it does not drive."""
+        ...
+
+
 class TaskEnvironment:
     """`n` worlds: see `servoid.tools.learn.trainers.ppo.Environment`. A tick of that is a decision here."""
 
@@ -83,7 +93,7 @@ class TaskEnvironment:
         worlds = n if scene is None else Worlds(robot, n, randomise=s.randomised, model=build(robot, scene))
         self.fleet = Fleet(robot, worlds, known, randomise=s.randomised, seed=seed)
         self.lead = task.lead(n)
-        self.teacher: Teacher | None = None  # who drives worlds, too
+        self.beside: Beside | None = None
         self.observation = TaskObservation(robot, task.seen if self.lead is None else self.lead.goal, (n,))
         self.stride, self.reach = score.stride, score.reach
         self.dt = self.stride * robot.dt  # s between decisions
@@ -154,8 +164,8 @@ class TaskEnvironment:
         if self.lead is not None and self.down is not None:
             self.lead.begin(where, fleet.truth.gravity, self.down.clip, self.down.time)
         self.observation.reset(where)
-        if self.teacher is not None:
-            self.teacher.reset(where, fleet.seeds)
+        if self.beside is not None:
+            self.beside.reset(where, fleet.seeds)
         self.score.reset(where)
         if windows is not None:
             self.score.fill(where, windows)
@@ -239,9 +249,9 @@ class TaskEnvironment:
             target = self.reach * act[:, : len(self.robot.joints)] + (
                 self.robot.home if self.lead is None else self.lead.target
             )
-            if self.teacher is not None:
+            if self.beside is not None:
                 state = self.fleet.state
-                target = self.teacher(state, self.fleet.applied, self._told(state), target)
+                target = self.beside(state, self.fleet.applied, self._told(state), target)
             self.fleet.step(target)
             if self.lead is not None:
                 self.lead.advance(action[:, -1], self.fleet.state.gravity, target, self.fleet.applied)

@@ -200,14 +200,13 @@ def trainer_of(
     """By reward, or by a teacher where the settings name one. Raises ConfigError."""
     from servoid.stack.control.policies import make_policy
     from servoid.stack.tasks import load_task
-    from servoid.tools.learn.taught.policy import TaughtPolicyTrainer
-    from servoid.tools.learn.taught.teacher import Teacher
+    from servoid.tools.learn.trainers.taught import TaughtPolicyTrainer, Teacher
 
     if not settings.teacher:
         return PolicyTrainer(env, style, settings, out, prior)
     task = load_task(env.task.run, {}, env.robot.dt, env.robot)
-    env.teacher = Teacher(make_policy(settings.teacher, env.robot, task, realtime=False, shape=(env.n,)), env.n)
-    return TaughtPolicyTrainer(env, style, settings, out, prior)
+    teacher = Teacher(make_policy(settings.teacher, env.robot, task, realtime=False, shape=(env.n,)), env.n)
+    return TaughtPolicyTrainer(env, style, settings, out, prior, teacher)
 
 
 class PolicyTrainer(PpoTrainer):

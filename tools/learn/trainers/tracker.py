@@ -69,7 +69,7 @@ def main(args: argparse.Namespace) -> int:
 
 def trainer_of(env: Tracking, settings: TrackerTraining, out: Path) -> TrackerTrainer:
     """By reward, or by a teacher where the settings name one."""
-    from servoid.tools.learn.taught.tracker import TaughtTrainer
+    from servoid.tools.learn.trainers.taught import TaughtTrainer
 
     return (TaughtTrainer if settings.teacher else TrackerTrainer)(env, settings, out)
 

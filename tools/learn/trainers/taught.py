@@ -7,14 +7,27 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.tools.learn.settings import Ppo
+from servoid.hw.contracts.control import Instruction, Policy, State
+from servoid.tools.learn.envs.task_environment import TaskEnvironment
+from servoid.tools.learn.envs.tracking import Tracking
+from servoid.tools.learn.prior_settings import PolicyTraining
+from servoid.tools.learn.settings import Ppo, TrackerTraining
+from servoid.tools.learn.trainers.policy import PolicyTrainer
 from servoid.tools.learn.trainers.ppo import Environment, PpoTrainer, tensors
+from servoid.tools.learn.trainers.tracker import TrackerTrainer
+
+if TYPE_CHECKING:
+    from servoid.policy.priors.score_matching.model import Style
 
 _BATCH = 1024  # samples a step, and as many mirror images
+_TURNS = 0.4, 2.5  # s for which the teacher of a task policy acts, or its pupil
 
 
 class Taught(PpoTrainer):
@@ -104,3 +117,86 @@ class Taught(PpoTrainer):
         torch.nn.utils.clip_grad_norm_(self.ppo.actor.mlp.parameters(), 1.0)
         self.ppo.optimizer.step()
         return float(loss.detach())
+
+
+class TaughtTrainer(Taught, TrackerTrainer):
+    """As `TrackerTrainer`, of an environment with a teacher."""
+
+    def __init__(self, env: Tracking, settings: TrackerTraining, out: Path) -> None:
+        super().__init__(env, settings, out)
+        self.begin_lessons(env, settings)
+
+    def lesson(self, action: Array, led: float) -> tuple[Array, Array]:
+        taught = self.env.taught
+        leads = self._rng.random(self.env.n) < led
+        reward, _, _ = self.env.step(np.where(leads[:, None], taught, action))
+        return reward, taught
+
+
+class Teacher:
+    """A policy of `n` worlds that drives some of them itself, and says of all what it would do there.
+
+    It acts once a tick; whom it teaches decides once in a few.
+    """
+
+    def __init__(self, policy: Policy, n: int) -> None:
+        self._policy = policy
+        self.leads = np.ones(n, bool)  # worlds that it drives
+        self._told: list[Array] = []  # targets of the ticks since `taught`
+
+    def reset(self, where: Array, seeds: Array) -> None:
+        """New episodes in the worlds `where` `(n,)` bool."""
+        self._policy.reset(where, seeds)
+
+    def __call__(self, state: State, applied: Array, told: Instruction, target: Array) -> Array:
+        """Joint targets of a tick `(n, n_joints)` rad: its own where it leads, `target` elsewhere."""
+        decided = self._policy.act(state, applied, told)
+        self._told.append(decided)
+        return np.where(self.leads[:, None], decided, target)
+
+    def taught(self) -> Array:
+        """The mean of what it would have done since it was last asked `(n, n_joints)` rad: a decision that lasts as
+        long does no better."""
+        mean = np.mean(self._told, 0)
+        self._told.clear()
+        return np.asarray(mean)
+
+
+class TaughtPolicyTrainer(Taught, PolicyTrainer):
+    """As `PolicyTrainer`, with a teacher.
+
+    It acts after each turn of its pupil: what it would do where a pupil went long before, in another phase of
+    the gait say, means little.
+    """
+
+    LAST = "last.safetensors"
+    kept, led, led_last = 300_000, 0.4, 0.5
+
+    def __init__(
+        self,
+        env: TaskEnvironment,
+        style: Style,
+        settings: PolicyTraining,
+        out: Path,
+        prior: Path | None,
+        teacher: Teacher,
+    ) -> None:
+        env.beside = self.teacher = teacher
+        super().__init__(env, style, settings, out, prior)
+        self.begin_lessons(env, settings)
+        self._left = np.zeros(env.n, int)  # decisions of the present turns
+
+    def score(self, results: Mapping[str, float]) -> tuple[float, float]:
+        """The best return: a pupil that stops somewhere, where it did not before, does worse though it errs less."""
+        return results.get("return", 0.0), float(self.step)
+
+    def lesson(self, action: Array, led: float) -> tuple[Array, Array]:
+        env = self.env
+        over = self._left == 0
+        turns = np.rint(self._rng.uniform(*_TURNS, env.n) / env.dt).astype(int)
+        self._left = np.where(over, turns, self._left) - 1
+        # The pupil after one of the teacher's turns, so often that the teacher acts for a share `led` of the time.
+        leads = ~self.teacher.leads | (self._rng.random(env.n) * led >= 1.0 - led)
+        self.teacher.leads = np.where(over, leads, self.teacher.leads)
+        reward, _, _ = env.step(action)
+        return reward, (self.teacher.taught() - env.robot.home) / env.reach
