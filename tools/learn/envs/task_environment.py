@@ -65,7 +65,7 @@ REWARDS: Mapping[str, Callable[[TaskStep], Array]] = {
 }
 
 
-class Beside(Protocol):
+class Driver(Protocol):
     """Who drives some of the worlds, too, a tick at a time."""
 
     def reset(self, where: Array, seeds: Array) -> None:
@@ -93,7 +93,7 @@ class TaskEnvironment:
         worlds = n if scene is None else Worlds(robot, n, randomise=s.randomised, model=build(robot, scene))
         self.fleet = Fleet(robot, worlds, known, randomise=s.randomised, seed=seed)
         self.lead = task.lead(n)
-        self.beside: Beside | None = None
+        self.beside: Driver | None = None
         self.observation = TaskObservation(robot, task.seen if self.lead is None else self.lead.goal, (n,))
         self.stride, self.reach = score.stride, score.reach
         self.dt = self.stride * robot.dt  # s between decisions
@@ -128,7 +128,7 @@ class TaskEnvironment:
 
     @property
     def measures(self) -> Mapping[str, float]:
-        """Beside the rewards: the prior's error, and how often tasks are achieved, by how episodes begin."""
+        """Driver the rewards: the prior's error, and how often tasks are achieved, by how episodes begin."""
         return {**self.score.measures, **({} if self.down is None else self.down.measures)}
 
     def schedule(self, progress: float) -> None:
