@@ -43,7 +43,7 @@ class Taught(PpoTrainer):
 
         self.critic_alone = 0.0  # no critic is asked
         self.columns = (*(name for name in self.columns if not name.startswith("loss/")), "loss/taught")
-        self.panels = (*(panel for panel in self.panels if "std" not in panel), ("loss/taught",))
+        self.panels = (*(panel for panel in self.panels if panel and "std" not in panel), ("loss/taught",))
         self._rng = np.random.default_rng(settings.seed)
         count = min(self.kept, 100 * settings.horizon * env.n)
         self._seen = torch.zeros(count, env.observations["actor"].shape[1])
@@ -183,6 +183,8 @@ class TaughtPolicyTrainer(Taught, PolicyTrainer):
     ) -> None:
         env.beside = self.teacher = teacher
         super().__init__(env, style, settings, out, prior)
+        # Not all at the same part of the task: what is learned from would be that part.
+        env.ticks[:] = np.random.default_rng(settings.seed).integers(0, env.limit, env.n)
         self.begin_lessons(env, settings)
         self._left = np.zeros(env.n, int)  # decisions of the present turns
 
