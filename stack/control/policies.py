@@ -121,6 +121,7 @@ def _loop_settings(source: str) -> ClosedLoopSettings:
 # Policies of Servoid's own; besides there are the planner's other settings in configs/policies/.
 POLICIES: dict[str, Maker] = {
     "carrier": _carrier,
+    "carry": _task_policy,
     "diffusion": _diffusion,
     "dodgeball": _task_policy,
     "expert": _expert,

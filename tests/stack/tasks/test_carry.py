@@ -36,6 +36,13 @@ def test_a_script_picks_the_box_up_from_the_ground_and_brings_it() -> None:
     assert not judged.assignment.success(replace(judged.trace, fallen=True))
 
 
+@pytest.mark.slow
+def test_what_learned_from_the_script_picks_it_up_too() -> None:
+    figures = judge(RunSettings("carry", policy="carry", seed=2968811710, seconds=12.0)).row["metrics"]
+    assert figures["held"] == 1.0
+    assert figures["return"] > 0.3
+
+
 def test_the_box_is_drawn_ahead_and_is_seen_as_it_stands_there() -> None:
     task = Carry(ROBOT)
     box = task.place(np.random.default_rng(0))

@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 
 from servoid.hw.config import ConfigError
-from servoid.policy.checkpoint import read, resolve, write
+from servoid.policy.checkpoint import read, read_header, resolve, write
 from servoid.tools.evaluate.cache import key
 from servoid.tools.evaluate.policies import Policies, dependencies
 from servoid.tools.evaluate.spec import Experiment, OwnNetwork
+
+# As the shipped model was trained, by whose file a network of a row's own is tried here.
+FULL = f"--minutes {read_header(resolve('diffusion'))['training']['minutes']:g} --width 128 --horizon 24"
 
 
 def newest(folder: Path, share: float | None) -> None:
@@ -97,15 +100,15 @@ def test_a_task_policy_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: 
 
 def test_a_network_that_is_not_there_yet_is_a_command_to_train_it(tmp_path: Path) -> None:
     policies = Policies("diffusion", tmp_path)
-    experiment = Experiment("goal-near", network=OwnNetwork("full", "--width 128 --horizon 24"))
-    train = f"servoid train diffusion --data runs/walks --out {tmp_path}/networks/full --width 128 --horizon 24"
+    experiment = Experiment("goal-near", network=OwnNetwork("full", FULL))
+    train = f"servoid train diffusion --data runs/walks --out {tmp_path}/networks/full {FULL}"
     assert policies.training(experiment) == f"`{train}`"
     path = tmp_path / "networks" / "full" / "best.safetensors"
     newest(path.parent, 1.0)
     shutil.copy(resolve("diffusion"), path)
     assert policies.training(experiment) is None
     assert str(path.resolve()) in Path(policies.name(experiment)).read_text()
-    other = replace(experiment, network=OwnNetwork("full", "--width 128 --horizon 24 --near-actions 16"))
+    other = replace(experiment, network=OwnNetwork("full", f"{FULL} --near-actions 16"))
     with pytest.raises(ConfigError, match="trained with --near-actions 8, but this row needs 16"):
         policies.name(other)
 
@@ -132,7 +135,7 @@ def test_of_a_network_that_was_trained_by_steps_the_minutes_do_not_matter(tmp_pa
 )
 def test_a_half_trained_network_fills_no_row(tmp_path: Path, share: float | None, told: str) -> None:
     """Its best so far is there from the first evaluation."""
-    experiment = Experiment("goal-near", network=OwnNetwork("full", "--width 128 --horizon 24"))
+    experiment = Experiment("goal-near", network=OwnNetwork("full", FULL))
     newest(tmp_path / "networks" / "full", share)
     shutil.copy(resolve("diffusion"), tmp_path / "networks" / "full" / "best.safetensors")
     policies = Policies("diffusion", tmp_path)

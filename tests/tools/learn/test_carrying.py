@@ -26,7 +26,7 @@ from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.policy import environment
 
 ROBOT = load_robot()
-COMMAND = "collect --carry --worlds 6 --frames 1800 --seconds 9 --noise 0 0 --randomise 0 --threads 1 --json --out"
+COMMAND = "collect --carry --worlds 6 --frames 2160 --seconds 9 --noise 0 0 --randomise 0 --threads 1 --json --out"
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_each_tick_says_where_the_box_is_and_some_are_picked_up(recording: Recor
     for first, _ in recording.spans:
         assert recording.box[first, 2] == pytest.approx(STANDS, abs=0.01)
         assert 0.25 < np.linalg.norm(recording.box[first, :2]) < 0.65
-    assert (recording.box[:, 2] > 0.15).any(), "no box was picked up"
+    assert (recording.box[:, 2] > 0.1).any(), "no box was picked up"
 
 
 @pytest.mark.slow

@@ -17,7 +17,6 @@ from servoid.policy.priors.adversarial.discriminator import (
     Adversary,
     Discriminator,
     load_discriminator,
-    save_discriminator,
 )
 from servoid.policy.priors.adversarial.smiling import OwnScore
 from servoid.policy.priors.score_matching.model import Style, load_prior
@@ -26,7 +25,7 @@ from servoid.policy.priors.score_matching.windows import PriorWindows
 from servoid.policy.recording import read_recording
 from servoid.sim.kinematics import limbs_of
 from servoid.stack.tasks.learned import load_learned_task
-from servoid.tools.learn.envs.score_term import Rival
+from servoid.tools.learn.envs.score_term import Rival, SmilingTerm
 from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.policy import environment
 
@@ -55,7 +54,7 @@ def test_smiling_pays_nothing_for_what_the_prior_knows_as_well_and_charges_for_t
 def test_smiling_rewards_in_the_place_of_the_prior(prior: Path) -> None:
     known = load_prior(prior, ROBOT, limbs_of(ROBOT))
     settings = replace(SETTINGS, rewards={"manner": 1.0}, generated=0.0)
-    env = environment(load_learned_task("speed", ROBOT), known, Style(), settings, 6, 0, "smiling")
+    env = environment(load_learned_task("speed", ROBOT), known, Style(), settings, 6, 0, SmilingTerm)
     env.reset()
     rewards = [env.step(np.zeros((env.n, env.action_size)))[0] for _ in range(3)]
     assert np.isfinite(rewards).all()
@@ -70,24 +69,25 @@ def test_a_discriminator_learns_along_and_rewards_frozen(prior: Path, synthetic_
     recordings = {"": read_recording(synthetic_dataset, ROBOT)}
     discriminator = Discriminator(known)
     adversary = Adversary(discriminator, PriorWindows(recordings, known.features, known.config), 0)
-    rival = Rival(discriminator, adversary)
-    env = environment(load_learned_task("speed", ROBOT), known, Style(), replace(SETTINGS, generated=0.0), 6, 0, rival)
+    makes = Rival(discriminator, adversary).term
+    env = environment(load_learned_task("speed", ROBOT), known, Style(), replace(SETTINGS, generated=0.0), 6, 0, makes)
     env.reset()
     for _ in range(6):
         env.step(np.ones((env.n, env.action_size)))
     told = [env.score.learn() for _ in range(60)][-1]
     assert told["tells_data"] > 0.9
     assert told["tells_policy"] > 0.9
+    env.score.keep(tmp_path, {"data": "", "licence": "", "results": {}})
     file = tmp_path / "discriminator.safetensors"
-    save_discriminator(file, discriminator, known, {"data": "", "licence": "", "results": {}})
     frozen = load_discriminator(file, known)
     real = adversary._data.held_out(20)[0] * known.std + known.mean
     assert np.array_equal(frozen.reward(real), discriminator.reward(real))
     assert frozen.reward(real).mean() > frozen.reward(adversary.memory.windows).mean()
-    again = environment(load_learned_task("speed", ROBOT), known, Style(), SETTINGS, 6, 0, Rival(frozen, None))
+    again = environment(load_learned_task("speed", ROBOT), known, Style(), SETTINGS, 6, 0, Rival(frozen, None).term)
     again.reset()
     again.step(np.zeros((6, again.action_size)))
     assert again.score.learn() == {}
+    again.score.keep(tmp_path / "nowhere", {})  # what stays as it is has a file
     head, tensors = checkpoint.read(file)
     checkpoint.write(file, tensors, {**head, "config": {**head["config"], "stride": 1}})
     with pytest.raises(CheckpointError, match="stride 1"):

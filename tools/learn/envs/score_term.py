@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -24,16 +25,9 @@ if TYPE_CHECKING:
     from servoid.policy.priors.score_matching.model import Prior, Style
 
 SMALLEST_REACH, LARGEST_REACH = 0.05, 0.5  # rad of joint target for an action of one
+_DISCRIMINATOR = "discriminator.safetensors"  # beside the policy
 _REACH = 2.0  # deviations of the data: exploration goes where the data goes
 _SMOOTHING = 0.2  # of a decision's error in its running average by world
-
-
-@dataclass(frozen=True)
-class Rival:
-    """A discriminator that rewards in the prior's place, and what teaches it; None: it stays as it is."""
-
-    discriminator: Discriminator
-    adversary: Adversary | None
 
 
 class Manner(StatefulTerm[State]):
@@ -74,6 +68,9 @@ class Manner(StatefulTerm[State]):
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Inverse of `state`."""
+
+    def keep(self, folder: Path, about: Mapping[str, Any]) -> None:
+        """Write what it learned itself beside the policy, `about` into its header. Raises CheckpointError."""
 
     def __call__(self, step: State) -> Array:
         return np.ones(len(self.ratio))
@@ -167,12 +164,34 @@ class ScoreTerm(Manner):
         return torch.from_numpy(seen_from_last(self._frames, self._yaw).astype(np.float32))
 
 
+# What rewards in `n` worlds, made of a prior, a style, n, settings and a seed: `ScoreTerm`, or what takes its place.
+MakesTerm: TypeAlias = "Callable[[Prior, Style, int, ScoreSettings, int], ScoreTerm]"
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A discriminator that rewards in the prior's place, and what teaches it; None: it stays as it is."""
+
+    discriminator: Discriminator
+    adversary: Adversary | None
+
+    def term(self, prior: Prior, style: Style, n: int, settings: ScoreSettings, seed: int) -> AdversarialTerm:
+        """A `MakesTerm`."""
+        return AdversarialTerm(prior, style, n, settings, seed, self)
+
+
 class AdversarialTerm(ScoreTerm):
     """The reward of a discriminator instead (AMP), frozen or learning; the prior measures the manner all the same."""
 
     def __init__(self, prior: Prior, style: Style, n: int, settings: ScoreSettings, seed: int, rival: Rival) -> None:
         super().__init__(prior, style, n, settings, seed)
         self.discriminator, self._adversary = rival.discriminator, rival.adversary
+
+    def keep(self, folder: Path, about: Mapping[str, Any]) -> None:
+        from servoid.policy.priors.adversarial.discriminator import save_discriminator
+
+        if self._adversary is not None:
+            save_discriminator(folder / _DISCRIMINATOR, self.discriminator, self.prior, about)
 
     def _reward(self, windows: Tensor, errors: Array) -> Array:
         if self._adversary is not None:

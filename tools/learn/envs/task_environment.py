@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.contracts.control import State
+from servoid.hw.contracts.control import Instruction, State
 from servoid.hw.contracts.world import Start
 from servoid.hw.geometry import turned
 from servoid.hw.robot.mirror import Mirror
@@ -65,6 +65,17 @@ REWARDS: Mapping[str, Callable[[TaskStep], Array]] = {
 }
 
 
+class Driver(Protocol):
+    """Who drives some of the worlds, too, a tick at a time."""
+
+    def reset(self, where: Array, seeds: Array) -> None:
+        """New episodes in the worlds `where` `(n,)` bool."""
+
+    def __call__(self, state: State, applied: Array, told: Instruction, target: Array) -> Array:
+        """Joint targets of a tick `(n, n_joints)` rad, `target` where it does not drive."""
+        ...
+
+
 class TaskEnvironment:
     """`n` worlds: see `servoid.tools.learn.trainers.ppo.Environment`. A tick of that is a decision here."""
 
@@ -82,6 +93,7 @@ class TaskEnvironment:
         worlds = n if scene is None else Worlds(robot, n, randomise=s.randomised, model=build(robot, scene))
         self.fleet = Fleet(robot, worlds, known, randomise=s.randomised, seed=seed)
         self.lead = task.lead(n)
+        self.beside: Driver | None = None
         self.observation = TaskObservation(robot, task.seen if self.lead is None else self.lead.goal, (n,))
         self.stride, self.reach = score.stride, score.reach
         self.dt = self.stride * robot.dt  # s between decisions
@@ -116,7 +128,7 @@ class TaskEnvironment:
 
     @property
     def measures(self) -> Mapping[str, float]:
-        """Beside the rewards: the prior's error, and how often tasks are achieved, by how episodes begin."""
+        """Driver the rewards: the prior's error, and how often tasks are achieved, by how episodes begin."""
         return {**self.score.measures, **({} if self.down is None else self.down.measures)}
 
     def schedule(self, progress: float) -> None:
@@ -152,6 +164,8 @@ class TaskEnvironment:
         if self.lead is not None and self.down is not None:
             self.lead.begin(where, fleet.truth.gravity, self.down.clip, self.down.time)
         self.observation.reset(where)
+        if self.beside is not None:
+            self.beside.reset(where, fleet.seeds)
         self.score.reset(where)
         if windows is not None:
             self.score.fill(where, windows)
@@ -165,7 +179,6 @@ class TaskEnvironment:
 
     def _observe(self) -> None:
         state, truth = self._sense(), self.fleet.truth
-        box = self.score.box = None if self.task.scene is None else box_seen(truth)
         for i in np.flatnonzero(self.ticks >= self._next):
             rng = self.fleet.rngs[i]
             self.asked[i] = self.task.draw(rng, truth.position[i, :2])
@@ -173,8 +186,7 @@ class TaskEnvironment:
         if self.lead is not None:
             goal = self.lead.seen
         else:
-            told = replace(self.task.instruct(self.asked, state), box=box)
-            goal = self.task.seen.observe(told, self.robot.walking)
+            goal = self.task.seen.observe(self._told(state), self.robot.walking)
         actor = self.observation(state, self.fleet.applied, goal)
         forward = self.robot.walking.forward
         known = [
@@ -186,6 +198,11 @@ class TaskEnvironment:
             truth.gravity,
         ]
         self.observations = {"actor": actor, "critic": np.concatenate([actor, *known], -1).astype(np.float32)}
+
+    def _told(self, state: State) -> Instruction:
+        """What is asked, and where the box is, now."""
+        box = self.score.box = None if self.task.scene is None else box_seen(self.fleet.truth)
+        return replace(self.task.instruct(self.asked, state), box=box)
 
     def _sense(self) -> State:
         state = self.fleet.observe()
@@ -232,6 +249,9 @@ class TaskEnvironment:
             target = self.reach * act[:, : len(self.robot.joints)] + (
                 self.robot.home if self.lead is None else self.lead.target
             )
+            if self.beside is not None:
+                state = self.fleet.state
+                target = self.beside(state, self.fleet.applied, self._told(state), target)
             self.fleet.step(target)
             if self.lead is not None:
                 self.lead.advance(action[:, -1], self.fleet.state.gravity, target, self.fleet.applied)

@@ -18,7 +18,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -38,15 +38,13 @@ from servoid.tools.learn.trainers.trainer import add_run_arguments
 
 if TYPE_CHECKING:
     from servoid.policy.priors.score_matching.model import Prior, Style
-    from servoid.tools.learn.envs.score_term import Rival
+    from servoid.tools.learn.envs.score_term import MakesTerm
 
 _JUDGED, _JUDGED_STARTS = 32, 256  # worlds; states that they begin in, where a task has its own
 _LED_SHARE = 0.05  # of what initial weights give, where a lead knows a way already
 NO_PRIOR = "none"
-SMILING: Final = "smiling"  # what rewards in the prior's place
 _LICENCE = "Apache-2.0"  # of what learns from nothing but its own experience
 _IMITATION = "imitation.safetensors"  # what a policy began as, where it imitated
-_DISCRIMINATOR = "discriminator.safetensors"  # beside the policy
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -107,17 +105,16 @@ def main(args: argparse.Namespace) -> int:
     torch.manual_seed(settings.seed)
     robot = load_robot(args.robot)
     style = Style.parse(args.style, args.style_weight)
-    found, prior, rival = None, None, None
+    found, prior, makes = None, None, None
     if args.prior == NO_PRIOR:
         _refuse_what_needs_a_prior(args)
     else:
         found = checkpoint.resolve(args.prior, robot)
         prior = load_prior(found, robot, limbs_of(robot))
-        rival = _rival(args, prior, settings)
+        makes = _makes_term(args, prior, settings)
     task = load_learned_task(args.task, robot)
-    env = environment(task, prior, style, settings, settings.worlds, settings.seed, rival)
-    trainer = PolicyTrainer(env, style, settings, args.out, found)
-    trainer.rival = rival
+    env = environment(task, prior, style, settings, settings.worlds, settings.seed, makes)
+    trainer = trainer_of(env, style, settings, args.out, found)
     trainer.start(args.resume, None if args.init is None else checkpoint.resolve(args.init, robot))
     if args.demonstrations is not None and not trainer.begun_with:
         trainer.imitate(args.demonstrations)
@@ -139,10 +136,10 @@ def _refuse_what_needs_a_prior(args: argparse.Namespace) -> None:
             raise ConfigError(f"{flag} needs a prior: name one with --prior, or leave {flag} out")
 
 
-def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> Rival | Literal["smiling"] | None:
-    """What rewards in the prior's place, where that was asked for. Raises ConfigError."""
+def _makes_term(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> MakesTerm | None:
+    """What makes the term that rewards in the prior's place, where that was asked for. Raises ConfigError."""
     from servoid.policy.priors.adversarial.discriminator import load_discriminator
-    from servoid.tools.learn.envs.score_term import Rival
+    from servoid.tools.learn.envs.score_term import Rival, SmilingTerm
     from servoid.tools.learn.trainers.prior import learning_rival
 
     if sum((args.discriminator is not None, args.adversarial is not None, args.smiling)) > 1:
@@ -150,15 +147,13 @@ def _rival(args: argparse.Namespace, prior: Prior, settings: PolicyTraining) -> 
             "give one of --adversarial, --discriminator and --smiling: one reward takes the prior's place"
         )
     if args.discriminator is not None:
-        return Rival(load_discriminator(args.discriminator, prior), None)
+        return Rival(load_discriminator(args.discriminator, prior), None).term
     if args.adversarial is None and not args.smiling:
         return None
     if args.resume and (args.out / "resume.pt").exists():
         what = "a second denoiser" if args.smiling else "a discriminator"
         raise ConfigError(f"{args.out}: {what} does not go on where it stopped: use --no-resume")
-    if args.smiling:
-        return SMILING
-    return learning_rival(args.adversarial, prior, settings.seed)
+    return SmilingTerm if args.smiling else learning_rival(args.adversarial, prior, settings.seed).term
 
 
 def environment(
@@ -168,18 +163,12 @@ def environment(
     settings: PolicyTraining,
     worlds: int,
     seed: int,
-    rival: Rival | Literal["smiling"] | None = None,
+    makes: MakesTerm | None = None,
 ) -> TaskEnvironment:
-    """Worlds of a task under a prior, under a rival of it, or without one. Raises ConfigError."""
+    """Worlds of a task under a prior, under what `makes` the term in its place, or without one. Raises ConfigError."""
     from servoid.stack.estimation.odometry import load_odometry
     from servoid.tools.learn.envs.down import Down
-    from servoid.tools.learn.envs.score_term import (
-        AdversarialTerm,
-        GeneratedStarts,
-        Manner,
-        ScoreTerm,
-        SmilingTerm,
-    )
+    from servoid.tools.learn.envs.score_term import GeneratedStarts, Manner, ScoreTerm
     from servoid.tools.learn.envs.starts import AlongCarrying, AlongClip
 
     robot = task.robot
@@ -192,11 +181,7 @@ def environment(
     score = Manner(worlds, settings.decide_every, np.full(len(robot.joints), settings.reach))
     starts: Starts | None = None
     if prior is not None:
-        given = prior, style, worlds, settings, seed
-        if rival is None:
-            score = ScoreTerm(*given)
-        else:
-            score = SmilingTerm(*given) if rival == SMILING else AdversarialTerm(*given, rival)
+        score = (makes or ScoreTerm)(prior, style, worlds, settings, seed)
     if task.lies:
         starts = Down(robot, settings.eased, settings.starts, seed)
     elif task.scene is not None:
@@ -209,13 +194,27 @@ def environment(
     return TaskEnvironment(task, score, starts, load_odometry(robot), settings, worlds, seed)
 
 
+def trainer_of(
+    env: TaskEnvironment, style: Style, settings: PolicyTraining, out: Path, prior: Path | None
+) -> PolicyTrainer:
+    """By reward, or by a teacher where the settings name one. Raises ConfigError."""
+    from servoid.stack.control.policies import make_policy
+    from servoid.stack.tasks import load_task
+    from servoid.tools.learn.trainers.taught import TaughtPolicyTrainer, Teacher
+
+    if not settings.teacher:
+        return PolicyTrainer(env, style, settings, out, prior)
+    task = load_task(env.task.run, {}, env.robot.dt, env.robot)
+    teacher = Teacher(make_policy(settings.teacher, env.robot, task, realtime=False, shape=(env.n,)), env.n)
+    return TaughtPolicyTrainer(env, style, settings, out, prior, teacher)
+
+
 class PolicyTrainer(PpoTrainer):
     """A task policy; `policy.safetensors` is the newest one, which runs without torch."""
 
     BEST = LAST = "policy.safetensors"
     env: TaskEnvironment
     settings: PolicyTraining
-    rival: Rival | Literal["smiling"] | None = None
 
     def __init__(
         self, env: TaskEnvironment, style: Style, settings: PolicyTraining, out: Path, prior: Path | None
@@ -336,11 +335,6 @@ class PolicyTrainer(PpoTrainer):
             "results": results,
             "training": plain(self.settings),
         }
-        from servoid.tools.learn.envs.score_term import Rival
-
-        if env.score.prior is not None and isinstance(self.rival, Rival) and self.rival.adversary is not None:
-            from servoid.policy.priors.adversarial.discriminator import save_discriminator
-
-            save_discriminator(path.with_name(_DISCRIMINATOR), self.rival.discriminator, env.score.prior, about)
+        env.score.keep(path.parent, about)
         save = save_rising_policy if self._kind == RISING else save_task_policy
         save(path, self.actor(), env.robot, config, about)
