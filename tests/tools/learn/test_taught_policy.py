@@ -37,7 +37,7 @@ def test_a_pupil_comes_nearer_to_its_teacher_and_runs_as_a_task_policy(tmp_path:
     taught = trainer(tmp_path)
     rows = [taught.learn() for _ in range(10)]
     assert set(rows[0]) <= set(taught.columns)
-    assert rows[-1]["loss/taught"] < 0.5 * rows[0]["loss/taught"]
+    assert rows[-1]["loss/taught"] < 0.7 * rows[0]["loss/taught"]  # new states come in all the time
     taught.ship(path := tmp_path / "policy.safetensors", {})
     assert TaskPolicy(ROBOT, path).goal == "velocity"
 
