@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from servoid.hw.config import ConfigError
 from servoid.hw.robot.description import load_robot
@@ -34,10 +35,11 @@ def trainer(out: Path, **changes: object) -> TaughtPolicyTrainer:
 
 @pytest.mark.slow
 def test_a_pupil_comes_nearer_to_its_teacher_and_runs_as_a_task_policy(tmp_path: Path) -> None:
+    torch.manual_seed(0)
     taught = trainer(tmp_path)
-    rows = [taught.learn() for _ in range(10)]
+    rows = [taught.learn() for _ in range(7)]
     assert set(rows[0]) <= set(taught.columns)
-    assert rows[-1]["loss/taught"] < 0.5 * rows[0]["loss/taught"]
+    assert rows[-1]["loss/taught"] < 0.4 * rows[0]["loss/taught"]
     taught.ship(path := tmp_path / "policy.safetensors", {})
     assert TaskPolicy(ROBOT, path).goal == "velocity"
 
