@@ -128,7 +128,7 @@ class TaskEnvironment:
 
     @property
     def measures(self) -> Mapping[str, float]:
-        """Driver the rewards: the prior's error, and how often tasks are achieved, by how episodes begin."""
+        """Beside the rewards: the prior's error, and how often tasks are achieved, by how episodes begin."""
         return {**self.score.measures, **({} if self.down is None else self.down.measures)}
 
     def schedule(self, progress: float) -> None:
