@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import ctypes
 import signal
 import sys
@@ -85,7 +84,7 @@ def _unraisable(lost: sys.UnraisableHookArgs) -> None:
 
 
 def _again() -> None:
-    """As if Ctrl-C were pressed a little later."""
-    timer = threading.Timer(_AGAIN_SECONDS, _thread.interrupt_main)
+    """As if Ctrl-C were pressed a little later: a signal of the system, which ends what the program waits for, too."""
+    timer = threading.Timer(_AGAIN_SECONDS, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
     timer.daemon = True
     timer.start()

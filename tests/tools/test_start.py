@@ -12,25 +12,25 @@ from pathlib import Path
 import pytest
 
 WHILE_IMPORTING = """
-import sys, time
+import signal, sys
 from servoid.hw.signals import raise_interrupts
 sys.path.insert(0, sys.argv[1])
 raise_interrupts()
 try:
     import interrupted
-    time.sleep(30)
+    signal.pause()
 except KeyboardInterrupt:
     print(sys.modules["interrupted"].whole)
 """
 WHILE_DESTROYED = """
-import signal, time
+import signal
 from servoid.hw.signals import raise_interrupts
 class Destroyed:
     def __del__(self): signal.raise_signal(signal.SIGINT)
 raise_interrupts()
 try:
     Destroyed()
-    time.sleep(30)
+    signal.pause()
 except KeyboardInterrupt:
     print("raised")
 """
@@ -39,12 +39,14 @@ except KeyboardInterrupt:
 def test_an_interrupt_waits_for_the_import_that_it_falls_into(tmp_path: Path) -> None:
     """A compiled module would end it as "ImportError: initialization failed"."""
     (tmp_path / "interrupted.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\nwhole = True\n")
-    result = subprocess.run([sys.executable, "-c", WHILE_IMPORTING, tmp_path], capture_output=True, text=True)
+    result = subprocess.run(
+        [sys.executable, "-c", WHILE_IMPORTING, tmp_path], capture_output=True, text=True, timeout=60
+    )
     assert (result.stdout, result.stderr) == ("True\n", "")
 
 
 def test_an_interrupt_that_a_destructor_swallows_comes_again() -> None:
-    result = subprocess.run([sys.executable, "-c", WHILE_DESTROYED], capture_output=True, text=True)
+    result = subprocess.run([sys.executable, "-c", WHILE_DESTROYED], capture_output=True, text=True, timeout=60)
     assert (result.stdout, result.stderr) == ("raised\n", "")
 
 
