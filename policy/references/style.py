@@ -27,6 +27,10 @@ class WalkingStyle:
         """The gait of this style."""
         return replace(gait, **{name: factor * getattr(gait, name) for name, factor in self.gait.items()})
 
+    def on(self, legs: WalkingStyle) -> WalkingStyle:
+        """The arms and the head of this style, on the legs of another."""
+        return replace(legs, joints=self.joints, swing=self.swing, one_sided=self.one_sided)
+
     def held(self, robot: Robot) -> tuple[Array, Array, Array]:
         """Joints that are not the gait's `(n_joints,)` bool, where they are held and how far they swing, rad."""
         where, at, swing = np.zeros(len(robot.joints), bool), robot.home.copy(), np.zeros(len(robot.joints))
