@@ -44,6 +44,7 @@ class PriorTraining(DecayedOptimiser, PriorShape, StepRun):
     average: Annotated[float, "decay of the averaged weights, which are the ones saved"] = 0.999
     unstyled: Annotated[float, "share of windows that are shown without their style, for guidance"] = 0.1
     standing: Annotated[bool, "learn from windows in which the robot was asked to stand, too"] = False
+    moving: Annotated[float, "leave out windows in which no joint comes so far [rad]: a clip has poses that last"] = 0.0
     seconds: Annotated[float, "how much of the data is learned from [s], what is measured on not counted; 0: all"] = 0.0
     mirrored: Annotated[bool, "learn from the data's mirror image, too: not of a clip that has a side"] = True
     licence: Annotated[str, "licence of the data, kept in the checkpoint"] = "Apache-2.0"
@@ -53,8 +54,9 @@ class PriorTraining(DecayedOptimiser, PriorShape, StepRun):
             part.__post_init__(self)
         if not 0.0 <= self.unstyled < 1.0:
             raise ValueError(f"unstyled must be a share of 0 to below 1, not {self.unstyled:g}")
-        if self.seconds < 0.0:
-            raise ValueError(f"seconds must not be negative, not {self.seconds:g}")
+        if min(self.seconds, self.moving) < 0.0:
+            name = "seconds" if self.seconds < 0.0 else "moving"
+            raise ValueError(f"{name} must not be negative, not {getattr(self, name):g}")
 
 
 @dataclass(frozen=True)

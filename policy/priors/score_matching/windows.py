@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,20 +18,30 @@ HELD_OUT = 0.05  # share of the episodes, evenly spread
 _MEASURED = 20_000  # windows that the normalisation is measured on
 
 
+@dataclass(frozen=True)
+class Chosen:
+    """Which windows of its data a prior learns from."""
+
+    standing: bool = False  # also those in which the robot was asked to stand throughout
+    mirrored: bool = True  # their mirror images, too: half of all
+    moving: float = 0.0  # rad that some joint comes far in each: a clip has poses that last
+    seconds: float = 0.0  # of each style, 0 being all; those that are held out stay the same
+
+
 class PriorWindows:
     """Windows, an index of their last frame each: they are gathered and mirrored when a batch is drawn."""
 
     def __init__(
-        self, recordings: Mapping[str, Recording], features: PriorFeatures, config: PriorConfig, standing: bool = False,
-        seconds: float = 0.0, mirrored: bool = True,
-    ) -> None:  # fmt: skip
-        """`recordings` by style; those of one that has none are under an empty name.
-
-        With `standing` False, windows in which the robot was asked to stand throughout are left out. Of each style so
-        many `seconds` are learned from, 0 being all; those that are held out stay the same. Half of the windows are
-        `mirrored`, or none. Raises DatasetError where nothing is left to train on.
-        """
-        self.config, self.features, self._sides = config, features, 2 if mirrored else 1
+        self,
+        recordings: Mapping[str, Recording],
+        features: PriorFeatures,
+        config: PriorConfig,
+        chosen: Chosen = Chosen(),
+    ) -> None:
+        """`recordings` by style; those of one that has none are under an empty name. Raises DatasetError where nothing
+        is left to train on."""
+        standing, moving, seconds = chosen.standing, chosen.moving, chosen.seconds
+        self.config, self.features, self._sides = config, features, 2 if chosen.mirrored else 1
         span = (config.frames - 1) * config.stride
         frames, yaws, styles = [], [], []
         training: list[Array] = []
@@ -41,9 +52,13 @@ class PriorWindows:
             frames.append(rows)
             yaws.append(yaw)
             presents = _presents(recording, span, standing)
+            if moving > 0.0:
+                joints = rows[:, features.layout.slice("position")]
+                presents = [kept for rows in presents if len(kept := rows[_moves(joints, rows, span, moving)])]
             last_rows = np.concatenate([*presents, np.zeros(0, int)])
             if not len(last_rows):
                 asked = "" if standing else " in which the robot was not asked to stand"
+                asked += f" and a joint comes {moving:g} rad far" if moving > 0.0 else ""
                 raise DatasetError(
                     f"{style or 'data'}: no episode has the {span + 1} ticks of a window{asked}; record longer ones"
                 )
@@ -103,3 +118,10 @@ def _presents(recording: Recording, span: int, standing: bool) -> list[Array]:
         if len(rows):
             found.append(rows)
     return found
+
+
+def _moves(joints: Array, last: Array, span: int, least: float) -> Array:
+    """Whether any joint comes `least` rad far in the windows of `span` ticks and one that end at `last` `(n,)`: bool.
+    `joints` `(ticks, n_joints)` rad."""
+    windows = np.lib.stride_tricks.sliding_window_view(joints, span + 1, axis=0)[last - span]
+    return np.asarray((windows.max(-1) - windows.min(-1)).max(-1) >= least)

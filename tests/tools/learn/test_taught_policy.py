@@ -10,10 +10,16 @@ import pytest
 import torch
 
 from servoid.hw.config import ConfigError
+from servoid.hw.contracts.body import Array
 from servoid.hw.robot.description import load_robot
-from servoid.policy.priors.score_matching.model import Style
+from servoid.policy import checkpoint
+from servoid.policy.checkpoint import CheckpointError
+from servoid.policy.priors.score_matching.model import Style, load_prior
 from servoid.policy.priors.task_policy import TaskPolicy
+from servoid.policy.references.style import load_style
+from servoid.sim.kinematics import limbs_of
 from servoid.stack.tasks.learned import load_learned_task
+from servoid.tools.learn.envs.task_environment import TaskEnvironment
 from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.trainers.policy import environment, trainer_of
 from servoid.tools.learn.trainers.taught import TaughtPolicyTrainer
@@ -64,3 +70,35 @@ def test_the_teacher_acts_for_its_share_and_after_every_turn_of_its_pupil(tmp_pa
 def test_an_unknown_teacher_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="nobody-there"):
         trainer(tmp_path, teacher="nobody-there")
+
+
+@pytest.mark.slow
+def test_in_a_style_the_teacher_walks_so_each_half_in_its_own(tmp_path: Path) -> None:
+    style = Style.parse("zombie+wide")
+    prior = load_prior(checkpoint.resolve("styles"), ROBOT, limbs_of(ROBOT))
+    env = environment(load_learned_task("speed", ROBOT), prior, style, SETTINGS, 4, 0)
+    taught = trainer_of(env, style, SETTINGS, tmp_path, checkpoint.resolve("styles"))
+    assert isinstance(taught, TaughtPolicyTrainer)
+    env.ticks[:] = 0  # no episode ends meanwhile
+    before = apart(env)
+    for _ in range(75):
+        _, told = taught.lesson(np.zeros((4, 20)), 1.0)
+    targets, whole = ROBOT.home + env.reach * told, env.ticks == 75  # who fell begins anew
+    held, at, _ = load_style("zombie", ROBOT).held(ROBOT)
+    assert whole.sum() >= 2
+    assert np.allclose(targets[np.ix_(whole, held)], at[held], atol=0.02)
+    assert (apart(env)[whole] > before[whole] + 0.02).all()
+
+
+def test_who_knows_no_gait_teaches_no_style(tmp_path: Path) -> None:
+    style, settings = Style.parse("zombie"), replace(SETTINGS, teacher="speed")
+    prior = load_prior(checkpoint.resolve("styles"), ROBOT, limbs_of(ROBOT))
+    env = environment(load_learned_task("speed", ROBOT), prior, style, settings, 4, 0)
+    with pytest.raises(CheckpointError, match="tracker"):
+        trainer_of(env, style, settings, tmp_path, checkpoint.resolve("styles"))
+
+
+def apart(env: TaskEnvironment) -> Array:
+    """How far the feet of each robot are apart `(n,)` m."""
+    feet = env.fleet.truth.foot_position
+    return np.asarray(np.linalg.norm(feet[:, 1, :2] - feet[:, 0, :2], axis=-1))

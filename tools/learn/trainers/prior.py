@@ -55,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
     from servoid.policy.priors.features import PriorFeatures
     from servoid.policy.priors.manner import manner_by_speed
     from servoid.policy.priors.score_matching.network import PriorConfig
-    from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.policy.priors.score_matching.windows import Chosen, PriorWindows
     from servoid.policy.recording import source_of
     from servoid.sim.kinematics import limbs_of
 
@@ -69,7 +69,8 @@ def main(args: argparse.Namespace) -> int:
     features = PriorFeatures(robot, limbs_of(robot), all(boxes))
     shape = {f.name: getattr(settings, f.name) for f in fields(PriorShape)}
     config = PriorConfig(features.layout.size, **shape, styles=tuple(style for style in recordings if style))
-    windows = PriorWindows(recordings, features, config, settings.standing, settings.seconds, settings.mirrored)
+    chosen = Chosen(**{f.name: getattr(settings, f.name) for f in fields(Chosen)})
+    windows = PriorWindows(recordings, features, config, chosen)
     sources = [source_of(args.data / style, recording) for style, recording in recordings.items()]
     trainer = PriorTrainer(windows, features, settings, args.out, "; ".join(sources))
     trainer.manner = manner_by_speed(list(recordings.values()), robot)
@@ -95,13 +96,13 @@ def learning_rival(folder: Path, prior: Prior, seed: int) -> Rival:
     """A discriminator of the datasets in `folder` from what a policy does, for windows like those of `prior`. Raises
     DatasetError."""
     from servoid.policy.priors.adversarial.discriminator import Adversary, Discriminator
-    from servoid.policy.priors.score_matching.windows import PriorWindows
+    from servoid.policy.priors.score_matching.windows import Chosen, PriorWindows
     from servoid.tools.learn.envs.score_term import Rival
 
     discriminator = Discriminator(prior)
     how = prior.header.get("training", {})  # the same windows as the prior learned from
-    shown = {"standing": how.get("standing", False), "mirrored": how.get("mirrored", True)}
-    data = PriorWindows(read_by_style(folder, prior.features.robot), prior.features, prior.config, **shown)
+    chosen = Chosen(**{name: how[name] for name in ("standing", "mirrored", "moving") if name in how})
+    data = PriorWindows(read_by_style(folder, prior.features.robot), prior.features, prior.config, chosen)
     return Rival(discriminator, Adversary(discriminator, data, seed))
 
 
