@@ -37,7 +37,6 @@ from servoid.tools.learn.trainers.ppo import PpoTrainer
 from servoid.tools.learn.trainers.trainer import add_run_arguments
 
 if TYPE_CHECKING:
-    from servoid.hw.contracts.control import Policy
     from servoid.policy.priors.score_matching.model import Prior, Style
     from servoid.tools.learn.envs.score_term import MakesTerm
 
@@ -199,30 +198,13 @@ def trainer_of(
     env: TaskEnvironment, style: Style, settings: PolicyTraining, out: Path, prior: Path | None
 ) -> PolicyTrainer:
     """By reward, or by a teacher where the settings name one. Raises ConfigError, or CheckpointError."""
-    from servoid.tools.learn.trainers.taught import TaughtPolicyTrainer, Teacher
+    from servoid.tools.learn.teaching import Teacher, teaching
+    from servoid.tools.learn.trainers.taught import TaughtPolicyTrainer
 
     if not settings.teacher:
         return PolicyTrainer(env, style, settings, out, prior)
-    teacher = Teacher(_teaching(settings.teacher, env, style), env.n)
+    teacher = Teacher(teaching(settings.teacher, env.task, style.upper, style.lower, env.n), env.n)
     return TaughtPolicyTrainer(env, style, settings, out, prior, teacher)
-
-
-def _teaching(name: str, env: TaskEnvironment, style: Style) -> Policy:
-    """The policy that teaches. In a style it is a tracker of the gait that walks so, as in the prior's data.
-
-    Raises ConfigError, or CheckpointError where another kind of policy shall walk in a style.
-    """
-    from servoid.policy.references.style import load_style
-    from servoid.stack.control.policies import make_policy
-    from servoid.stack.control.styled import StyledExpert
-    from servoid.stack.tasks import load_task
-
-    robot, shape = env.robot, (env.n,)
-    if style.upper is None or style.lower is None:
-        task = load_task(env.task.run, {}, robot.dt, robot)
-        return make_policy(name, robot, task, realtime=False, shape=shape)
-    walks = load_style(style.upper, robot).on(load_style(style.lower, robot))
-    return StyledExpert(robot, walks, name, shape)
 
 
 class PolicyTrainer(PpoTrainer):

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from servoid.hw.contracts.body import Array
-from servoid.hw.contracts.control import Instruction, Policy, State
 from servoid.tools.learn.envs.task_environment import TaskEnvironment
 from servoid.tools.learn.envs.tracking import Tracking
 from servoid.tools.learn.prior_settings import PolicyTraining
 from servoid.tools.learn.settings import Ppo, TrackerTraining
+from servoid.tools.learn.teaching import Teacher
 from servoid.tools.learn.trainers.policy import PolicyTrainer
 from servoid.tools.learn.trainers.ppo import Environment, PpoTrainer, tensors
 from servoid.tools.learn.trainers.tracker import TrackerTrainer
@@ -131,35 +131,6 @@ class TaughtTrainer(Taught, TrackerTrainer):
         leads = self._rng.random(self.env.n) < led
         reward, _, _ = self.env.step(np.where(leads[:, None], taught, action))
         return reward, taught
-
-
-class Teacher:
-    """A policy of `n` worlds that drives some of them itself, and says of all what it would do there.
-
-    It acts once a tick; whom it teaches decides once in a few.
-    """
-
-    def __init__(self, policy: Policy, n: int) -> None:
-        self._policy = policy
-        self.leads = np.ones(n, bool)  # worlds that it drives
-        self._told: list[Array] = []  # targets of the ticks since `taught`
-
-    def reset(self, where: Array, seeds: Array) -> None:
-        """New episodes in the worlds `where` `(n,)` bool."""
-        self._policy.reset(where, seeds)
-
-    def __call__(self, state: State, applied: Array, told: Instruction, target: Array) -> Array:
-        """Joint targets of a tick `(n, n_joints)` rad: its own where it leads, `target` elsewhere."""
-        decided = self._policy.act(state, applied, told)
-        self._told.append(decided)
-        return np.where(self.leads[:, None], decided, target)
-
-    def taught(self) -> Array:
-        """The mean of what it would have done since it was last asked `(n, n_joints)` rad: a decision that lasts as
-        long does no better."""
-        mean = np.mean(self._told, 0)
-        self._told.clear()
-        return np.asarray(mean)
 
 
 class TaughtPolicyTrainer(Taught, PolicyTrainer):
