@@ -120,6 +120,11 @@ class ExpertPolicy(BasePolicy):
             gait = style.changed(gait)
         self._gait, self._tracker = Gait(robot, shape, gait), Tracker(robot, checkpoint, shape)
 
+    @property
+    def gait(self) -> Gait:
+        """What it follows."""
+        return self._gait
+
     def reset(self, where: Array | None, seeds: Array) -> None:
         self._gait.reset(slice(None) if where is None else where)
         self._tracker.reset(where)

@@ -12,14 +12,17 @@ from servoid.hw.robot.description import Robot
 from servoid.policy.motion.clip import Clip
 from servoid.policy.motion.library import find
 from servoid.policy.references.clip import ClipReference
+from servoid.policy.references.gait import Gait
 from servoid.policy.references.style import load_style
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.control.policies import make_policy
 from servoid.stack.control.styled import StyledExpert
+from servoid.stack.control.tracker import ExpertPolicy
 from servoid.stack.tasks import load_task
 from servoid.stack.tasks.learned import LearnedTask
 
 _BACK, _ON = 0.2, 0.6  # s from the last frame, within which the next one is looked for
+_PULL, _LEARNED = 0.15, 0.01  # a tick: of what a gait is off, and of what is measured anew
 _ALIKE = 0.003  # rad, root mean square of the joints: frames as near as that to each other are one pose
 
 
@@ -46,6 +49,7 @@ class Teacher:
 
     def __init__(self, policy: Policy, n: int) -> None:
         self._policy = policy
+        self._clock = GaitInStep(policy.gait) if isinstance(policy, ExpertPolicy) else None
         self.leads = np.ones(n, bool)  # worlds that it drives
         self._told: list[Array] = []  # targets of the ticks since `taught`
 
@@ -55,6 +59,8 @@ class Teacher:
 
     def __call__(self, state: State, applied: Array, told: Instruction, target: Array) -> Array:
         """Joint targets of a tick `(n, n_joints)` rad: its own where it leads, `target` elsewhere."""
+        if self._clock is not None:
+            self._clock(state, self.leads)
         decided = self._policy.act(state, applied, told)
         self._told.append(decided)
         return np.where(self.leads[:, None], decided, target)
@@ -65,6 +71,40 @@ class Teacher:
         mean = np.mean(self._told, 0)
         self._told.clear()
         return np.asarray(mean)
+
+
+class GaitInStep:
+    """Keeps the phase of a gait of `n` worlds that of the legs where somebody else moves them.
+
+    A gait has a clock, and who learns from what walks by it sees none: what is taught would be a step of either foot,
+    by chance, and in the mean no step. Legs are late, and not quite where a gait has them: how late, is measured where
+    they are moved by it.
+    """
+
+    def __init__(self, gait: Gait) -> None:
+        self._gait, count = gait, gait.cycle_ticks
+        ticks = np.arange(-(count // 2), count - count // 2)
+        self._off = ticks[np.argsort(np.abs(ticks), kind="stable")] / count  # phases, the nearest first
+        self._legs = np.unique(gait.robot.leg_index)
+        self._usual = complex(1.0, 0.0)  # how far the legs' phase is from the gait's, as a turn of the unit circle
+
+    def __call__(self, state: State, follows: Array) -> None:
+        """Once a tick, before the gait is asked; the legs are moved by it in the worlds `follows` `(n,)` bool."""
+        gait, ones = self._gait, np.ones_like(self._off)
+        walks = gait.activity[:, None] * ones
+        pose, _ = gait.pose(
+            (gait.phase[:, None] + self._off) % 1.0,
+            gait.velocity[:, None] * ones[:, None],
+            walks,
+            gait.lowered[:, None] * ones,
+        )
+        away = np.square(pose[..., self._legs] - state.position[:, None, self._legs]).mean(-1)
+        turns = np.exp(2j * np.pi * self._off[away.argmin(-1)])
+        known = follows & (gait.activity >= 1.0)
+        if known.any():
+            self._usual += _LEARNED * (turns[known].mean() - self._usual)
+        late = np.angle(turns * np.conj(self._usual)) / (2.0 * np.pi)
+        gait.phase = np.where(follows | (gait.activity <= 0.0), gait.phase, (gait.phase + _PULL * late) % 1.0)
 
 
 class RoundOfClips(BasePolicy):
