@@ -148,16 +148,13 @@ class PolicyTraining(EpisodeSettings, Ppo):
     ] = 100_000
 
     teacher: Annotated[str, "policy to imitate wherever this one comes, instead of PPO by reward; none: nobody"] = ""
-    trusted: Annotated[
-        float, "time into a turn of the pupil up to which its teacher's answers count [s]: a clock goes on meanwhile"
-    ] = 10.0
     imitation_steps: Annotated[int, "steps in which a network learns what demonstrations show"] = 6000
 
     def __post_init__(self) -> None:
         for part in (Ppo, EpisodeSettings):
             part.__post_init__(self)
-        if min(self.critic_alone, self.trusted) < 0 or self.imitation_steps < 1:
-            raise ValueError("critic_alone and trusted must not be negative, and imitation_steps must be at least 1")
+        if self.critic_alone < 0 or self.imitation_steps < 1:
+            raise ValueError("critic_alone must not be negative, and imitation_steps must be at least 1")
 
 
 PRIOR_TITLES: Mapping[type, str] = {

@@ -15,6 +15,7 @@ from servoid.policy.references.clip import ClipReference
 from servoid.policy.references.gait import Gait
 from servoid.policy.references.style import load_style
 from servoid.stack.control.base import BasePolicy
+from servoid.stack.control.carrier import Carrier
 from servoid.stack.control.policies import make_policy
 from servoid.stack.control.styled import StyledExpert
 from servoid.stack.control.tracker import ExpertPolicy
@@ -49,7 +50,7 @@ class Teacher:
 
     def __init__(self, policy: Policy, n: int) -> None:
         self._policy = policy
-        self._clock = GaitInStep(policy.gait) if isinstance(policy, ExpertPolicy) else None
+        self._clock = GaitInStep(policy.gait) if isinstance(policy, ExpertPolicy | Carrier) else None
         self.leads = np.ones(n, bool)  # worlds that it drives
         self._told: list[Array] = []  # targets of the ticks since `taught`
 
@@ -86,7 +87,8 @@ class GaitInStep:
         ticks = np.arange(-(count // 2), count - count // 2)
         self._off = ticks[np.argsort(np.abs(ticks), kind="stable")] / count  # phases, the nearest first
         self._legs = np.unique(gait.robot.leg_index)
-        self._usual = complex(1.0, 0.0)  # how far the legs' phase is from the gait's, as a turn of the unit circle
+        self._usual, self._measured = complex(1.0, 0.0), 0  # how far the legs' phase is from the gait's, as a turn of
+        # the unit circle, and in how many ticks that was measured
 
     def __call__(self, state: State, follows: Array) -> None:
         """Once a tick, before the gait is asked; the legs are moved by it in the worlds `follows` `(n,)` bool."""
@@ -102,7 +104,8 @@ class GaitInStep:
         turns = np.exp(2j * np.pi * self._off[away.argmin(-1)])
         known = follows & (gait.activity >= 1.0)
         if known.any():
-            self._usual += _LEARNED * (turns[known].mean() - self._usual)
+            self._measured += 1
+            self._usual += max(1.0 / self._measured, _LEARNED) * (turns[known].mean() - self._usual)
         late = np.angle(turns * np.conj(self._usual)) / (2.0 * np.pi)
         gait.phase = np.where(follows | (gait.activity <= 0.0), gait.phase, (gait.phase + _PULL * late) % 1.0)
 

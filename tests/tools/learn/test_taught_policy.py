@@ -67,22 +67,6 @@ def test_the_teacher_acts_for_its_share_and_after_every_turn_of_its_pupil(tmp_pa
     assert longest <= 63  # 2.5 s
 
 
-@pytest.mark.slow
-def test_what_a_teacher_would_do_late_in_its_pupils_turn_is_not_learned(tmp_path: Path) -> None:
-    taught = trainer(tmp_path, trusted=0.2)
-    late = round(0.2 / taught.env.dt)
-    taught.env.ticks[:], taught._left[:] = 0, 100
-    taught.teacher.leads = np.array([True, False, False, True])
-    for decision in range(late + 3):
-        _, told = taught.lesson(np.zeros((4, 20)), 0.0)
-        known = np.isfinite(told).all(-1)
-        assert known[0] and known[3]
-        assert (known[1:3] == (decision <= late)).all()
-    before = taught._added
-    taught._keep(taught.env.observations["actor"], told)
-    assert taught._added == before + 2
-
-
 def test_an_unknown_teacher_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="nobody-there"):
         trainer(tmp_path, teacher="nobody-there")

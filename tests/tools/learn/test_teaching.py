@@ -1,4 +1,4 @@
-"""Who teaches: clips that are played round and round, by what was commanded and not by a clock."""
+"""Who teaches: clips that are played round and round, and gaits, neither by a clock of their own."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ import pytest
 from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction
+from servoid.hw.contracts.world import Start
 from servoid.hw.robot.description import load_robot
 from servoid.policy.motion.library import find
 from servoid.stack.control.fleet import Fleet
+from servoid.stack.control.tracker import ExpertPolicy
 from servoid.stack.tasks.learned import load_learned_task
-from servoid.tools.learn.teaching import RoundOfClips, teaching
+from servoid.tools.learn.teaching import GaitInStep, RoundOfClips, teaching
 
 ROBOT = load_robot()
 TOLD = Instruction(np.zeros((1, 3)))
@@ -63,5 +65,25 @@ def test_a_new_episode_begins_at_the_pose_it_finds() -> None:
 
 def test_an_unknown_clip_is_refused_by_its_name() -> None:
     task = load_learned_task("clip:sit-down", ROBOT)
-    with pytest.raises(ConfigError, match="unknown clip 'risen'.*rise"):
+    with pytest.raises(ConfigError, match=r"unknown clip 'risen'.*rise"):
         teaching("sit-down+risen", task, None, None, 1)
+
+
+def test_a_gait_keeps_in_step_with_legs_that_another_moves() -> None:
+    """One expert walks, and the gait of another who watches is put elsewhere in its cycle."""
+    n, fleet = 6, Fleet(ROBOT, 6, None)
+    fleet.reset(np.ones(n, bool), Start())
+    walks, watches = (ExpertPolicy(ROBOT, shape=(n,)) for _ in range(2))
+    for policy in (walks, watches):
+        policy.reset(None, np.zeros(n, np.uint32))
+    clock, told = GaitInStep(watches.gait), Instruction(np.tile([0.2, 0.0, 0.0], (n, 1)))
+    off = np.array([0.0, 0.1, 0.2, -0.1, -0.2, 0.35])
+    for tick in range(150):
+        state = fleet.observe()
+        clock(state, np.full(n, tick < 60))
+        watches.act(state, fleet.applied, told)
+        fleet.step(walks.act(state, fleet.applied, told))
+        if tick == 60:  # until then it is moved by what it measures
+            watches.gait.phase = (watches.gait.phase + off) % 1.0
+    late = (watches.gait.phase - walks.gait.phase + 0.5) % 1.0 - 0.5
+    assert np.abs(late).max() < 0.06

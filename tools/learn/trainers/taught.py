@@ -53,7 +53,7 @@ class Taught(PpoTrainer):
     @abstractmethod
     def lesson(self, action: Array, led: float) -> tuple[Array, Array]:
         """Take a step, in which the teacher acts instead for a share `led` of the time. Returns the reward `(n,)`, and
-        what the teacher would have done `(n, action_size)`, NaN where that means nothing."""
+        what the teacher would have done `(n, action_size)`."""
 
     def learn(self) -> dict[str, float]:
         """Collect `horizon` ticks in every world, and learn from what was collected of late."""
@@ -92,11 +92,9 @@ class Taught(PpoTrainer):
         }
 
     def _keep(self, seen: Array, taught: Array) -> None:
-        """Remember what was seen, and what the teacher would do, where it knows; the oldest is forgotten."""
+        """Remember what was seen, and what the teacher would do; the oldest is forgotten."""
         import torch
 
-        known = np.isfinite(taught).all(-1)
-        seen, taught = seen[known], taught[known]
         at = (self._added + torch.arange(len(seen))) % len(self._seen)
         self._seen[at] = torch.from_numpy(seen)
         self._taught[at] = torch.from_numpy(taught.astype(np.float32))
@@ -138,8 +136,7 @@ class TaughtTrainer(Taught, TrackerTrainer):
 class TaughtPolicyTrainer(Taught, PolicyTrainer):
     """As `PolicyTrainer`, with a teacher.
 
-    It acts after each turn of its pupil: what it would do where a pupil went long before, in another phase of
-    the gait say, means little, and is not learned from `trusted` s on.
+    It acts after each turn of its pupil: where a pupil stops for good, nothing else is seen any more.
     """
 
     LAST = "last.safetensors"
@@ -159,7 +156,7 @@ class TaughtPolicyTrainer(Taught, PolicyTrainer):
         # Not all at the same part of the task: what is learned from would be that part.
         env.ticks[:] = np.random.default_rng(settings.seed).integers(0, env.limit, env.n)
         self.begin_lessons(env, settings)
-        self._left, self._passed = np.zeros(env.n, int), np.zeros(env.n, int)  # decisions of the present turns
+        self._left = np.zeros(env.n, int)  # decisions of the present turns
 
     def score(self, results: Mapping[str, float]) -> tuple[float, float]:
         """The best return: a pupil that stops somewhere, where it did not before, does worse though it errs less."""
@@ -173,9 +170,5 @@ class TaughtPolicyTrainer(Taught, PolicyTrainer):
         # The pupil after one of the teacher's turns, so often that the teacher acts for a share `led` of the time.
         leads = ~self.teacher.leads | (self._rng.random(env.n) * led >= 1.0 - led)
         self.teacher.leads = np.where(over, leads, self.teacher.leads)
-        # It begins with the episode, too, whoever acts then.
-        self._passed = np.where(self.teacher.leads | (env.ticks == 0), 0, self._passed + 1)
-        trusted = self._passed * env.dt <= self.settings.trusted
         reward, _, _ = env.step(action)
-        taught = (self.teacher.taught() - env.robot.home) / env.reach
-        return reward, np.where(trusted[:, None], taught, np.nan)
+        return reward, (self.teacher.taught() - env.robot.home) / env.reach
