@@ -136,12 +136,11 @@ class RoundOfClips(BasePolicy):
             self.frame = np.where(self._fresh, off.argmin(-1), self.frame)
             self._fresh = np.zeros_like(self._fresh)
         among = (self.frame[..., None] + self._near) % count
-        off = np.sqrt(np.square(np.asarray(applied)[..., None, :] - self._joints[among]).mean(-1))
-        nearest = np.take_along_axis(among, off.argmin(-1)[..., None], -1)
-        alike = np.sqrt(np.square(self._joints[among] - self._joints[nearest]).mean(-1)) < _ALIKE
+        poses, order = self._joints[among], np.arange(len(self._near))
+        at = np.square(np.asarray(applied)[..., None, :] - poses).mean(-1).argmin(-1)[..., None]
+        nearest = np.take_along_axis(poses, at[..., None], -2)
+        alike = np.square(poses - nearest).mean(-1) < _ALIKE**2
         # Only what is alike without a break from there on: the same pose may come again.
-        at = off.argmin(-1)[..., None]
-        order = np.arange(len(self._near))
-        broken = np.where((order > at) & ~alike, order, len(self._near)).min(-1)
-        self.frame = np.take_along_axis(among, (broken - 1)[..., None], -1)[..., 0]
+        last = np.where((order > at) & ~alike, order, len(order)).min(-1) - 1
+        self.frame = np.take_along_axis(among, last[..., None], -1)[..., 0]
         return self._joints[(self.frame + 1) % count]
