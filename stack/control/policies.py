@@ -127,11 +127,14 @@ POLICIES: dict[str, Maker] = {
     "expert": _expert,
     "fast": _expert,
     "gait": _gait,
+    "hands-on-head": _task_policy,
+    "high-knees": _task_policy,
     "location": _task_policy,
     "looking-around": _task_policy,
     "speed": _task_policy,
     "steering": _task_policy,
     "zombie": _task_policy,
+    "zombie-wide": _task_policy,
 }
 _KINDS: dict[str, Maker] = {  # of .safetensors files
     "diffusion": _diffusion,
