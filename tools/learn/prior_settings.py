@@ -147,7 +147,10 @@ class PolicyTraining(EpisodeSettings, Ppo):
         float, "samples for which only the critic learns, where the actor began with demonstrations"
     ] = 100_000
 
-    teacher: Annotated[str, "policy to imitate wherever this one comes, instead of PPO by reward; none: nobody"] = ""
+    teacher: Annotated[
+        str,
+        "policy to imitate wherever this one comes, instead of PPO; for a clip CLIP+CLIP, played round; none: nobody",
+    ] = ""
     imitation_steps: Annotated[int, "steps in which a network learns what demonstrations show"] = 6000
 
     def __post_init__(self) -> None:
