@@ -17,7 +17,6 @@ from servoid.hw.geometry import rotate
 from servoid.hw.robot.description import Robot
 from servoid.policy.checkpoint import resolve
 from servoid.policy.priors.task_policy import TaskPolicy
-from servoid.policy.references.gait import Gait
 from servoid.stack.control.base import BasePolicy
 from servoid.stack.control.tracker import ExpertPolicy
 from servoid.stack.safety.balance import Balance, Feedback
@@ -76,11 +75,6 @@ class Carrier(BasePolicy):
         self._plain = np.broadcast_to(robot.home, (*shape, len(robot.joints))).copy()  # the expert's targets, with the
         self._waits = np.zeros(shape)  # s for which it rests where it should walk
         self._share = np.zeros(shape)  # arms where it would have them; of their way from there to where they hold a box
-
-    @property
-    def gait(self) -> Gait:
-        """What it walks by."""
-        return self._expert.gait
 
     def reset(self, where: Array | None, seeds: Array) -> None:
         fresh = np.ones_like(self.stage, bool) if where is None else where

@@ -15,7 +15,6 @@ from servoid.policy.references.clip import ClipReference
 from servoid.policy.references.gait import Gait
 from servoid.policy.references.style import load_style
 from servoid.stack.control.base import BasePolicy
-from servoid.stack.control.carrier import Carrier
 from servoid.stack.control.policies import make_policy
 from servoid.stack.control.styled import StyledExpert
 from servoid.stack.control.tracker import ExpertPolicy
@@ -50,7 +49,7 @@ class Teacher:
 
     def __init__(self, policy: Policy, n: int) -> None:
         self._policy = policy
-        self._clock = GaitInStep(policy.gait) if isinstance(policy, ExpertPolicy | Carrier) else None
+        self._clock = GaitInStep(policy.gait) if isinstance(policy, ExpertPolicy) else None
         self.leads = np.ones(n, bool)  # worlds that it drives
         self._told: list[Array] = []  # targets of the ticks since `taught`
 
@@ -87,8 +86,8 @@ class GaitInStep:
         ticks = np.arange(-(count // 2), count - count // 2)
         self._off = ticks[np.argsort(np.abs(ticks), kind="stable")] / count  # phases, the nearest first
         self._legs = np.unique(gait.robot.leg_index)
-        self._usual, self._measured = complex(1.0, 0.0), 0  # how far the legs' phase is from the gait's, as a turn of
-        # the unit circle, and in how many ticks that was measured
+        self._usual = complex(1.0, 0.0)  # how far the legs' phase is from the gait's, as a turn of the unit circle
+        self._measured = 0  # ticks in which that was
 
     def __call__(self, state: State, follows: Array) -> None:
         """Once a tick, before the gait is asked; the legs are moved by it in the worlds `follows` `(n,)` bool."""

@@ -54,7 +54,7 @@ class PriorWindows:
             presents = _presents(recording, span, standing)
             if moving > 0.0:
                 joints = rows[:, features.layout.slice("position")]
-                presents = [kept for rows in presents if len(kept := rows[_moves(joints, rows, span, moving)])]
+                presents = [kept for last in presents if len(kept := last[_moves(joints, last, span, moving)])]
             last_rows = np.concatenate([*presents, np.zeros(0, int)])
             if not len(last_rows):
                 asked = "" if standing else " in which the robot was not asked to stand"

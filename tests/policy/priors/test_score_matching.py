@@ -27,6 +27,7 @@ from servoid.policy.priors.score_matching.styles import StyleClassifier
 from servoid.policy.priors.score_matching.windows import Chosen, PriorWindows
 from servoid.policy.recording import DatasetError
 from servoid.sim.kinematics import limbs_of
+from servoid.tools.learn.prior_settings import PriorTraining
 from servoid.tools.learn.trainers.prior import read_by_style
 
 ROBOT = load_robot()
@@ -239,6 +240,8 @@ def test_windows_in_which_nothing_moves_are_left_out(synthetic_dataset: Path, tm
         assert np.ptp(recording.raw[last - span : last + 1, joints], axis=0).max() >= 0.02
     with pytest.raises(DatasetError, match="and a joint comes 9 rad far"):
         PriorWindows(recordings, made.features, made.config, Chosen(moving=9.0))
+    with pytest.raises(ValueError, match="moving must not be negative"):
+        PriorTraining(moving=-0.1)
 
 
 def test_folders_of_datasets_are_styles(tmp_path: Path, synthetic_dataset: Path) -> None:
