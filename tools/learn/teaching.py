@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from servoid.hw.config import ConfigError
 from servoid.hw.contracts.body import Array
 from servoid.hw.contracts.control import Instruction, Policy, State
 from servoid.hw.robot.description import Robot
@@ -15,6 +16,7 @@ from servoid.policy.references.clip import ClipReference
 from servoid.policy.references.gait import Gait
 from servoid.policy.references.style import load_style
 from servoid.stack.control.base import BasePolicy
+from servoid.stack.control.gait import GaitPolicy
 from servoid.stack.control.policies import make_policy
 from servoid.stack.control.styled import StyledExpert
 from servoid.stack.control.tracker import ExpertPolicy
@@ -30,15 +32,22 @@ def teaching(name: str, task: LearnedTask, upper: str | None, lower: str | None,
     """The policy `name` in `n` worlds of `task`; in a style a tracker of the gait that walks so, as the prior's data
     do; of a clip that is imitated, `CLIP+CLIP...` of the library or of files, round and round.
 
-    Raises ConfigError, or CheckpointError where another kind of policy shall walk in a style.
+    Raises ConfigError, also where the policy goes by a velocity and the task tells none, or CheckpointError where
+    another kind of policy shall walk in a style.
     """
     robot = task.robot
     if task.motion is not None:
         return RoundOfClips(robot, [find(clip, robot) for clip in name.split("+")], (n,))
     if upper is None or lower is None:
-        return make_policy(name, robot, load_task(task.run, {}, robot.dt, robot), realtime=False, shape=(n,))
-    walks = load_style(upper, robot).on(load_style(lower, robot))
-    return StyledExpert(robot, walks, name, (n,))
+        policy = make_policy(name, robot, load_task(task.run, {}, robot.dt, robot), realtime=False, shape=(n,))
+    else:
+        policy = StyledExpert(robot, load_style(upper, robot).on(load_style(lower, robot)), name, (n,))
+    if isinstance(policy, ExpertPolicy | GaitPolicy) and not task.seen.velocity:
+        raise ConfigError(
+            f"--teacher {name} walks as it is told a velocity, and task {task.name} tells none, so it would stand: "
+            "begin with --init, as location with steering"
+        )
+    return policy
 
 
 class Teacher:

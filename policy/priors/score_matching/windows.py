@@ -19,7 +19,7 @@ _MEASURED = 20_000  # windows that the normalisation is measured on
 
 
 @dataclass(frozen=True)
-class Chosen:
+class WindowSelection:
     """Which windows of its data a prior learns from."""
 
     standing: bool = False  # also those in which the robot was asked to stand throughout
@@ -36,7 +36,7 @@ class PriorWindows:
         recordings: Mapping[str, Recording],
         features: PriorFeatures,
         config: PriorConfig,
-        chosen: Chosen = Chosen(),
+        chosen: WindowSelection = WindowSelection(),
     ) -> None:
         """`recordings` by style; those of one that has none are under an empty name. Raises DatasetError where nothing
         is left to train on."""

@@ -24,7 +24,7 @@ from servoid.policy.priors.score_matching.judged import manner_of
 from servoid.policy.priors.score_matching.model import Prior, Style, load_prior
 from servoid.policy.priors.score_matching.score import RunningMean, Score, likeness
 from servoid.policy.priors.score_matching.styles import StyleClassifier
-from servoid.policy.priors.score_matching.windows import Chosen, PriorWindows
+from servoid.policy.priors.score_matching.windows import PriorWindows, WindowSelection
 from servoid.policy.recording import DatasetError
 from servoid.sim.kinematics import limbs_of
 from servoid.tools.learn.prior_settings import PriorTraining
@@ -218,13 +218,13 @@ def test_data_without_motion_is_refused(tmp_path: Path) -> None:
 def test_less_of_the_data_is_learned_from_and_as_much_measured_on(synthetic_dataset: Path, tmp_path: Path) -> None:
     recordings, made = read_by_style(synthetic_dataset, ROBOT), trainer(synthetic_dataset, tmp_path)
     whole, span = made.windows, (made.config.frames - 1) * made.config.stride
-    few = PriorWindows(recordings, made.features, made.config, Chosen(seconds=3.0))
+    few = PriorWindows(recordings, made.features, made.config, WindowSelection(seconds=3.0))
     ticks = 3 * ROBOT.rate
     assert ticks - 3 * span <= len(few.training) < ticks - span  # in pieces of two episodes
     assert set(few.training.tolist()) < set(whole.training.tolist())
     assert torch.equal(few.validation, whole.validation)
     with pytest.raises(DatasetError, match=r"seconds 0\.1: shorter than"):
-        PriorWindows(recordings, made.features, made.config, Chosen(seconds=0.1))
+        PriorWindows(recordings, made.features, made.config, WindowSelection(seconds=0.1))
 
 
 def test_windows_in_which_nothing_moves_are_left_out(synthetic_dataset: Path, tmp_path: Path) -> None:
@@ -233,13 +233,13 @@ def test_windows_in_which_nothing_moves_are_left_out(synthetic_dataset: Path, tm
     recording = recordings[""]
     joints = raw_layout(len(ROBOT.joints)).slice("position")
     recording.raw[: len(recording.raw) // 2, joints] = ROBOT.home
-    moving = PriorWindows(recordings, made.features, made.config, Chosen(moving=0.02))
+    moving = PriorWindows(recordings, made.features, made.config, WindowSelection(moving=0.02))
     kept = moving.training.numpy()
     assert 0 < len(kept) < len(whole.training)
     for last in (kept[0], kept[-1]):
         assert np.ptp(recording.raw[last - span : last + 1, joints], axis=0).max() >= 0.02
     with pytest.raises(DatasetError, match="and a joint comes 9 rad far"):
-        PriorWindows(recordings, made.features, made.config, Chosen(moving=9.0))
+        PriorWindows(recordings, made.features, made.config, WindowSelection(moving=9.0))
     with pytest.raises(ValueError, match="moving must not be negative"):
         PriorTraining(moving=-0.1)
 

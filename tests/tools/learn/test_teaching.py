@@ -69,6 +69,12 @@ def test_an_unknown_clip_is_refused_by_its_name() -> None:
         teaching("sit-down+risen", task, None, None, 1)
 
 
+def test_who_goes_by_a_velocity_teaches_no_task_that_tells_none() -> None:
+    with pytest.raises(ConfigError, match=r"--teacher expert walks as it is told a velocity, and task location tells"):
+        teaching("expert", load_learned_task("location", ROBOT), None, None, 1)
+    assert isinstance(teaching("expert", load_learned_task("steering", ROBOT), None, None, 1), ExpertPolicy)
+
+
 def test_a_gait_keeps_in_step_with_legs_that_another_moves() -> None:
     """One expert walks, and the gait of another who watches is put elsewhere in its cycle."""
     n, fleet = 6, Fleet(ROBOT, 6, None)

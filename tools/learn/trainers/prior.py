@@ -55,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
     from servoid.policy.priors.features import PriorFeatures
     from servoid.policy.priors.manner import manner_by_speed
     from servoid.policy.priors.score_matching.network import PriorConfig
-    from servoid.policy.priors.score_matching.windows import Chosen, PriorWindows
+    from servoid.policy.priors.score_matching.windows import PriorWindows, WindowSelection
     from servoid.policy.recording import source_of
     from servoid.sim.kinematics import limbs_of
 
@@ -69,7 +69,7 @@ def main(args: argparse.Namespace) -> int:
     features = PriorFeatures(robot, limbs_of(robot), all(boxes))
     shape = {f.name: getattr(settings, f.name) for f in fields(PriorShape)}
     config = PriorConfig(features.layout.size, **shape, styles=tuple(style for style in recordings if style))
-    chosen = Chosen(**{f.name: getattr(settings, f.name) for f in fields(Chosen)})
+    chosen = WindowSelection(**{f.name: getattr(settings, f.name) for f in fields(WindowSelection)})
     windows = PriorWindows(recordings, features, config, chosen)
     sources = [source_of(args.data / style, recording) for style, recording in recordings.items()]
     trainer = PriorTrainer(windows, features, settings, args.out, "; ".join(sources))
@@ -96,12 +96,12 @@ def learning_rival(folder: Path, prior: Prior, seed: int) -> Rival:
     """A discriminator of the datasets in `folder` from what a policy does, for windows like those of `prior`. Raises
     DatasetError."""
     from servoid.policy.priors.adversarial.discriminator import Adversary, Discriminator
-    from servoid.policy.priors.score_matching.windows import Chosen, PriorWindows
+    from servoid.policy.priors.score_matching.windows import PriorWindows, WindowSelection
     from servoid.tools.learn.envs.score_term import Rival
 
     discriminator = Discriminator(prior)
     how = prior.header.get("training", {})  # the same windows as the prior learned from
-    chosen = Chosen(**{name: how[name] for name in ("standing", "mirrored", "moving") if name in how})
+    chosen = WindowSelection(**{name: how[name] for name in ("standing", "mirrored", "moving") if name in how})
     data = PriorWindows(read_by_style(folder, prior.features.robot), prior.features, prior.config, chosen)
     return Rival(discriminator, Adversary(discriminator, data, seed))
 
